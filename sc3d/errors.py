@@ -1,0 +1,13 @@
+"""The errors a user can meet: one line each, saying what to do next."""
+
+
+class Sc3dError(Exception):
+    """Something went wrong that is not the input's fault; the command exits with status 1."""
+
+
+class InputError(Sc3dError):
+    """The input cannot be used as it is; the command exits with status 2 before anything is written."""
+
+
+class MissingPackageError(Sc3dError):
+    """An optional package is not installed; the message holds the pip line that installs it."""

@@ -1,0 +1,1 @@
+"""Geometry on arrays and Open3D tensors; knows nothing of classes and stands alone."""
