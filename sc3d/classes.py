@@ -1,0 +1,109 @@
+"""The class table: which uint8 id means what, and how it is shown, prompted and exported."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sc3d.errors import InputError
+
+
+@dataclass(frozen=True)
+class SemanticClass:
+    """One class. id: 1 to 255 (0 is reserved: unlabelled); color: RGB uint8; prompts: texts for segmenters; asprs: LAS class code."""
+
+    id: int
+    name: str
+    color: tuple[int, int, int]
+    prompts: tuple[str, ...] = ()
+    asprs: int = 1
+
+
+@dataclass(frozen=True)
+class ClassTable:
+    """The classes of a scene, ordered by id."""
+
+    classes: tuple[SemanticClass, ...]
+
+    def __iter__(self) -> Iterator[SemanticClass]:
+        return iter(self.classes)
+
+    def __len__(self) -> int:
+        return len(self.classes)
+
+    @property
+    def num_ids(self) -> int:
+        """Largest id + 1: the length of arrays indexed by id."""
+        return self.classes[-1].id + 1
+
+    @property
+    def palette(self) -> np.ndarray:
+        """(256, 3) uint8 RGB per id; unlabelled is dark grey."""
+        palette = np.zeros((256, 3), np.uint8)
+        palette[0] = 60
+        for entry in self.classes:
+            palette[entry.id] = entry.color
+        return palette
+
+    def name(self, label: int) -> str:
+        """Name of an id; "unlabelled" for 0."""
+        return next((entry.name for entry in self.classes if entry.id == label), "unlabelled" if label == 0 else f"class {label}")
+
+    def unknown(self, labels: np.ndarray) -> list[int]:
+        """Ids in `labels` (any shape, uint8) that are neither 0 nor in the table."""
+        present = np.flatnonzero(np.bincount(np.asarray(labels, np.uint8).ravel(), minlength=256))
+        return sorted({int(label) for label in present} - {0} - {entry.id for entry in self.classes})
+
+    def as_json(self) -> list[dict]:
+        """The list that `classes.json` holds."""
+        return [asdict(entry) for entry in self.classes]
+
+
+def read_classes(path: Path) -> ClassTable:
+    """Read `classes.json`; raises InputError that names the faulty entry."""
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path} is missing: pass --classes FILE, or copy data/classes.json from the sc3d repository and edit it") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not valid JSON ({error})") from None
+    return parse_classes(entries, path)
+
+
+def parse_classes(entries: object, origin: Path | str) -> ClassTable:
+    """Check a decoded class list; `origin` names its source in errors."""
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f"{origin} must hold a non-empty list of classes")
+    classes = tuple(sorted((_parse_class(entry, origin) for entry in entries), key=lambda entry: entry.id))
+    for key in ("id", "name"):
+        values = [getattr(entry, key) for entry in classes]
+        doubled = sorted({value for value in values if values.count(value) > 1})
+        if doubled:
+            raise InputError(f"{origin}: {key} {doubled[0]!r} is used twice")
+    return ClassTable(classes)
+
+
+def _parse_class(entry: object, origin: Path | str) -> SemanticClass:
+    if not isinstance(entry, dict):
+        raise InputError(f"{origin}: every class must be an object like {{\"id\": 1, \"name\": \"building\", \"color\": [214, 60, 60]}}")
+    label, name, color = entry.get("id"), entry.get("name"), entry.get("color")
+    if not _is_int(label, 1, 255):
+        raise InputError(f"{origin}: class id {label!r} must be a whole number from 1 to 255 (0 means unlabelled)")
+    if not isinstance(name, str) or not name.strip():
+        raise InputError(f"{origin}: class {label} needs a name")
+    if not isinstance(color, list | tuple) or len(color) != 3 or not all(_is_int(value, 0, 255) for value in color):
+        raise InputError(f"{origin}: class {label} needs a color of three numbers from 0 to 255")
+    prompts, asprs = entry.get("prompts", [name]), entry.get("asprs", 1)
+    if not isinstance(prompts, list | tuple) or not all(isinstance(prompt, str) for prompt in prompts):
+        raise InputError(f"{origin}: prompts of class {label} must be a list of texts")
+    if not _is_int(asprs, 0, 255):
+        raise InputError(f"{origin}: asprs code of class {label} must be a whole number from 0 to 255")
+    return SemanticClass(label, name.strip(), tuple(color), tuple(prompts), asprs)
+
+
+def _is_int(value: object, low: int, high: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
