@@ -141,7 +141,7 @@ def read_sparse_model(path: Path) -> SparseModel:
         _check_name(image.name, path)
         cam_from_world = np.eye(4)
         cam_from_world[:3] = image.cam_from_world().matrix()
-        views.append(View(image.name, image.camera, cam_from_world))
+        views.append(View(image.name, pycolmap.Camera(image.camera.todict()), cam_from_world))  # a copy: image.camera dies with the model
         seen = np.array([point.point3D_id for point in image.get_observation_points2D()], dtype=np.int64)
         tracks.append(np.unique(np.searchsorted(point_ids, seen)))
     stems = [Path(view.name).stem for view in views]

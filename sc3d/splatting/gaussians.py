@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from pathlib import Path
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
+
+from sc3d.errors import InputError
+from sc3d.io import atomic_path
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic Y_0."""
+
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
+    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
+}
 
 
 @dataclass
@@ -26,3 +40,155 @@ class Gaussians:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    @classmethod
+    def from_points(cls, points: np.ndarray, colors: np.ndarray, sh_degree: int = 0, opacity: float = 0.1) -> Gaussians:
+        """One isotropic Gaussian per sparse point; its scale is the rms distance to the 3 nearest neighbours.
+
+        points: (N, 3) local world frame, N >= 2; colors: (N, 3) uint8 RGB; opacity: of every Gaussian, in (0, 1)
+        Duplicate and far points get a scale within 1/100 to 20 times the median. Raises InputError for fewer than two points.
+        """
+        points = np.asarray(points, np.float64)
+        if len(points) < 2:
+            raise InputError(f"training starts from the sparse points, and there are only {len(points)}: check the reconstruction")
+        neighbours = min(3, len(points) - 1)
+        distances = cKDTree(points).query(points, k=neighbours + 1)[0][:, 1:]
+        scales = np.sqrt((distances**2).mean(1))
+        median = np.median(scales[scales > 0]) if (scales > 0).any() else 1.0
+        log_scales = torch.from_numpy(np.log(np.clip(scales, 0.01 * median, 20 * median))).float()[:, None].repeat(1, 3)
+        sh = torch.zeros(len(points), (sh_degree + 1) ** 2, 3)
+        sh[:, 0] = (torch.from_numpy(np.asarray(colors, np.float32)) / 255 - 0.5) / SH_C0
+        quats = torch.zeros(len(points), 4)
+        quats[:, 0] = 1
+        logits = torch.full((len(points),), float(np.log(opacity / (1 - opacity))))
+        return cls(torch.from_numpy(points).float(), log_scales, quats, logits, sh)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the stored harmonics, 0 to 3."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    @property
+    def scales(self) -> torch.Tensor:
+        """(N, 3) standard deviations along the Gaussian's own axes, world units."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> torch.Tensor:
+        """(N,) in (0, 1)."""
+        return self.opacity_logits.sigmoid()
+
+    @property
+    def rotations(self) -> torch.Tensor:
+        """(N, 3, 3) world_from_gaussian; the columns are the axes that `scales` belong to."""
+        return rotations_from_quats(self.quats)
+
+    @property
+    def normals(self) -> torch.Tensor:
+        """(N, 3) unit axis of the smallest scale, world; its sign means nothing."""
+        smallest = self.log_scales.argmin(1)
+        return self.rotations.gather(2, smallest[:, None, None].expand(-1, 3, 1))[..., 0]
+
+    @property
+    def covariances(self) -> torch.Tensor:
+        """(N, 3, 3) R diag(scales^2) R^T, world units squared."""
+        axes = self.rotations * self.scales[:, None, :]
+        return axes @ axes.transpose(1, 2)
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """The five tensors by name; not copies."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def detached(self) -> Gaussians:
+        """The same values outside the autograd graph; memory is shared."""
+        return Gaussians(**{name: tensor.detach() for name, tensor in self.parameters().items()})
+
+    def __getitem__(self, chosen: torch.Tensor) -> Gaussians:
+        """The Gaussians of an index or bool tensor."""
+        return Gaussians(**{name: tensor[chosen] for name, tensor in self.parameters().items()})
+
+    def save(self, path: str | Path, comments: list[str] | None = None) -> None:
+        """Write the PLY that 3DGS viewers read (binary, float32; positions stay in the local frame, so say its offset in a comment).
+
+        nx ny nz hold `normals`; f_rest is ordered by colour channel first.
+        """
+        with torch.no_grad():
+            rest = self.sh[:, 1:].transpose(1, 2).reshape(len(self), -1)
+            parts = [self.means, self.normals, self.sh[:, 0], rest, self.opacity_logits[:, None], self.log_scales, self.quats]
+            values = torch.cat([part.detach().float() for part in parts], 1).numpy().astype("<f4")
+        names = [*"xyz", "nx", "ny", "nz", *_numbered("f_dc", 3), *_numbered("f_rest", rest.shape[1]), "opacity",
+                 *_numbered("scale", 3), *_numbered("rot", 4)]
+        lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for text in comments or [] for line in text.splitlines()),
+                 f"element vertex {len(self)}", *(f"property float {name}" for name in names), "end_header"]
+        with atomic_path(Path(path)) as temporary, open(temporary, "wb") as file:
+            file.write(("\n".join(lines) + "\n").encode())
+            file.write(np.ascontiguousarray(values).tobytes())
+
+    @classmethod
+    def load(cls, path: str | Path) -> tuple[Gaussians, list[str]]:
+        """Read a 3DGS PLY; returns the Gaussians and the file's comment lines. Raises InputError if it is not one."""
+        table, comments = _read_vertices(Path(path))
+
+        def columns(names: list[str]) -> torch.Tensor:
+            missing = [name for name in names if name not in table.dtype.names]
+            if missing:
+                raise InputError(f"{path} is not a Gaussian splat PLY: property {missing[0]} is missing")
+            return torch.from_numpy(np.stack([table[name].astype(np.float32) for name in names], 1))
+
+        num_rest = sum(name.startswith("f_rest_") for name in table.dtype.names)
+        if num_rest not in (0, 9, 24, 45):
+            raise InputError(f"{path} has {num_rest} f_rest properties; 0, 9, 24 or 45 belong to degrees 0 to 3")
+        sh = columns(_numbered("f_dc", 3))[:, None]
+        if num_rest:
+            rest = columns(_numbered("f_rest", num_rest)).reshape(len(table), 3, num_rest // 3)
+            sh = torch.cat([sh, rest.transpose(1, 2)], 1)
+        gaussians = cls(columns(list("xyz")), columns(_numbered("scale", 3)), columns(_numbered("rot", 4)), columns(["opacity"])[:, 0], sh)
+        return gaussians, comments
+
+
+def rotations_from_quats(quats: torch.Tensor) -> torch.Tensor:
+    """(N, 3, 3) rotation matrices of (N, 4) wxyz quaternions of any length."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]
+    return torch.stack(rows, 1).reshape(-1, 3, 3)
+
+
+def _numbered(name: str, count: int) -> list[str]:
+    return [f"{name}_{index}" for index in range(count)]
+
+
+def _read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
+    if not path.is_file():
+        raise InputError(f"{path} does not exist")
+    with open(path, "rb") as file:
+        header = []
+        while not header or header[-1] != "end_header":
+            line = file.readline()
+            if not line or (not header and line.strip() != b"ply"):
+                raise InputError(f"{path} is not a PLY file")
+            header.append(line.decode("ascii", "replace").rstrip("\r\n"))
+        if not any(line.split() == ["format", "binary_little_endian", "1.0"] for line in header):
+            raise InputError(f"{path} is not a binary little endian PLY")
+        elements = [line.split() for line in header if line.startswith("element ")]
+        if not elements or elements[0][1] != "vertex":
+            raise InputError(f"{path} does not start with an element named vertex")
+        body = header[header.index(" ".join(elements[0])) + 1:]
+        properties = []
+        for line in body:
+            words = line.split()
+            if words[0] == "element":
+                break
+            if words[0] == "property":
+                if words[1] not in _PLY_TYPES:
+                    raise InputError(f"{path}: property type {words[1]} is not supported in vertices")
+                properties.append((words[2], _PLY_TYPES[words[1]]))
+        dtype, count = np.dtype(properties), int(elements[0][2])
+        data = file.read(count * dtype.itemsize)
+    if len(data) < count * dtype.itemsize:
+        raise InputError(f"{path} ends early: {count} Gaussians are announced, {len(data) // max(dtype.itemsize, 1)} are there")
+    comments = [line.removeprefix("comment").strip() for line in header if line.startswith("comment")]
+    return np.frombuffer(data, dtype), comments

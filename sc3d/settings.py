@@ -1,0 +1,122 @@
+"""Every option of every stage, once: the field is the option, its docstring the help. Imports nothing heavy.
+
+`sc3d STAGE --help`, the sidecar files and the functions all read these records.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Photos to cameras and sparse points (pycolmap)."""
+
+    matching: Literal["exhaustive", "sequential", "spatial"] = "exhaustive"
+    """Which photo pairs to match: all, neighbours in name order, or neighbours by GPS (hundreds of photos and more)."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP camera model, shared by all photos of one size and EXIF camera."""
+    max_size: int = 1600
+    """Longest photo side for feature extraction, px."""
+    max_features: int = 8192
+    """SIFT features per photo."""
+    gps: bool = True
+    """Use EXIF GPS positions for scale, orientation and position."""
+    seed: int = 0
+    """Seed of RANSAC."""
+
+
+@dataclass(frozen=True)
+class Extract:
+    """Gaussians to mesh and cloud."""
+
+    method: Literal["tsdf", "centres"] = "tsdf"
+    """Fuse rendered depth into a truncated signed distance field, or take the Gaussians' centres as the cloud."""
+    voxel_size: float = 0.0
+    """TSDF voxel, world units; 0 = 1.5 times the median ground sampling distance, at least box / 2048."""
+    min_views: int = 2
+    """Neighbour views that must confirm a depth (within 1 px)."""
+    min_opacity: float = 0.3
+    """Smallest opacity of a Gaussian whose centre becomes a point (centres)."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """2D masks for all photos."""
+
+    backend: Literal["files", "grounded-sam"] = "files"
+    """Where masks come from: a folder of index PNGs (--masks), or text prompts with Grounding DINO and SAM."""
+    masks: Path | None = None
+    """Folder of masks <photo stem>.png (files)."""
+    confidence: Path | None = None
+    """Folder of confidence maps <photo stem>.png (files); optional."""
+    prompts: tuple[str, ...] = ()
+    """Class prompts as NAME=text,text; replace those of classes.json."""
+    model_dir: Path | None = None
+    """Folder with model weights; the hub's cache otherwise."""
+    box_threshold: float = 0.3
+    """Smallest score of a detected box."""
+    text_threshold: float = 0.25
+    """Smallest score of a phrase."""
+    device: str = "auto"
+    """torch device."""
+
+
+@dataclass(frozen=True)
+class Label:
+    """Fuse masks into the voxel label field and the cloud."""
+
+    method: Literal["direct", "majority", "conflict-lock", "paper"] = "conflict-lock"
+    """direct: last photo wins; majority: most votes win; conflict-lock: disagreeing voxels are reset and locked; paper: the same with any disagreement."""
+    depth_filter: bool = True
+    """Only the first surface along each ray is labelled; --no-depth-filter lets labels penetrate."""
+    consensus: float = 0.8
+    """Share of the votes that the winning class needs, else the voxel is locked (conflict-lock)."""
+    voxel_size: float = 0.0
+    """Label voxel, world units; 0 = 2 times the median point spacing, at least 1.5 times the median mask pixel on the ground."""
+    use_confidence: bool = True
+    """Weigh mask pixels by the confidence maps, where there are any."""
+    edge_width: float = 3.0
+    """Mask pixels closer than this to a label boundary count less, px; 0 = off."""
+    incidence: bool = True
+    """Weigh votes by the cosine of the incidence angle."""
+    reproject: bool = True
+    """Vote once more on locked voxels with half the depth tolerance and without mask edges and grazing views."""
+    cloud: Path | None = None
+    """Cloud to label; SCENE/cloud.ply otherwise."""
+    output: Path | None = None
+    """Labelled cloud to write; SCENE/seeds.ply otherwise."""
+
+
+@dataclass(frozen=True)
+class Propagate:
+    """Complete the labels along the geometry."""
+
+    method: Literal["knn", "geometry", "map"] = "map"
+    """knn: nearest labelled points vote; geometry: front along similar normals and curvature (the paper's); map: Potts energy over all points."""
+    num_neighbors: int = 16
+    """Neighbours per point in the graph."""
+    fill: bool = False
+    """Label also the points that no edge connects to a seed, from the nearest labelled point."""
+    smoothness: float = 1.0
+    """Weight of the pairwise term (map)."""
+    seeds: Path | None = None
+    """Cloud written by label; SCENE/seeds.ply otherwise."""
+    output: Path | None = None
+    """Labelled cloud to write; SCENE/labelled.ply otherwise."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """OA, mIoU and IoU per class against truth masks, through the first surface."""
+
+    truth: Path | None = None
+    """Folder of truth masks; SCENE/truth otherwise."""
+    labelled: Path | None = None
+    """Labelled cloud; SCENE/labelled.ply otherwise."""
+    band: float = 10.0
+    """Half width of the band around depth edges that is also reported apart, px."""
+    output: Path | None = None
+    """Metrics file; SCENE/metrics.json otherwise."""
