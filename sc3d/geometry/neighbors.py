@@ -1,0 +1,96 @@
+"""Neighbourhoods of points: batched KD-tree queries, normals (eq. 5), curvature (eq. 6), spacing.
+
+Batches go through `open3d.core.nns.NearestNeighborSearch`, the tensor form of `KDTreeFlann`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+
+CHUNK = 500_000  # queries per batch: bounds memory, not results
+
+
+class NeighborIndex:
+    """A KD-tree over (N, 3) points, world; N >= 1. Points are shifted to their first point, so UTM positions keep their precision."""
+
+    def __init__(self, points: np.ndarray) -> None:
+        points = np.asarray(points, np.float64)
+        if len(points) == 0:
+            raise ValueError("an empty cloud has no neighbours")
+        self.num_points = len(points)
+        self._origin = points[0].copy()
+        self._search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(np.ascontiguousarray(points - self._origin, np.float32)))
+        self._search.knn_index()
+
+    def nearest(self, queries: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """The `count` (at most N) nearest points of each query.
+
+        queries: (Q, 3) world
+        returns: (Q, count) int32 rows, nearest first, equal distances by row; (Q, count) float32 distances
+        """
+        count = min(count, self.num_points)
+        indices = np.empty((len(queries), count), np.int32)
+        distances = np.empty((len(queries), count), np.float32)
+        for start in range(0, len(queries), CHUNK):
+            part = slice(start, start + CHUNK)
+            local = np.ascontiguousarray(np.asarray(queries[part], np.float64) - self._origin, np.float32)
+            found, squared = self._search.knn_search(o3d.core.Tensor(local), count)
+            indices[part] = found.numpy().reshape(-1, count)
+            distances[part] = np.sqrt(np.maximum(squared.numpy().reshape(-1, count), 0))
+        return indices, distances
+
+
+def point_spacing(distances: np.ndarray) -> float:
+    """Median distance to the nearest other point; `distances` (N, K) of points to themselves, column 0 = self."""
+    positive = distances[:, 1:][distances[:, 1:] > 0] if distances.shape[1] > 1 else np.empty(0)
+    nearest = distances[:, 1] if distances.shape[1] > 1 else np.zeros(1)
+    nearest = nearest[nearest > 0]
+    return float(np.median(nearest)) if len(nearest) else float(np.median(positive)) if len(positive) else 0.0
+
+
+def estimate_normals(points: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
+    """Unit normals: eigenvector of the smallest eigenvalue of the neighbourhood covariance (eq. 5); the sign is arbitrary.
+
+    points: (N, 3) world; neighbors: (N, K) rows, K >= 3
+    returns: (N, 3) float32
+    """
+    normals = np.empty((len(points), 3), np.float32)
+    for start in range(0, len(points), CHUNK // 4):
+        part = slice(start, start + CHUNK // 4)
+        local = np.asarray(points, np.float64)[neighbors[part]]
+        local -= local.mean(axis=1, keepdims=True)
+        covariance = np.einsum("nki,nkj->nij", local, local) / local.shape[1]
+        normals[part] = np.linalg.eigh(covariance)[1][:, :, 0]
+    return normals
+
+
+def orient_normals(points: np.ndarray, normals: np.ndarray, centres: np.ndarray, visible_from: np.ndarray | None = None) -> np.ndarray:
+    """Flip normals towards the cameras.
+
+    points, normals: (N, 3); centres: (M, 3) camera centres, world
+    visible_from: (N,) row of a camera that sees the point, -1 = none known; None or -1: the nearest camera centre
+    """
+    origin = centres[0]
+    nearest = NeighborIndex(centres).nearest(points, 1)[0][:, 0]
+    chosen = nearest if visible_from is None else np.where(visible_from >= 0, visible_from, nearest)
+    towards = (centres - origin)[chosen] - (points - origin)
+    away = np.einsum("ij,ij->i", normals, towards.astype(np.float32)) < 0
+    return np.where(away[:, None], -normals, normals)
+
+
+def curvature(normals: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
+    """Dispersion of a normal against its neighbours: |n_i - mean_j n_j| (eq. 6).
+
+    Each neighbour normal is sign-aligned with n_i, so that unoriented normals give the same value as oriented ones of a smooth surface.
+
+    normals: (N, 3) unit; neighbors: (N, K) rows
+    returns: (N,) float32, 0 = plane
+    """
+    result = np.empty(len(normals), np.float32)
+    for start in range(0, len(normals), CHUNK):
+        part = slice(start, start + CHUNK)
+        around = normals[neighbors[part]]
+        signs = np.where(np.einsum("nki,ni->nk", around, normals[part]) < 0, np.float32(-1), np.float32(1))
+        result[part] = np.linalg.norm(normals[part] - np.einsum("nki,nk->ni", around, signs) / around.shape[1], axis=1)
+    return result

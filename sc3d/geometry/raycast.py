@@ -1,0 +1,142 @@
+"""First surfaces and visibility with Open3D's `RaycastingScene`, from a mesh or from the surfels of a bare cloud.
+
+Distances along rays are ranges (from the camera centre); depth = range * z component of the unit ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import open3d as o3d
+
+from sc3d.geometry.cameras import View, in_image, project, rays
+from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, point_spacing
+
+SURFEL_NEIGHBORS = 8
+MIN_SUPPORT = 4  # points around a surfel, itself not counted; fewer: a floater, which blocks nothing
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What rays can hit, in a frame shifted by `origin` (3,) so that float32 keeps its precision."""
+
+    scene: o3d.t.geometry.RaycastingScene
+    origin: np.ndarray
+
+    @classmethod
+    def from_mesh(cls, vertices: np.ndarray, triangles: np.ndarray, origin: np.ndarray) -> Surface:
+        """vertices: (V, 3) world; triangles: (T, 3) rows of vertices."""
+        scene = o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(o3d.core.Tensor(np.ascontiguousarray(vertices - origin, np.float32)), o3d.core.Tensor(np.ascontiguousarray(triangles, np.uint32)))
+        return cls(scene, np.asarray(origin, np.float64))
+
+    @classmethod
+    def from_cloud(cls, points: np.ndarray, normals: np.ndarray | None, origin: np.ndarray) -> Surface:
+        """Squares in the tangent planes of the points, large enough to touch their neighbours (a surfel cloud).
+
+        points: (N, 3) world; normals: (N, 3) or None = estimated. Lone points (floaters) get no surfel.
+        """
+        vertices, triangles = surfels(points - origin, normals)
+        return cls(cls.from_mesh(vertices, triangles, np.zeros(3)).scene, np.asarray(origin, np.float64))
+
+
+@dataclass(frozen=True)
+class FirstSurface:
+    """The first surface of a view, one value per pixel.
+
+    range: (H, W) float32 from the camera centre, world units; inf = nothing hit
+    incidence: (H, W) float32 |cosine| between ray and surface normal
+    ray_z: (H, W) float32, depth = range * ray_z
+    """
+
+    range: np.ndarray
+    incidence: np.ndarray
+    ray_z: np.ndarray
+
+
+def first_surface(surface: Surface, view: View) -> FirstSurface:
+    """Cast the rays of all pixel centres of `view`, by the camera's own model."""
+    directions, ray_z = rays(view)
+    shape = (view.height, view.width)
+    origin = view.centre - surface.origin
+    bundle = np.empty((len(directions), 6), np.float32)
+    bundle[:, :3], bundle[:, 3:] = origin, np.nan_to_num(directions)
+    hit = surface.scene.cast_rays(o3d.core.Tensor(bundle))
+    incidence = np.abs(np.einsum("ij,ij->i", hit["primitive_normals"].numpy(), bundle[:, 3:]))
+    distance = np.where(np.isfinite(ray_z), hit["t_hit"].numpy(), np.float32(np.inf))
+    return FirstSurface(distance.reshape(shape), incidence.reshape(shape), ray_z.astype(np.float32).reshape(shape))
+
+
+def surface_points(first: FirstSurface, view: View, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """(K, 3) float64 world positions of the first surface at K pixels that hit something."""
+    directions, _ = rays(view, np.stack([columns + 0.5, rows + 0.5], axis=1))
+    return view.centre + directions * first.range[rows, columns, None]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """The points that a view sees, K of N.
+
+    points: (K,) int64 rows of the cloud
+    rows, columns: (K,) int32 pixel
+    excess: (K,) float32 how far behind the first surface, in tolerances; <= 1
+    incidence: (K,) float32 cosine between the ray and the point's normal (1 without normals)
+    depth: (K,) float32 z, world units
+    """
+
+    points: np.ndarray
+    rows: np.ndarray
+    columns: np.ndarray
+    excess: np.ndarray
+    incidence: np.ndarray
+    depth: np.ndarray
+
+
+def see_points(view: View, points: np.ndarray, normals: np.ndarray | None, first: FirstSurface | None, voxel_size: float) -> Sighting:
+    """Which points a view sees: inside the image, facing the camera, and not behind the first surface.
+
+    A point is visible iff its range <= first range + tol, tol = max(voxel_size, 0.5 % of the range) / max(|cos incidence|, 0.2).
+    points: (N, 3) world; normals: (N, 3) or None (then every point faces the camera)
+    first: first surface of the view; None = no occlusion test
+    """
+    pixels, depth = project(view, points)
+    inside = np.flatnonzero(in_image(view, pixels))
+    columns, rows = pixels[inside, 0].astype(np.int32), pixels[inside, 1].astype(np.int32)
+    towards = view.centre - points[inside]
+    distance = np.linalg.norm(towards, axis=1)
+    cosine = np.ones(len(inside)) if normals is None else np.einsum("ij,ij->i", normals[inside], towards) / distance
+    excess = np.zeros(len(inside))
+    keep = np.ones(len(inside), bool)
+    if first is not None:
+        tolerance = np.maximum(voxel_size, 0.005 * distance) / np.maximum(np.abs(cosine), 0.2)
+        excess = np.maximum(distance - first.range[rows, columns], 0) / tolerance
+        keep = (excess <= 1) & (cosine > 0)
+    seen = inside[keep]
+    return Sighting(
+        seen, rows[keep], columns[keep], excess[keep].astype(np.float32), np.abs(cosine[keep]).astype(np.float32), depth[seen].astype(np.float32)
+    )
+
+
+def surfels(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Two triangles per point in its tangent plane.
+
+    points: (N, 3) local frame; normals: (N, 3) or None
+    returns: (4 K, 3) vertices and (2 K, 3) triangles of the K <= N points that have support; half width = distance to the 6th neighbour
+    or so, which closes the surface even where half of the points are missing
+    """
+    neighbors, distances = NeighborIndex(points).nearest(points, SURFEL_NEIGHBORS + 1)
+    if normals is None:
+        normals = estimate_normals(points, neighbors) if neighbors.shape[1] > 3 else np.tile(np.float32([0, 0, 1]), (len(points), 1))
+    spacing = point_spacing(distances) or 1.0
+    supported = (distances[:, 1:] < 4 * spacing).sum(axis=1) >= min(MIN_SUPPORT, len(points) - 1)
+    half = np.clip(distances[:, -1], 0.5 * spacing, 2 * spacing)[supported, None] * 0.75
+    centre, normal = points[supported], normals[supported]
+    helper = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    first_axis = np.cross(normal, helper)
+    first_axis /= np.linalg.norm(first_axis, axis=1, keepdims=True)
+    second_axis = np.cross(normal, first_axis)
+    corners = [centre + half * (u * first_axis + v * second_axis) for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    vertices = np.stack(corners, axis=1).reshape(-1, 3)
+    base = 4 * np.arange(len(centre))[:, None]
+    return vertices, np.concatenate([base + [[0, 1, 2]], base + [[0, 2, 3]]], axis=1).reshape(-1, 3)

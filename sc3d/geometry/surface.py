@@ -1,0 +1,68 @@
+"""Depth maps to a surface: a truncated signed distance field (TSDF) on Open3D's `VoxelBlockGrid`, then mesh and cloud."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+
+from sc3d.geometry.cameras import View
+
+BLOCK = 8
+TRUNCATION = 4.0  # voxels
+CPU = o3d.core.Device("CPU:0")
+
+
+class DepthFusion:
+    """Fuses float32 depth maps of pinhole views. The views' world must be local (float32-safe); `voxel_size` in its units."""
+
+    def __init__(self, voxel_size: float, block_count: int = 50_000) -> None:
+        self.voxel_size = voxel_size
+        self._grid = o3d.t.geometry.VoxelBlockGrid(
+            ("tsdf", "weight", "color"), (o3d.core.float32,) * 3, ((1,), (1,), (3,)), voxel_size, BLOCK, block_count, CPU
+        )
+
+    def integrate(self, view: View, depth: np.ndarray, color: np.ndarray, depth_max: float) -> None:
+        """Add one view.
+
+        depth: (H, W) float32 z, world units, 0 = no surface known; color: (H, W, 3) uint8 RGB; depth_max: farther depths are ignored
+        """
+        if not view.camera.is_undistorted():
+            raise ValueError("depth fusion needs a pinhole view: use cameras.undistorted")
+        if not ((depth > 0) & (depth < depth_max)).any():
+            return
+        matrix = view.matrix.copy()
+        matrix[:2, 2] -= 0.5  # Open3D counts pixel centres as whole numbers
+        intrinsic, extrinsic = o3d.core.Tensor(matrix), o3d.core.Tensor(view.cam_from_world)
+        depth_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth, np.float32)[..., None]))
+        color_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(color, np.float32) / np.float32(255)))
+        blocks = self._grid.compute_unique_block_coordinates(depth_image, intrinsic, extrinsic, 1.0, depth_max, TRUNCATION)
+        self._grid.integrate(blocks, depth_image, color_image, intrinsic, extrinsic, 1.0, depth_max, TRUNCATION)
+
+    def mesh(self, min_weight: float = 1.0) -> o3d.t.geometry.TriangleMesh:
+        """Triangles of the zero level set where at least `min_weight` views agree there is a surface."""
+        return self._grid.extract_triangle_mesh(min_weight)
+
+    def cloud(self, min_weight: float = 1.0) -> o3d.t.geometry.PointCloud:
+        """Points where the zero level set crosses the grid's edges: positions, colors uint8, unit normals out of the surface."""
+        cloud = self._grid.extract_point_cloud(min_weight)
+        if "colors" in cloud.point:
+            colors = np.clip(np.round(cloud.point.colors.numpy() * 255), 0, 255).astype(np.uint8)
+            cloud.point.colors = o3d.core.Tensor(colors)
+        if "normals" in cloud.point:
+            normals = cloud.point.normals.numpy()
+            cloud.point.normals = o3d.core.Tensor(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12).astype(np.float32))
+        return cloud
+
+
+def drop_small_parts(mesh: o3d.t.geometry.TriangleMesh, min_triangles: int) -> o3d.t.geometry.TriangleMesh:
+    """Remove connected components of fewer than `min_triangles` triangles (floaters)."""
+    labels, counts, _ = mesh.to_legacy().cluster_connected_triangles()
+    keep = np.asarray(counts)[np.asarray(labels)] >= min_triangles
+    return mesh.select_faces_by_mask(o3d.core.Tensor(keep))
+
+
+def near_mesh(points: np.ndarray, mesh: o3d.t.geometry.TriangleMesh, distance: float) -> np.ndarray:
+    """(N,) bool: which of the (N, 3) points lie within `distance` of the mesh, in the mesh's own frame."""
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(mesh)
+    return scene.compute_distance(o3d.core.Tensor(np.ascontiguousarray(points, np.float32))).numpy() <= distance
