@@ -131,3 +131,73 @@ def write_image(path: Path, image: np.ndarray) -> None:
 
     with atomic_path(path) as temporary:
         cv2.imwrite(str(temporary), image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
+
+
+def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported late
+    """Read a point cloud with all its attributes (PLY, PCD, XYZ); InputError if it is truncated, empty or has positions that are not finite."""
+    import open3d as o3d
+
+    _check_ply(path)
+    cloud = o3d.t.io.read_point_cloud(str(path))
+    if "positions" not in cloud.point or not len(cloud.point.positions):
+        raise InputError(f"{path} holds no points")
+    if not np.isfinite(cloud.point.positions.numpy()).all():
+        raise InputError(f"{path} has positions that are not finite numbers: remove those points first")
+    return cloud
+
+
+def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
+    """Read a triangle mesh; InputError if it is truncated, empty or has positions that are not finite."""
+    import open3d as o3d
+
+    _check_ply(path)
+    mesh = o3d.t.io.read_triangle_mesh(str(path))
+    if "positions" not in mesh.vertex or "indices" not in mesh.triangle or not len(mesh.triangle.indices):
+        raise InputError(f"{path} holds no triangles")
+    if not np.isfinite(mesh.vertex.positions.numpy()).all():
+        raise InputError(f"{path} has vertices that are not finite numbers: repair the mesh first")
+    return mesh
+
+
+def write_geometry(path: Path, geometry) -> None:  # noqa: ANN001 - tensor PointCloud or TriangleMesh
+    """Write a tensor point cloud or mesh, atomically."""
+    import open3d as o3d
+
+    write = o3d.t.io.write_point_cloud if isinstance(geometry, o3d.t.geometry.PointCloud) else o3d.t.io.write_triangle_mesh
+    with atomic_path(path) as temporary:
+        if not write(str(temporary), geometry):
+            raise OSError(f"could not write {path}: is the disk full?")
+
+
+PLY_SIZES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4, "int32": 4,
+             "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8}
+
+
+def _check_ply(path: Path) -> None:
+    """Open3D reads a truncated PLY as far as it goes, without an error: compare the header's counts with the file's size first."""
+    if not path.is_file():
+        raise InputError(f"{path} is missing")
+    if path.suffix.lower() != ".ply":
+        return
+    with path.open("rb") as file:
+        header = file.read(1 << 16)
+    end = header.find(b"end_header")
+    if not header.startswith(b"ply") or end < 0:
+        raise InputError(f"{path} is not a PLY file: its header is missing or cut off")
+    body = path.stat().st_size - (header.find(b"\n", end) + 1)
+    least, count, binary = 0, 0, False
+    for line in header[:end].decode("ascii", "replace").splitlines():
+        words = line.split()
+        try:
+            if words[:1] == ["format"]:
+                binary = words[1].startswith("binary")
+            elif words[:1] == ["element"]:
+                count = int(words[2])
+            elif words[:2] == ["property", "list"]:
+                least += count * (PLY_SIZES[words[2]] if binary else 2)
+            elif words[:1] == ["property"]:
+                least += count * (PLY_SIZES[words[1]] if binary else 2)
+        except (IndexError, ValueError, KeyError):
+            raise InputError(f"{path} has a PLY header that cannot be understood: {line!r}") from None
+    if body < least - (0 if binary else 1) or count < 0:
+        raise InputError(f"{path} is truncated: {least} bytes are announced, {body} are there; write or copy it again")

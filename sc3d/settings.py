@@ -82,6 +82,8 @@ class Label:
     """Mask pixels closer than this to a label boundary count less, px; 0 = off."""
     incidence: bool = True
     """Weigh votes by the cosine of the incidence angle."""
+    range: bool = True
+    """Weigh votes by the inverse distance, so that near photos count more."""
     reproject: bool = True
     """Vote once more on locked voxels with half the depth tolerance and without mask edges and grazing views."""
     cloud: Path | None = None

@@ -42,11 +42,13 @@ class NeighborIndex:
 
 
 def point_spacing(distances: np.ndarray) -> float:
-    """Median distance to the nearest other point; `distances` (N, K) of points to themselves, column 0 = self."""
-    positive = distances[:, 1:][distances[:, 1:] > 0] if distances.shape[1] > 1 else np.empty(0)
-    nearest = distances[:, 1] if distances.shape[1] > 1 else np.zeros(1)
-    nearest = nearest[nearest > 0]
-    return float(np.median(nearest)) if len(nearest) else float(np.median(positive)) if len(positive) else 0.0
+    """Sampling distance of a surface cloud: the side of the area per point, from the median distance to the farthest of K neighbours.
+
+    distances: (N, K + 1) of points to themselves, column 0 = self; K = 8 or so makes grids and random samples agree
+    returns: d_K / sqrt(K / pi), world units; 0 if all points coincide
+    """
+    count = distances.shape[1] - 1
+    return float(np.median(distances[:, -1]) / np.sqrt(count / np.pi)) if count > 0 else 0.0
 
 
 def estimate_normals(points: np.ndarray, neighbors: np.ndarray) -> np.ndarray:

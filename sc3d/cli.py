@@ -1,0 +1,98 @@
+"""The command line: `sc3d STAGE ...`; options come from `sc3d.settings`, heavy imports after parsing."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import FlagConversionOff, OmitArgPrefixes, Positional
+
+from sc3d import settings as options
+from sc3d.errors import InputError, Sc3dError
+
+# stages that are one settings record applied to one scene folder, in the order of the data flow
+STAGES: dict[str, type] = {
+    "synthesize": options.Synthesize,
+    "train": options.Train,
+    "extract": options.Extract,
+    "segment": options.Segment,
+    "label": options.Label,
+    "propagate": options.Propagate,
+    "evaluate": options.Evaluate,
+    "report": options.Report,
+}
+# commands with arguments of their own
+COMMANDS: dict[str, type] = {"reconstruct": options.ReconstructCommand, "run": options.Run, "view": options.View, "doctor": options.Doctor}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run one command and exit: 0 done, 1 failed, 2 bad input."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help"):
+        sys.stdout.write(usage())
+        sys.exit(0 if arguments else 2)
+    name = arguments[0]
+    if name not in STAGES and name not in COMMANDS:
+        sys.exit(_fail(f"unknown command {name!r}: one of {', '.join(sorted(STAGES | COMMANDS))}"))
+    command = parse(name, arguments[1:])
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle OpenMP threads would spin and starve the kernels
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    logging.captureWarnings(True)
+    try:
+        _dispatch(name, command)
+    except InputError as error:
+        sys.exit(_fail(str(error)))
+    except (Sc3dError, OSError, MemoryError) as error:
+        sys.exit(_fail(f"{error or type(error).__name__}", status=1))
+    except KeyboardInterrupt:
+        sys.exit(_fail("interrupted; finished work is kept, run the same command again to go on", status=1))
+
+
+def usage() -> str:
+    """The list of commands."""
+    lines = ["usage: sc3d COMMAND ...   (sc3d COMMAND --help shows the options)", ""]
+    lines += [f"  {name:12s}{(record.__doc__ or '').strip().splitlines()[0]}" for name, record in ({"reconstruct": COMMANDS["reconstruct"]} | STAGES | COMMANDS).items()]
+    return "\n".join(lines) + "\n"
+
+
+def parse(name: str, arguments: list[str]) -> object:
+    """Arguments to the settings record of a command; exits with status 2 on a usage error."""
+    record = COMMANDS.get(name) or scene_command(STAGES[name])
+    return tyro.cli(record, args=arguments, prog=f"sc3d {name}", description=(record.__doc__ or "").strip())
+
+
+def scene_command(record: type) -> type:
+    """A record with the scene folder, the stage's own options without prefix, and --overwrite."""
+    command = dataclasses.make_dataclass(
+        "Command",
+        [
+            ("scene", Annotated[Positional[Path], tyro.conf.arg(help="Scene folder.")]),
+            ("settings", OmitArgPrefixes[record], dataclasses.field(default_factory=record)),
+            ("overwrite", Annotated[bool, tyro.conf.arg(help="Run again even if the outputs are up to date.")], False),
+        ],
+        frozen=True,
+    )
+    command.__doc__ = record.__doc__
+    return command
+
+
+def _dispatch(name: str, command: object) -> None:
+    from sc3d.scene import Scene
+    from sc3d.stages import execute, require_writable
+
+    if name in COMMANDS:
+        importlib.import_module(f"sc3d.stages.{name}").main(command)
+        return
+    require_writable(command.scene)
+    execute(name, Scene(command.scene), command.settings, command.overwrite)
+
+
+def _fail(message: str, status: int = 2) -> int:
+    sys.stderr.write(f"sc3d: {' '.join(message.split())}\n")
+    return status

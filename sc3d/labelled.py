@@ -1,0 +1,86 @@
+"""The labelled cloud as a tensor point cloud: which attributes it has, and the surface it stands for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+
+from sc3d.errors import InputError
+from sc3d.fusion import Labels
+from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, orient_normals, point_spacing
+from sc3d.geometry.raycast import Surface
+from sc3d.io import read_cloud, read_mesh
+
+NORMAL_NEIGHBORS = 30
+VOTES = "votes_"  # + class id; PLY has scalar properties only
+
+
+def point_arrays(cloud: o3d.t.geometry.PointCloud, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N, 3) float64 and unit normals (N, 3) float32 of a cloud.
+
+    Missing normals are estimated (eq. 5) and turned towards the nearest of the camera centres (M, 3).
+    """
+    points = cloud.point.positions.numpy().astype(np.float64)
+    if "normals" in cloud.point:
+        normals = cloud.point.normals.numpy().astype(np.float32)
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        if np.isfinite(lengths).all() and (lengths > 0).all():
+            return points, normals / lengths
+    neighbors, _ = NeighborIndex(points).nearest(points, NORMAL_NEIGHBORS)
+    if neighbors.shape[1] < 3:
+        raise InputError(f"the cloud has {len(points)} points: normals need at least 3")
+    return points, orient_normals(points, estimate_normals(points, neighbors), centres)
+
+
+def read_surface(mesh: Path, points: np.ndarray, normals: np.ndarray, origin: np.ndarray) -> Surface:
+    """The surface that rays hit: the mesh file if there is one, else surfels at the points (world), in a frame shifted by `origin`."""
+    if not mesh.exists():
+        return Surface.from_cloud(points, normals, origin)
+    read = read_mesh(mesh)
+    return Surface.from_mesh(read.vertex.positions.numpy().astype(np.float64), read.triangle.indices.numpy(), origin)
+
+
+def with_labels(cloud: o3d.t.geometry.PointCloud, normals: np.ndarray, labels: Labels, votes: np.ndarray | None = None) -> o3d.t.geometry.PointCloud:
+    """The same points, in order, with attributes label, confidence, state, num_views (and votes per class: (N, num_ids) float32)."""
+    result = cloud.clone()
+    attributes = {
+        "normals": normals.astype(np.float32),
+        "label": labels.label[:, None],
+        "confidence": labels.confidence[:, None],
+        "state": labels.state[:, None],
+        "num_views": labels.num_views[:, None].astype(np.int32),
+    }
+    for name in [name for name in result.point if name.startswith(VOTES)]:
+        del result.point[name]
+    if votes is not None:
+        attributes |= {f"{VOTES}{label}": votes[:, label, None].astype(np.float32) for label in range(votes.shape[1])}
+    for name, values in attributes.items():
+        result.point[name] = o3d.core.Tensor(np.ascontiguousarray(values))
+    return result
+
+
+def read_labelled(path: Path, made_by: str) -> tuple[o3d.t.geometry.PointCloud, Labels]:
+    """Read a cloud that has labels; `made_by` names the command that writes it, for the error."""
+    if not path.exists():
+        raise InputError(f"{path} is missing: run `sc3d {made_by} SCENE` first")
+    cloud = read_cloud(path)
+    missing = [name for name in ("label", "confidence", "state", "num_views") if name not in cloud.point]
+    if missing:
+        raise InputError(f"{path} has no attribute {missing[0]!r}: it was not written by `sc3d {made_by}`")
+    return cloud, Labels(*(cloud.point[name].numpy().ravel() for name in ("label", "confidence", "state", "num_views")))
+
+
+def read_votes(cloud: o3d.t.geometry.PointCloud) -> np.ndarray | None:
+    """(N, num_ids) float32 votes that `label` left in a cloud; None if there are none."""
+    ids = sorted(int(name[len(VOTES) :]) for name in cloud.point if name.startswith(VOTES) and name[len(VOTES) :].isdigit())
+    if not ids or ids != list(range(len(ids))):
+        return None
+    return np.concatenate([cloud.point[f"{VOTES}{label}"].numpy() for label in ids], axis=1)
+
+
+def spacing_of(points: np.ndarray) -> float:
+    """Sampling distance of the (N, 3) points, world units, from at most 100 000 of them; 1 if they coincide."""
+    sample = points[:: max(1, len(points) // 100_000)]
+    return point_spacing(NeighborIndex(points).nearest(sample, 9)[1]) or 1.0
