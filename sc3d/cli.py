@@ -6,12 +6,13 @@ import dataclasses
 import importlib
 import logging
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from tyro.conf import FlagConversionOff, OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
 from sc3d import settings as options
 from sc3d.errors import InputError, Sc3dError
@@ -34,6 +35,7 @@ COMMANDS: dict[str, type] = {"reconstruct": options.ReconstructCommand, "run": o
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and exit: 0 done, 1 failed, 2 bad input."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `sc3d ... | head` ends quietly
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.stdout.write(usage())
         sys.exit(0 if arguments else 2)

@@ -7,7 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from sc3d.splatting.settings import TrainSettings as Train
+from sc3d.synthetic.settings import SynthesizeSettings as Synthesize
 
 
 @dataclass(frozen=True)
@@ -32,8 +37,10 @@ class Reconstruct:
 class Extract:
     """Gaussians to mesh and cloud."""
 
-    method: Literal["tsdf", "centres"] = "tsdf"
+    method: Annotated[Literal["tsdf", "centres"], arg(name="from")] = "tsdf"
     """Fuse rendered depth into a truncated signed distance field, or take the Gaussians' centres as the cloud."""
+    max_size: int = 800
+    """Longest side of the depth maps, px."""
     voxel_size: float = 0.0
     """TSDF voxel, world units; 0 = 1.5 times the median ground sampling distance, at least box / 2048."""
     min_views: int = 2
@@ -53,15 +60,21 @@ class Segment:
     confidence: Path | None = None
     """Folder of confidence maps <photo stem>.png (files); optional."""
     prompts: tuple[str, ...] = ()
-    """Class prompts as NAME=text,text; replace those of classes.json."""
+    """Texts per class, each as NAME=text,text (grounded-sam); they replace those of classes.json."""
     model_dir: Path | None = None
-    """Folder with model weights; the hub's cache otherwise."""
+    """Folder with downloaded model weights; the hub's cache otherwise."""
+    download: bool = False
+    """Download weights that are not on this machine."""
+    detector: str = "IDEA-Research/grounding-dino-tiny"
+    """Grounding DINO model that finds boxes."""
+    segmenter: str = "facebook/sam2.1-hiera-small"
+    """SAM 2 or SAM 1 model that outlines them."""
     box_threshold: float = 0.3
     """Smallest score of a detected box."""
     text_threshold: float = 0.25
     """Smallest score of a phrase."""
     device: str = "auto"
-    """torch device."""
+    """torch device: auto, cpu, cuda."""
 
 
 @dataclass(frozen=True)
@@ -122,3 +135,77 @@ class Evaluate:
     """Half width of the band around depth edges that is also reported apart, px."""
     output: Path | None = None
     """Metrics file; SCENE/metrics.json otherwise."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """One self-contained HTML page with figures and pictures."""
+
+    labelled: Path | None = None
+    """Labelled cloud; SCENE/labelled.ply otherwise."""
+    output: Path | None = None
+    """Page to write; SCENE/report.html otherwise."""
+
+
+@dataclass(frozen=True)
+class ReconstructCommand:
+    """Photos to cameras and sparse points (pycolmap); metric and georeferenced where the photos have GPS."""
+
+    photos: Annotated[Positional[Path], arg(help="Folder of photos; never modified.")]
+    scene: Annotated[Positional[Path], arg(help="Scene folder to write.")]
+    reconstruct: Annotated[Reconstruct, arg(name="")] = Reconstruct()
+    overwrite: bool = False
+    """Run again even if the outputs are up to date."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a scene: Open3D window, or a picture without a display."""
+
+    scene: Annotated[Positional[Path], arg(help="Scene folder.")]
+    by: Literal["photo", "label", "confidence", "state"] = "label"
+    """What the colours show."""
+    file: Path | None = None
+    """Cloud or mesh to show; the labelled cloud, or else cloud.ply, otherwise."""
+    photo: str | None = None
+    """Look through the camera of this photo."""
+    from_above: bool = False
+    """Straight down instead of oblique (with --screenshot)."""
+    cameras: bool = True
+    """Draw the cameras."""
+    screenshot: Path | None = None
+    """Write a PNG instead of opening a window."""
+    size: tuple[int, int] = (1600, 1000)
+    """Width and height of the picture, px."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Report versions, missing system libraries, Vulkan, CUDA and models found."""
+
+    model_dir: Path | None = None
+    """Folder with downloaded model weights."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Photos to labelled cloud: all stages, skipping what is up to date."""
+
+    photos: Annotated[Positional[Path], arg(help="Folder of photos; never modified.")]
+    scene: Annotated[Positional[Path], arg(help="Scene folder to write.")]
+    masks: Path | None = None
+    """Folder of masks <photo stem>.png; short for --segment.masks."""
+    confidence: Path | None = None
+    """Folder of confidence maps; short for --segment.confidence."""
+    classes: Path | None = None
+    """Class table, copied to SCENE/classes.json."""
+    truth: Path | None = None
+    """Folder of truth masks; evaluates at the end."""
+    reconstruct: Reconstruct = Reconstruct()
+    train: Train = Train()
+    extract: Extract = Extract()
+    segment: Segment = Segment()
+    label: Label = Label()
+    propagate: Propagate = Propagate()
+    overwrite: bool = False
+    """Run every stage again."""

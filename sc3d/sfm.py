@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-import shutil
 import sqlite3
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
@@ -33,8 +33,9 @@ def reconstruct(images: Path, names: list[str], sparse: Path, settings: Reconstr
     pycolmap.logging.minloglevel = 2
     if settings.camera_model not in pycolmap.CameraModelId.__members__ or settings.camera_model == "INVALID":
         raise InputError(f"unknown camera model {settings.camera_model!r}: one of {', '.join(list(pycolmap.CameraModelId.__members__)[1:])}")
-    with atomic_path(sparse.parent / ".work") as work:
-        work.mkdir(parents=True)
+    sparse.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".work-", dir=sparse.parent) as folder:
+        work = Path(folder)
         database = work / "database.db"
         _extract(database, images, names, settings)
         origin = _gps_origin(database) if settings.gps else None
@@ -45,7 +46,6 @@ def reconstruct(images: Path, names: list[str], sparse: Path, settings: Reconstr
         with atomic_path(sparse) as output:
             output.mkdir()
             reconstruction.write_binary(str(output))
-    shutil.rmtree(sparse.parent / ".work")
     return _summary(reconstruction, names, origin)
 
 

@@ -45,21 +45,21 @@ class Gaussians:
     def from_points(cls, points: np.ndarray, colors: np.ndarray, sh_degree: int = 0, opacity: float = 0.1) -> Gaussians:
         """One isotropic Gaussian per sparse point; its scale is the rms distance to the 3 nearest neighbours.
 
+        Its first axis is the normal of the plane through the 12 nearest points: the axis along which training flattens it first.
+
         points: (N, 3) local world frame, N >= 2; colors: (N, 3) uint8 RGB; opacity: of every Gaussian, in (0, 1)
         Duplicate and far points get a scale within 1/100 to 20 times the median. Raises InputError for fewer than two points.
         """
         points = np.asarray(points, np.float64)
         if len(points) < 2:
             raise InputError(f"training starts from the sparse points, and there are only {len(points)}: check the reconstruction")
-        neighbours = min(3, len(points) - 1)
-        distances = cKDTree(points).query(points, k=neighbours + 1)[0][:, 1:]
-        scales = np.sqrt((distances**2).mean(1))
+        distances, near = cKDTree(points).query(points, k=min(12, len(points)))
+        scales = np.sqrt((distances[:, 1:4] ** 2).mean(1))
         median = np.median(scales[scales > 0]) if (scales > 0).any() else 1.0
         log_scales = torch.from_numpy(np.log(np.clip(scales, 0.01 * median, 20 * median))).float()[:, None].repeat(1, 3)
         sh = torch.zeros(len(points), (sh_degree + 1) ** 2, 3)
         sh[:, 0] = (torch.from_numpy(np.asarray(colors, np.float32)) / 255 - 0.5) / SH_C0
-        quats = torch.zeros(len(points), 4)
-        quats[:, 0] = 1
+        quats = _first_axis_along(_plane_normals(points[near]))
         logits = torch.full((len(points),), float(np.log(opacity / (1 - opacity))))
         return cls(torch.from_numpy(points).float(), log_scales, quats, logits, sh)
 
@@ -155,6 +155,20 @@ def rotations_from_quats(quats: torch.Tensor) -> torch.Tensor:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]
     return torch.stack(rows, 1).reshape(-1, 3, 3)
+
+
+def _plane_normals(groups: np.ndarray) -> np.ndarray:
+    """(N, 3) unit normals of the planes through (N, K, 3) points; arbitrary sign."""
+    centred = groups - groups.mean(1, keepdims=True)
+    return np.linalg.eigh(centred.transpose(0, 2, 1) @ centred)[1][:, :, 0]
+
+
+def _first_axis_along(directions: np.ndarray) -> torch.Tensor:
+    """(N, 4) wxyz quaternions that turn (1, 0, 0) into the (N, 3) unit directions or their opposites, by at most 90 degrees."""
+    directions = torch.from_numpy(np.where(directions[:, :1] < 0, -directions, directions)).float()
+    x, y, z = directions.unbind(1)
+    # Half-way rotation: w = 1 + cos(angle), vector = (1, 0, 0) x direction.
+    return torch.nn.functional.normalize(torch.stack([1 + x, torch.zeros_like(x), -z, y], 1), dim=1)
 
 
 def _numbered(name: str, count: int) -> list[str]:

@@ -1,0 +1,107 @@
+"""Small charts as inline SVG. Text keeps its size at every page width: positions are percentages, not a scaled drawing."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+
+import numpy as np
+
+Color = tuple[int, int, int]
+
+
+def css_color(color: Sequence[int]) -> str:
+    """`#rrggbb` of an RGB colour."""
+    return "#" + "".join(f"{int(value):02x}" for value in color)
+
+
+def paired_bars(rows: Sequence[tuple[str, Color, float | None, float | None]]) -> str:
+    """Two bars per row, on the scale 0 to 1: the upper in the row's colour, the lower grey.
+
+    rows: name, colour, upper value, lower value; None = no such value
+    """
+    step, parts = 46, []
+    for number, (name, color, upper, lower) in enumerate(rows):
+        top = number * step
+        values = [text for text in (_value(upper), lower is not None and f"masks {_value(lower)}") if text]
+        parts.append(f'<text x="0" y="{top + 14}">{html.escape(name)}</text>')
+        parts.append(f'<text x="100%" y="{top + 14}" text-anchor="end"><tspan class="strong">{values[0] if upper is not None else "–"}</tspan>'
+                     f'<tspan class="soft" dx="8">{values[-1] if lower is not None else ""}</tspan></text>')
+        parts.append(f'<rect class="track" x="0" y="{top + 21}" width="100%" height="16" rx="2"/>')
+        for value, y, height, style in ((upper, 21, 10, f'fill="{css_color(color)}"'), (lower, 32, 5, 'class="second"')):
+            if value is not None:
+                parts.append(f'<rect x="0" y="{top + y}" width="{100 * min(max(value, 0.0), 1.0):.2f}%" height="{height}" rx="1" {style}/>')
+    return _svg("".join(parts), len(rows) * step, "IoU per class")
+
+
+def histogram(values: np.ndarray, colors: np.ndarray) -> str:
+    """Distribution of values from 0 to 1 in as many bins as there are colours.
+
+    values: (N,); colors: (B, 3) uint8 RGB
+    """
+    counts = np.histogram(np.clip(np.nan_to_num(values), 0, 1), bins=len(colors), range=(0, 1))[0]
+    shares = counts / max(counts.sum(), 1)
+    height, width = 150, 100 / len(colors)
+    parts = [f'<line class="axis" x1="0" x2="100%" y1="{height}" y2="{height}"/>']
+    for number, (share, color) in enumerate(zip(shares, colors, strict=True)):
+        bar = (height - 14) * share / max(shares.max(), 1e-12)
+        parts.append(f'<rect x="{number * width + 0.15 * width:.2f}%" y="{height - bar:.1f}" width="{0.7 * width:.2f}%" height="{bar:.1f}" '
+                     f'fill="{css_color(color)}"><title>{number / len(colors):.2f} to {(number + 1) / len(colors):.2f}: {share:.1%}</title></rect>')
+    peak = int(shares.argmax())
+    anchor = "end" if peak > 0.8 * len(colors) else "start"
+    parts.append(f'<text class="soft" x="{(peak + (anchor == "end")) * width:.2f}%" y="{9}" text-anchor="{anchor}">{shares.max():.0%}</text>')
+    for place, anchor in ((0, "start"), (0.5, "middle"), (1, "end")):
+        parts.append(f'<text class="soft" x="{100 * place}%" y="{height + 16}" text-anchor="{anchor}">{place:g}</text>')
+    return _svg("".join(parts), height + 20, "Confidence of the points")
+
+
+def stacked_bar(rows: Sequence[tuple[str, Color, float]]) -> str:
+    """One bar divided by shares. rows: name, colour, share from 0 to 1."""
+    parts, start = [], 0.0
+    for name, color, share in rows:
+        parts.append(f'<rect x="{100 * start:.3f}%" y="0" width="{100 * share:.3f}%" height="28" fill="{css_color(color)}">'
+                     f"<title>{html.escape(name)}: {share:.2%}</title></rect>")
+        start += share
+    return _svg("".join(parts), 28, "Shares")
+
+
+def flight_map(centres: np.ndarray, headings: np.ndarray, names: Sequence[str], ground: tuple[str, tuple[float, float, float, float]] | None) -> str:
+    """Camera positions seen from above, north (+y) up, with a scale bar.
+
+    centres: (M, 2) x and y, world units; headings: (M, 2) horizontal part of the viewing direction
+    ground: data URI of a picture from above and its (x minimum, y minimum, x maximum, y maximum)
+    """
+    boxes = [np.array(ground[1])] if ground else []
+    low = np.min([centres.min(axis=0), *(box[:2] for box in boxes)], axis=0)
+    high = np.max([centres.max(axis=0), *(box[2:] for box in boxes)], axis=0)
+    span = max(float((high - low).max()), 1e-6)
+    low, high = low - 0.05 * span, high + 0.05 * span
+    scale = 600 / max(float((high - low).max()), 1e-6)
+    width, height = (high - low) * scale
+    parts = []
+    if ground:
+        x_low, y_low, x_high, y_high = ground[1]
+        parts.append(f'<image href="{ground[0]}" x="{(x_low - low[0]) * scale:.1f}" y="{(high[1] - y_high) * scale:.1f}" '
+                     f'width="{(x_high - x_low) * scale:.1f}" height="{(y_high - y_low) * scale:.1f}" preserveAspectRatio="none"/>')
+    for (x, y), (east, north), name in zip((centres - low) * scale, headings, names, strict=True):
+        y = height - y
+        parts.append(f'<g class="camera"><line x1="{x:.1f}" y1="{y:.1f}" x2="{x + 18 * east:.1f}" y2="{y - 18 * north:.1f}"/>'
+                     f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4.5"/><title>{html.escape(name)}</title></g>')
+    length = _round_length(span / 4)
+    parts.append(f'<path class="scale" d="M10 {height + 12:.1f}v6h{length * scale:.1f}v-6"/>'
+                 f'<text x="{18 + length * scale:.1f}" y="{height + 20:.1f}">{length:g} m</text>'
+                 f'<text x="{width - 6:.1f}" y="{height + 20:.1f}" text-anchor="end">north up</text>')
+    return f'<svg class="map" viewBox="0 0 {width:.1f} {height + 28:.1f}" role="img" aria-label="Camera positions">{"".join(parts)}</svg>'
+
+
+def _round_length(length: float) -> float:
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= length * 1.0001))
+
+
+def _value(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"
+
+
+def _svg(content: str, height: float, label: str) -> str:
+    return f'<svg class="chart" width="100%" height="{height:.0f}" role="img" aria-label="{html.escape(label)}">{content}</svg>'

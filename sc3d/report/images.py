@@ -1,0 +1,117 @@
+"""Pictures of a report, as data URIs."""
+
+from __future__ import annotations
+
+import base64
+import logging
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sc3d.errors import InputError, Sc3dError
+from sc3d.geometry.cameras import View
+from sc3d.io import read_image, read_index_image
+from sc3d.report.material import Material
+from sc3d.view import COLOURINGS, LabelledSurface, Style, color_points, draw_points, render_labels, screenshot
+
+logger = logging.getLogger(__name__)
+
+BACKGROUND = (238, 240, 242)
+_PICTURE = (1280, 720)
+_PHOTO_SIZE = 640  # px, longest side of a photo in the comparison
+_MAX_POINTS = 1_500_000
+
+
+def cloud_pictures(material: Material) -> dict[tuple[str, str], str]:
+    """Data URIs by (colouring or "mesh", "oblique" or "above"), of what the cloud has; empty where no renderer works."""
+    pictures = {}
+    try:
+        for direction in ("oblique", "above"):
+            style = Style(from_above=direction == "above", legend=False, background=BACKGROUND, max_points=_MAX_POINTS)
+            if material.cloud is not None:
+                point_image = draw_points(material.points, None, _PICTURE, style)
+                for by, colors in _colorings(material).items():
+                    painted = point_image.paint(colors, replace(style, shading=0.0 if by == "photo" else 0.6))
+                    pictures[by, direction] = jpeg(_trimmed(painted))
+            if material.mesh is not None:
+                pictures["mesh", direction] = jpeg(_trimmed(screenshot(material.mesh, None, _PICTURE, style)))
+    except Sc3dError as error:
+        logger.warning("the report has no pictures of the cloud: %s", error)
+    return pictures
+
+
+def _colorings(material: Material) -> dict[str, np.ndarray]:
+    """(N, 3) uint8 RGB by colouring, for the attributes that the cloud has."""
+    found = {}
+    for by in COLOURINGS:
+        with suppress(InputError):
+            found[by] = color_points(material.cloud, by, material.class_table)
+    return found
+
+
+def comparison(material: Material, view: View, labelled: LabelledSurface | None) -> list[tuple[str, str]]:
+    """Captions and data URIs of one photo: the photo, the given mask, the fused labels and the truth, as far as they exist."""
+    scene, stem = material.scene, Path(view.name).stem
+    scale = min(1.0, _PHOTO_SIZE / max(view.width, view.height))
+    size = max(1, round(view.width * scale)), max(1, round(view.height * scale))
+    panels = []
+    if scene.photo(view.name).exists():
+        panels.append(("photo", jpeg(cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA))))
+    if material.class_table is None:
+        return panels
+    palette = material.class_table.palette
+    for caption, file in (("given mask", scene.masks / f"{stem}.png"), ("fused labels", None), ("truth", scene.truth / f"{stem}.png")):
+        if file is None and labelled is not None:
+            labels = render_labels(labelled, view, _PHOTO_SIZE)
+        elif file is not None and file.exists():
+            labels = cv2.resize(read_index_image(file), size, interpolation=cv2.INTER_NEAREST)
+        else:
+            continue
+        panels.append((caption, png(palette[labels])))
+    return panels
+
+
+def ground_picture(points: np.ndarray, colors: np.ndarray, longest: int = 480) -> tuple[str, tuple[float, float, float, float]]:
+    """The cloud straight from above, parallel projection, north up: the highest point of each cell.
+
+    points: (N, 3) world; colors: (N, 3) uint8 RGB
+    returns: data URI; (x minimum, y minimum, x maximum, y maximum), world
+    """
+    low, high = np.quantile(points[:: max(1, len(points) // 200_000), :2], [0.002, 0.998], axis=0)
+    inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
+    longest = int(min(longest, max(8, 0.7 * np.sqrt(inside.sum()))))
+    cell = max(float((high - low).max()) / longest, 1e-9)
+    width, height = np.maximum(np.ceil((high - low) / cell).astype(int), 1)
+    order = np.argsort(points[inside, 2], kind="stable")
+    columns, rows = np.minimum((points[inside, :2] - low) / cell, [width - 1, height - 1]).astype(int)[order].T
+    picture = np.zeros((height, width, 4), np.uint8)
+    picture[height - 1 - rows, columns] = np.column_stack([colors[inside][order], np.full(len(order), 255)])
+    holes = picture[..., 3] == 0
+    filled = np.stack([cv2.medianBlur(np.ascontiguousarray(picture[..., channel]), 3) for channel in range(4)], axis=-1)
+    picture[holes] = filled[holes]
+    return _png_uri(picture[..., [2, 1, 0, 3]]), (low[0], high[1] - height * cell, low[0] + width * cell, high[1])
+
+
+def jpeg(image: np.ndarray, quality: int = 85) -> str:
+    """Data URI of (H, W, 3) uint8 RGB."""
+    encoded = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
+
+
+def png(image: np.ndarray) -> str:
+    """Data URI of (H, W, 3) uint8 RGB with few colours."""
+    return _png_uri(image[..., ::-1])
+
+
+def _png_uri(image: np.ndarray) -> str:
+    encoded = cv2.imencode(".png", np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
+    return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode()
+
+
+def _trimmed(image: np.ndarray) -> np.ndarray:
+    """Without empty rows above and below, but for a margin."""
+    rows = np.flatnonzero((image != np.uint8(BACKGROUND)).any(axis=(1, 2)))
+    return image if not len(rows) else image[max(0, rows[0] - 24) : rows[-1] + 25]

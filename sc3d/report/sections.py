@@ -1,0 +1,263 @@
+"""The parts of a report as HTML. Text from files passes through `html.escape`, here or in `charts`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from sc3d.report.charts import css_color, flight_map, histogram, paired_bars, stacked_bar
+from sc3d.report.images import cloud_pictures, comparison, ground_picture
+from sc3d.report.material import Material
+from sc3d.view import LabelledSurface, color_points
+from sc3d.view.colors import STATES, confidence_colors, legend_entries
+
+_NUM_PHOTOS = 4
+_COLOURING_NAMES = {"label": "Classes", "photo": "Photo colours", "confidence": "Confidence", "state": "Origin of the label", "mesh": "Mesh"}
+
+
+def sections(material: Material) -> Iterator[tuple[str, str, str]]:
+    """Anchor, title and HTML of each part; empty HTML where its files are missing."""
+    yield "cloud", "The labelled cloud", cloud_section(material)
+    yield "quality", "Agreement with the truth", quality_section(material)
+    yield "photos", "In the photos", photo_section(material)
+    yield "classes", "Classes", class_section(material)
+    yield "certainty", "Certainty", certainty_section(material)
+    yield "flight", "Flight", flight_section(material)
+    yield "processing", "Processing", processing_section(material)
+
+
+def summary_line(material: Material) -> str:
+    """One sentence about the scene."""
+    parts = []
+    if material.cloud is not None:
+        parts.append(f"{len(material.points):,} points")
+    if material.views:
+        parts.append(f"from {_count(len(material.views), 'photo')}")
+    counts = material.label_counts
+    if counts is not None:
+        parts.append(f"in {_count(int((counts[1:] > 0).sum()), 'class', 'classes')}")
+    sentence = " ".join(parts) or "An empty scene"
+    accuracy = _number(material.figures("labels").get("oa"))
+    if accuracy is not None:
+        photos = material.metrics.get("photos")
+        where = f" of {_count(len(photos), 'photo')} with truth" if isinstance(photos, list) else ""
+        sentence += f"; {accuracy:.1%} of the pixels{where} carry the right class"
+    return escape(sentence + ".")
+
+
+def headline(material: Material) -> str:
+    """The figures at the top."""
+    labels, masks = material.figures("labels"), material.figures("masks")
+    tiles = []
+    for key, name, pattern in (("oa", "Overall accuracy", "{:.1%}"), ("miou", "Mean IoU", "{:.3f}")):
+        value, before = _number(labels.get(key)), _number(masks.get(key))
+        if value is not None:
+            tiles.append((name, pattern.format(value), "" if before is None else f"given masks {pattern.format(before)}"))
+    coverage, counts = _number(labels.get("coverage")), material.label_counts
+    if coverage is not None:
+        tiles.append(("Coverage", f"{coverage:.1%}", "of the pixels carry a label"))
+    elif counts is not None:
+        tiles.append(("Labelled", f"{1 - counts[0] / max(counts.sum(), 1):.1%}", "of the points"))
+    if material.cloud is not None:
+        tiles.append(("Points", _short(len(material.points)), ""))
+    if material.views:
+        tiles.append(("Photos", f"{len(material.views):,}", ""))
+    return "".join(f'<div class="tile"><span>{escape(name)}</span><strong>{escape(value)}</strong><small>{escape(note)}</small></div>'
+                   for name, value, note in tiles)
+
+
+def cloud_section(material: Material) -> str:
+    """Pictures of the cloud: one tab per colouring, from the south and from above."""
+    pictures = cloud_pictures(material)
+    names = [name for name in _COLOURING_NAMES if (name, "oblique") in pictures]
+    tabs, panels = [], []
+    for number, name in enumerate(names):
+        tabs.append(f'<button type="button" role="tab" aria-selected="{str(number == 0).lower()}" data-panel="cloud-{name}">{_COLOURING_NAMES[name]}</button>')
+        images = "".join(f'<img src="{pictures[name, direction]}" alt="{_COLOURING_NAMES[name]}, {text}">'
+                         for direction, text in (("oblique", "from the south"), ("above", "from above")) if (name, direction) in pictures)
+        panels.append(f'<figure id="cloud-{name}" class="panel" {"" if number == 0 else "hidden"}>'
+                      f'<figcaption class="print-only">{_COLOURING_NAMES[name]}</figcaption>{images}{_legend(material, name)}</figure>')
+    return f'<div class="tabs" role="tablist">{"".join(tabs)}</div>{"".join(panels)}' if names else ""
+
+
+def quality_section(material: Material) -> str:
+    """IoU per class, labels against the given masks, and the confusion of the labels."""
+    labels, masks = _iou(material, "labels"), _iou(material, "masks")
+    if not labels:
+        return ""
+    colors = _class_colors(material)
+    rows = [(name, colors.get(name, (128, 128, 128)), value, masks.get(name)) for name, value in labels.items()]
+    note = "Intersection over union per class against the truth masks. Wide bar: fused labels" + ("; grey bar: the given masks." if masks else ".")
+    return f'<p class="note">{note}</p>{paired_bars(rows)}{_confusion(material)}'
+
+
+def photo_section(material: Material) -> str:
+    """A handful of photos with mask, fused labels and truth."""
+    chosen, rows = _choose_views(material), []
+    labelled = None
+    if chosen and material.label_counts is not None:
+        labelled = LabelledSurface.build(material.cloud, material.views, material.scene.mesh)
+    for view in chosen:
+        panels = comparison(material, view, labelled)
+        if len(panels) > 1:
+            images = "".join(f'<figure><img src="{uri}" alt="{caption} of {escape(view.name)}"><figcaption>{caption}</figcaption></figure>'
+                             for caption, uri in panels)
+            rows.append(f'<h3>{escape(view.name)}{_photo_figures(material, view.name)}</h3><div class="row">{images}</div>')
+    return "".join(rows) + _legend(material, "label") if rows else ""
+
+
+def class_section(material: Material) -> str:
+    """Points, share and confidence of each class."""
+    counts = material.label_counts
+    if counts is None or material.class_table is None:
+        return ""
+    labels, confidence, iou = material.values("label"), material.values("confidence"), _iou(material, "labels")
+    total, rows = max(int(counts.sum()), 1), []
+    sums = None if confidence is None else np.bincount(labels, np.nan_to_num(confidence), minlength=256)
+    for label in [*(entry.id for entry in material.class_table), *([0] if counts[0] else [])]:
+        name = material.class_table.name(label)
+        mean = "–" if sums is None or not counts[label] else f"{sums[label] / counts[label]:.2f}"
+        cells = [f"{counts[label]:,}", f"{counts[label] / total:.1%}"] + ([mean] if sums is not None else [])
+        cells += [_format(iou.get(name), ".3f")] if iou else []
+        swatch = f'<i style="background:{css_color(material.class_table.palette[label])}"></i>'
+        rows.append(f"<tr><th>{swatch}{escape(name)}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
+    heads = ["Class", "Points", "Share"] + (["Mean confidence"] if sums is not None else []) + (["IoU"] if iou else [])
+    return f"<table><thead><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def certainty_section(material: Material) -> str:
+    """Confidence of the points, and how their labels came about."""
+    confidence, states, parts = material.values("confidence"), material.values("state"), []
+    if confidence is not None:
+        colors = confidence_colors((np.arange(20) + 0.5) / 20)
+        parts.append(f'<div><h3>Confidence</h3><p class="note">Share of the points by confidence; median {np.nanmedian(confidence):.2f}.</p>'
+                     f"{histogram(confidence, colors)}</div>")
+    if states is not None and len(states):
+        shares = np.bincount(states.astype(np.uint8), minlength=256)[: len(STATES)] / len(states)
+        rows = [(state.name, state.color, float(share)) for state, share in zip(STATES, shares, strict=True)]
+        items = "".join(f'<li><i style="background:{css_color(color)}"></i>{escape(name)} <b>{share:.1%}</b></li>' for name, color, share in rows)
+        parts.append(f'<div><h3>Origin of the labels</h3><p class="note">Seeds come from the photos, propagated labels from their neighbours; '
+                     f'locked points were contradictory.</p>{stacked_bar(rows)}<ul class="legend">{items}</ul></div>')
+    return f'<div class="columns">{"".join(parts)}</div>' if parts else ""
+
+
+def flight_section(material: Material) -> str:
+    """Camera positions over the ground."""
+    if not material.views:
+        return ""
+    centres = np.array([view.centre for view in material.views])
+    headings = np.array([view.cam_from_world[2, :2] for view in material.views])
+    ground = None
+    if "colors" in (material.cloud.point if material.cloud is not None else {}):
+        ground = ground_picture(material.points, color_points(material.cloud, "photo"))
+    heights = f"{_count(len(centres), 'camera')}, {centres[:, 2].min():,.1f} to {centres[:, 2].max():,.1f} m high (z). The line shows where each looks."
+    return f'<p class="note">{heights}</p>{flight_map(centres[:, :2], headings, [view.name for view in material.views], ground)}'
+
+
+def processing_section(material: Material) -> str:
+    """Time and memory per stage, then every setting and version."""
+    if not material.records:
+        return ""
+    rows, details = [], []
+    for record in material.records:
+        summary = record.get("summary") if isinstance(record.get("summary"), dict) else {}
+        text = "; ".join(f"{key} {_plain(value)}" for key, value in summary.items() if not isinstance(value, dict | list))
+        rows.append(f"<tr><th>{escape(record['stage'])}</th><td>{_format(_number(record.get('seconds')), ',.1f')}</td>"
+                    f"<td>{_format(_number(record.get('peak_memory_mb')), ',.0f')}</td><td class=\"text\">{escape(text)}</td></tr>")
+        blocks = "".join(f"<h4>{title}</h4>{_pairs(record.get(key))}" for key, title in
+                         (("settings", "Settings"), ("summary", "Results"), ("inputs", "Inputs and their hashes"), ("versions", "Versions")) if record.get(key))
+        details.append(f"<details><summary>{escape(record['stage'])} <span>{escape(', '.join(record['outputs']))}</span></summary>{blocks}</details>")
+    head = "<tr><th>Stage</th><th>Time, s</th><th>Peak memory, MB</th><th class=\"text\">Results</th></tr>"
+    return f'<div class="scroll"><table><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table></div><h3>Settings and versions</h3>{"".join(details)}'
+
+
+def _choose_views(material: Material) -> list:
+    """Photos spread evenly over the flight; those with truth first, then those with a mask."""
+    def with_file(folder: Path) -> list:
+        return [view for view in material.views if (folder / f"{Path(view.name).stem}.png").exists()]
+
+    views = with_file(material.scene.truth) or with_file(material.scene.masks) or material.views
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(_NUM_PHOTOS, len(views))).round().astype(int)) if views else []
+    return [views[number] for number in chosen]
+
+
+def _photo_figures(material: Material, name: str) -> str:
+    """Accuracy of one photo, labels and given mask."""
+    photos = material.metrics.get("per_photo")
+    figures = photos.get(name) if isinstance(photos, dict) else None
+    if not isinstance(figures, dict):
+        return ""
+    found = [(text, _number(figures[key].get("oa"))) for key, text in (("labels", "fused labels"), ("masks", "given mask")) if isinstance(figures.get(key), dict)]
+    return " ".join(f"<small>{text} {value:.1%} right</small>" for text, value in found if value is not None)
+
+
+def _legend(material: Material, by: str) -> str:
+    if by == "confidence":
+        stops = ", ".join(css_color(color) for color in confidence_colors(np.linspace(0, 1, 9)))
+        return f'<p class="legend">confidence 0 <i class="ramp" style="background:linear-gradient(90deg, {stops})"></i> 1</p>'
+    values = material.values(by) if by in ("label", "state") else None
+    present = None if values is None else set(np.unique(values).tolist())
+    entries = legend_entries(by, material.class_table, present)
+    items = "".join(f'<li><i style="background:{css_color(color)}"></i>{escape(name)}</li>' for name, color in entries)
+    return f'<ul class="legend">{items}</ul>' if items else ""
+
+
+def _confusion(material: Material) -> str:
+    """The confusion matrix as shares of the true class; rows 1, 2, ... and columns 0, 1, ... are class ids, column 0 = no label."""
+    try:
+        counts = np.array(material.figures("labels").get("confusion"), float)
+    except (TypeError, ValueError):
+        return ""
+    if material.class_table is None or counts.shape != (material.class_table.num_ids - 1, material.class_table.num_ids):
+        return ""
+    ids = [entry.id for entry in material.class_table if counts[entry.id - 1].sum() > 0 or counts[:, entry.id].sum() > 0]
+    rows = []
+    for label in ids:
+        shares = counts[label - 1] / max(counts[label - 1].sum(), 1)
+        cells = "".join(f'<td style="--share:{shares[column]:.3f}">{shares[column]:.1%}</td>' for column in [*ids, 0])
+        rows.append(f"<tr><th>{escape(material.class_table.name(label))}</th>{cells}</tr>")
+    head = "".join(f"<th>{escape(material.class_table.name(label))}</th>" for label in ids) + "<th>no label</th>"
+    return (f'<h3>Confusion</h3><p class="note">Rows: the true class. Columns: what the fused labels say, as share of the row.</p>'
+            f'<div class="scroll"><table class="confusion"><thead><tr><th></th>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>')
+
+
+def _iou(material: Material, source: str) -> dict[str, float | None]:
+    found = material.figures(source).get("iou")
+    return {str(name): _number(value) for name, value in found.items()} if isinstance(found, dict) else {}
+
+
+def _class_colors(material: Material) -> dict[str, tuple[int, int, int]]:
+    return {entry.name: entry.color for entry in material.class_table} if material.class_table else {}
+
+
+def _pairs(content: object) -> str:
+    if not isinstance(content, dict):
+        return f"<p>{escape(_plain(content))}</p>"
+    return "<dl>" + "".join(f"<dt>{escape(str(key))}</dt><dd>{escape(_plain(value))}</dd>" for key, value in content.items()) + "</dl>"
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def _number(value: object) -> float | None:
+    """A finite number, else None."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value) else None
+
+
+def _format(value: float | None, pattern: str) -> str:
+    return "–" if value is None else format(value, pattern)
+
+
+def _count(number: int, noun: str, plural: str | None = None) -> str:
+    return f"{number:,} {noun if number == 1 else plural or noun + 's'}"
+
+
+def _short(number: int) -> str:
+    return f"{number / 1e6:.2f} M" if number >= 1e6 else f"{number:,}"

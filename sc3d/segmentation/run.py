@@ -1,0 +1,74 @@
+"""Segment the photos of a scene one by one, with any segmenter; what is finished stays finished."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from sc3d.errors import InputError
+from sc3d.io import image_size, read_image, write_image
+from sc3d.scene import check_mask_aspect
+
+
+class Segmenter(Protocol):
+    """What a backend offers."""
+
+    def segment(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Segment an (H, W, 3) uint8 RGB photo: (H, W) uint8 class id, 0 = unlabelled; (H, W) uint8 confidence, 255 = sure."""
+        ...
+
+
+@dataclass(frozen=True)
+class SegmentSummary:
+    """What `segment_photos` did.
+
+    segmented, skipped: names of the photos
+    num_pixels: (256,) int64 pixels per class id, over the photos segmented in this run
+    """
+
+    segmented: list[str]
+    skipped: list[str]
+    num_pixels: np.ndarray
+
+
+def segment_photos(photos: list[Path], out_masks: Path, out_confidence: Path, segmenter: Segmenter, overwrite: bool = False) -> SegmentSummary:
+    """Write a mask and a confidence map `<photo stem>.png` for every photo.
+
+    Photos that have a mask are skipped unless `overwrite`, so an interrupted run goes on where it stopped.
+    Raises InputError before the work starts if a photo cannot be opened, two share a stem, or an old mask does not fit its photo.
+    """
+    from tqdm import tqdm
+
+    todo = _check_photos(photos, out_masks, overwrite)
+    pending, num_pixels = set(todo), np.zeros(256, np.int64)
+    for photo in tqdm(todo, desc="segment", unit="photo", disable=None):
+        image = read_image(photo)
+        label, confidence = segmenter.segment(image)
+        for array in (label, confidence):
+            if array.shape != image.shape[:2] or array.dtype != np.uint8:
+                raise ValueError(f"the segmenter returned {array.shape} {array.dtype} for a photo of {image.shape[:2]}")
+        # The mask comes last: that it exists says that the photo is finished.
+        write_image(out_confidence / f"{photo.stem}.png", confidence)
+        write_image(out_masks / f"{photo.stem}.png", label)
+        num_pixels += np.bincount(label.ravel(), minlength=256)
+    return SegmentSummary([photo.name for photo in todo], [photo.name for photo in photos if photo not in pending], num_pixels)
+
+
+def _check_photos(photos: list[Path], out_masks: Path, overwrite: bool) -> list[Path]:
+    """Photos that have no mask yet, after a look at the header of all of them."""
+    by_stem: dict[str, Path] = {}
+    todo = []
+    for photo in photos:
+        size = image_size(photo)
+        other = by_stem.setdefault(photo.stem, photo)
+        if other is not photo:
+            raise InputError(f"{other} and {photo} share the name {photo.stem!r}, by which masks are found: rename one")
+        mask = out_masks / f"{photo.stem}.png"
+        if overwrite or not mask.exists():
+            todo.append(photo)
+        else:
+            check_mask_aspect(mask, image_size(mask), size)
+    return todo

@@ -1,0 +1,75 @@
+"""Adam over rows: one row per Gaussian (or photo), so that rows can be skipped, reordered and added together with their moments."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+import torch
+
+BETAS = (0.9, 0.999)
+EPSILON = 1e-15
+
+
+class RowAdam:
+    """Adam for named float32 tensors with the same number of rows.
+
+    parameters: contiguous leaf tensors (N, ...), changed in place by `step`
+    rates: per name a float, or one rate per column of the flattened (N, C) tensor
+    """
+
+    def __init__(self, parameters: dict[str, torch.Tensor], rates: dict[str, float | np.ndarray]) -> None:
+        self.parameters = parameters
+        self.rates = dict(rates)
+        self.count = 0
+        self.means = {name: torch.zeros_like(tensor, requires_grad=False) for name, tensor in parameters.items()}
+        self.squares = {name: torch.zeros_like(tensor, requires_grad=False) for name, tensor in parameters.items()}
+
+    def step(self, rows: torch.Tensor | None = None) -> None:
+        """One update from the tensors' `.grad`, which is cleared. rows: (N,) bool; the others keep values and moments; None = all."""
+        self.count += 1
+        corrections = 1 - BETAS[0] ** self.count, math.sqrt(1 - BETAS[1] ** self.count)
+        for name, tensor in self.parameters.items():
+            if tensor.grad is None or not len(tensor):
+                continue
+            chosen = np.ones(len(tensor), bool) if rows is None else rows.numpy()
+            columns = tensor.numel() // len(tensor)
+            rates = np.broadcast_to(np.float32(self.rates[name]), columns) * np.float32(corrections[1] / corrections[0])
+            flat = [part.detach().numpy().reshape(len(tensor), -1)
+                    for part in (tensor, tensor.grad.contiguous(), self.means[name], self.squares[name])]
+            _update_rows(*flat, np.ascontiguousarray(rates, np.float32), chosen, np.float32(EPSILON * corrections[1]))
+            tensor.grad = None
+
+    def take(self, source: torch.Tensor, fresh: torch.Tensor) -> None:
+        """Rebuild every tensor from rows of the present one: new[i] = old[source[i]]; its moments too, but zero where `fresh`.
+
+        source: (M,) int64; fresh: (M,) bool. The entries of `parameters` are replaced by new leaves.
+        """
+        for name, tensor in self.parameters.items():
+            self.parameters[name] = tensor.detach()[source].requires_grad_(tensor.requires_grad)
+            for moments in (self.means, self.squares):
+                moments[name] = moments[name][source]
+                moments[name][fresh] = 0
+
+    def state(self) -> dict:
+        """Moments and step count, as tensors and plain numbers."""
+        return {"count": self.count, "means": dict(self.means), "squares": dict(self.squares)}
+
+    def restore(self, state: dict) -> None:
+        """Undo `state`."""
+        self.count, self.means, self.squares = state["count"], dict(state["means"]), dict(state["squares"])
+
+
+@numba.njit(parallel=True, cache=True, fastmath={"contract", "nsz", "arcp"})
+def _update_rows(values, gradient, means, squares, rates, chosen, epsilon):
+    """values -= rate * m / (sqrt(v) + epsilon); the bias corrections are inside `rates` and `epsilon`."""
+    for row in numba.prange(values.shape[0]):
+        if chosen[row]:
+            for column in range(values.shape[1]):
+                slope = gradient[row, column]
+                mean = np.float32(0.9) * means[row, column] + np.float32(0.1) * slope
+                square = np.float32(0.999) * squares[row, column] + np.float32(0.001) * slope * slope
+                means[row, column] = mean
+                squares[row, column] = square
+                values[row, column] -= rates[column] * mean / (np.sqrt(square) + epsilon)

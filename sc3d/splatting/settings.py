@@ -1,0 +1,104 @@
+"""What can be set about training, and the schedules that follow from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Gaussian training. Times are fractions of the run, so that a short run goes through all phases of a long one."""
+
+    iterations: int = 3000
+    """training steps, one photo each; 30 000 is the paper's, 1500 to 7000 suit a CPU"""
+    max_gaussians: int = 300_000
+    """never more Gaussians than this: bounds memory and time"""
+    max_size: int = 800
+    """longest side of the training images, px"""
+    sh_degree: int = 2
+    """degree of the view-dependent colour, 0 to 3; 0 = the same from everywhere"""
+    seed: int = 0
+    """the same seed gives the same result"""
+    plain: bool = False
+    """no normal and multi-view terms: faster, rougher surface"""
+    exposure: bool = True
+    """fit a brightness gain and offset per photo"""
+    test_every: int = 0
+    """hold out every Nth photo and report PSNR and SSIM on them; 0 = none"""
+    checkpoint_every: int = 0
+    """save a checkpoint every N iterations, to continue an interrupted run; 0 = never"""
+
+    ssim_weight: float = 0.2
+    """share of 1 - SSIM in the image loss; the rest is L1"""
+    flatten_weight: float = 10.0
+    """weight of the smallest scale (relative to the scene), which presses Gaussians flat"""
+    normal_weight: float = 0.015
+    """weight of the agreement between rendered normals and those of the rendered depth"""
+    geometric_weight: float = 0.03
+    """weight of the depth agreement between neighbouring views"""
+    photometric_weight: float = 0.15
+    """weight of the patch similarity (NCC) between neighbouring views"""
+    surface_from: float = 0.25
+    """when normal and multi-view terms begin, fraction of the run"""
+    num_neighbours: int = 8
+    """neighbouring views to choose from"""
+    num_patches: int = 8192
+    """7x7 patches compared per step"""
+
+    fill: bool = True
+    """also start from points between the sparse ones, at interpolated depth"""
+    random_background: bool = True
+    """render before a random colour, so that dark surfaces become opaque; False = black"""
+    coarse_until: float = 0.25
+    """train on images of half size until this fraction of the run"""
+    densify_from: float = 0.02
+    """first densification, fraction of the run"""
+    densify_until: float = 0.5
+    """last densification, fraction of the run"""
+    gradient_threshold: float = 2e-4
+    """mean image-position gradient (NDC) that asks for more Gaussians"""
+    absolute_gradient_threshold: float = 8e-4
+    """mean absolute gradient that splits Gaussians with a large radius"""
+    means_rate: float = 1.6e-4
+    """first learning rate of positions, relative to the scene; it falls to 1 % log-linearly"""
+
+    def active_sh_degree(self, iteration: int) -> int:
+        """One degree more every 30th of the run."""
+        return min(self.sh_degree, 30 * iteration // self.iterations)
+
+    def position_rate(self, iteration: int, extent: float) -> float:
+        """Learning rate of the means, world units."""
+        return self.means_rate * extent * 0.01 ** (iteration / self.iterations)
+
+    def densify_interval(self, num_views: int) -> int:
+        """Iterations between densifications: a 300th of the run, but long enough for statistics of every view (or of 100)."""
+        return max(self.iterations // 300, min(self.iterations // 60, 50), min(num_views, 100), 1)
+
+    def densifies(self, iteration: int, num_views: int) -> bool:
+        """Whether Gaussians are added after this iteration."""
+        active = self.densify_from * self.iterations <= iteration <= self.densify_until * self.iterations
+        return active and iteration % self.densify_interval(num_views) == 0
+
+    def allowed_gaussians(self, iteration: int, num_initial: int) -> int:
+        """The cap at this iteration: it rises linearly while densifying, so that the places that need most get Gaussians, not the first to ask."""
+        progress = (iteration / self.iterations - self.densify_from) / max(self.densify_until - self.densify_from, 1e-9)
+        return min(self.max_gaussians, round(num_initial + max(self.max_gaussians - num_initial, 0) * min(progress, 1.0)))
+
+    def trims(self, iteration: int, num_views: int) -> bool:
+        """Whether to drop what fewer than two views saw, asked after each pass over the views: every 30th of the run while densifying."""
+        interval = max(self.iterations // 30, num_views)
+        due = iteration // interval > (iteration - num_views) // interval
+        return due and num_views >= 4 and 2 * num_views <= iteration <= self.densify_until * self.iterations
+
+    def resets_opacity(self, iteration: int) -> bool:
+        """Every tenth of the run while densifying, in runs long enough to recover from it (700 iterations)."""
+        interval = self.iterations // 10
+        return interval >= 700 and 0 < iteration < self.densify_until * self.iterations and iteration % interval == 0
+
+    def coarse(self, iteration: int) -> bool:
+        """Whether the images of this iteration are halved."""
+        return iteration < self.coarse_until * self.iterations
+
+    def shapes_surface(self, iteration: int) -> bool:
+        """Whether the normal and multi-view terms apply."""
+        return not self.plain and iteration >= max(self.surface_from, self.coarse_until) * self.iterations

@@ -1,0 +1,68 @@
+"""gaussians.ply + cameras + photos -> mesh.ply and cloud.ply, in the world of the cameras."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+
+from sc3d.errors import InputError
+from sc3d.geometry.cameras import local_origin, project, resample, undistorted
+from sc3d.io import read_image, write_geometry
+from sc3d.scene import Scene, check_photos
+from sc3d.settings import Extract
+from sc3d.splatting.extraction import centre_cloud, extract_surface
+from sc3d.splatting.gaussians import Gaussians
+from sc3d.splatting.neighbours import neighbour_views
+
+
+def inputs(scene: Scene, settings: Extract) -> list[Path]:
+    return [scene.gaussians, scene.sparse, scene.images]
+
+
+def outputs(scene: Scene, settings: Extract) -> list[Path]:
+    return [scene.cloud, scene.mesh] if settings.method == "tsdf" else [scene.cloud]
+
+
+def run(scene: Scene, settings: Extract) -> dict[str, object]:
+    scene.require(scene.gaussians, hint="run `sc3d train SCENE` first")
+    gaussians, comments = Gaussians.load(scene.gaussians)
+    model, origin = scene.model, local_origin(scene.model.views)
+    if any(line.startswith("sc3d origin") for line in comments) and f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}" not in comments:
+        raise InputError(f"{scene.gaussians} was trained with other cameras than those in {scene.sparse}: run `sc3d train SCENE --overwrite`")
+    centres = np.array([view.centre for view in model.views])
+    if settings.method == "centres":
+        cloud = centre_cloud(gaussians, centres - origin, settings.min_opacity)
+        write_geometry(scene.cloud, _placed(cloud, origin))
+        return {"points": len(cloud.point.positions)}
+    check_photos(scene, [view.name for view in model.views])
+    views = [undistorted(view.shifted(origin), settings.max_size) for view in model.views]
+
+    def image(row: int) -> np.ndarray:
+        return resample(read_image(scene.photo(model.views[row].name)), model.views[row].shifted(origin), views[row])
+
+    surfaces = extract_surface(gaussians, views, image, neighbour_views(model.tracks, model.points, centres), _depth_limit(model), settings)
+    write_geometry(scene.mesh, _placed(surfaces.mesh, origin))
+    write_geometry(scene.cloud, _placed(surfaces.cloud, origin))
+    return {
+        "points": len(surfaces.cloud.point.positions),
+        "triangles": len(surfaces.mesh.triangle.indices),
+        "voxel_size": round(surfaces.voxel_size, 5),
+        "coverage": f"{surfaces.coverage:.1%} of the pixels",
+    }
+
+
+def _depth_limit(model) -> float:  # noqa: ANN001 - SparseModel
+    """1.2 times the 99th percentile of the sparse points' depths."""
+    depths = [project(view, model.points[track])[1] for view, track in zip(model.views, model.tracks, strict=True) if len(track)]
+    if not depths:
+        raise InputError("the COLMAP model has no tracks: sparse points with the photos that see them are needed")
+    return 1.2 * float(np.quantile(np.concatenate(depths), 0.99))
+
+
+def _placed(geometry, origin: np.ndarray):  # noqa: ANN001, ANN202 - tensor PointCloud or TriangleMesh
+    """The geometry moved from the local frame to the world, with float64 positions."""
+    attributes = geometry.vertex if isinstance(geometry, o3d.t.geometry.TriangleMesh) else geometry.point
+    attributes.positions = o3d.core.Tensor(attributes.positions.numpy().astype(np.float64) + origin)
+    return geometry

@@ -1,0 +1,53 @@
+"""Photos -> sparse/0."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+from sc3d.errors import InputError
+from sc3d.io import atomic_path, find_photos, image_size
+from sc3d.scene import Scene
+from sc3d.settings import Reconstruct, ReconstructCommand
+from sc3d.sfm import reconstruct
+from sc3d.stages import execute, require_writable
+
+
+def main(command: ReconstructCommand) -> None:
+    scene = Scene(command.scene)
+    prepare(command.photos, scene)
+    execute("reconstruct", scene, command.reconstruct, command.overwrite)
+
+
+def prepare(photos: Path, scene: Scene) -> None:
+    """Check all photos, then make SCENE/images a link to their folder (a copy where links are not possible)."""
+    files = find_photos(photos)
+    for file in files:
+        image_size(file)
+    if len(files) < 2:
+        raise InputError(f"{photos} holds one photo: at least two that overlap are needed")
+    require_writable(scene.path)
+    if scene.images.exists() and scene.images.resolve() == photos.resolve():
+        return
+    if scene.images.exists() and not scene.images.is_symlink():
+        raise InputError(f"{scene.images} already holds other photos: choose another scene folder")
+    scene.path.mkdir(parents=True, exist_ok=True)
+    with atomic_path(scene.images) as temporary:
+        try:
+            os.symlink(photos.resolve(), temporary, target_is_directory=True)
+        except OSError:
+            shutil.copytree(photos, temporary)
+
+
+def inputs(scene: Scene, settings: Reconstruct) -> list[Path]:
+    return [scene.images]
+
+
+def outputs(scene: Scene, settings: Reconstruct) -> list[Path]:
+    return [scene.sparse]
+
+
+def run(scene: Scene, settings: Reconstruct) -> dict[str, object]:
+    names = [str(photo.relative_to(scene.images)) for photo in find_photos(scene.images)]
+    return reconstruct(scene.images, names, scene.sparse, settings)

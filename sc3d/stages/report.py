@@ -1,0 +1,24 @@
+"""Everything in the scene -> report.html."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sc3d.report import write_report
+from sc3d.scene import Scene
+from sc3d.settings import Report
+
+
+def inputs(scene: Scene, settings: Report) -> list[Path]:
+    return [scene.labelled, scene.metrics, scene.sparse, scene.masks, scene.classes]
+
+
+def outputs(scene: Scene, settings: Report) -> list[Path]:
+    return [settings.output or scene.report]
+
+
+def run(scene: Scene, settings: Report) -> dict[str, object]:
+    scene.require(scene.labelled, scene.classes, hint="run `sc3d propagate SCENE` first")
+    output = settings.output or scene.report
+    write_report(scene, output)
+    return {"kilobytes": output.stat().st_size // 1024}

@@ -1,0 +1,57 @@
+"""Photos (or a folder of masks) -> masks/ and confidence/."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from sc3d.classes import ClassTable
+from sc3d.errors import InputError
+from sc3d.io import find_photos
+from sc3d.scene import Scene, photo_sizes
+from sc3d.settings import Segment
+
+
+def inputs(scene: Scene, settings: Segment) -> list[Path]:
+    given = [path for path in (settings.masks, settings.confidence) if path is not None]
+    return [scene.classes, *(given if settings.backend == "files" else [scene.images])]
+
+
+def outputs(scene: Scene, settings: Segment) -> list[Path]:
+    return [scene.masks]
+
+
+def run(scene: Scene, settings: Segment) -> dict[str, object]:
+    class_table = scene.class_table()
+    if settings.backend == "files":
+        return _import(scene, settings, class_table)
+    from sc3d.segmentation.grounded_sam import GroundedSam, GroundedSamSettings
+    from sc3d.segmentation.run import segment_photos
+
+    names = GroundedSamSettings.__dataclass_fields__.keys() & Segment.__dataclass_fields__.keys()
+    segmenter = GroundedSam(GroundedSamSettings(**{name: getattr(settings, name) for name in names}), with_prompts(class_table, settings.prompts))
+    summary = segment_photos(find_photos(scene.images), scene.masks, scene.confidence, segmenter)
+    pixels = {class_table.name(label): int(count) for label, count in enumerate(summary.num_pixels) if count}
+    return {"segmented": len(summary.segmented), "already_there": len(summary.skipped)} | {f"pixels_{name}": count for name, count in pixels.items()}
+
+
+def with_prompts(class_table: ClassTable, prompts: tuple[str, ...]) -> ClassTable:
+    """The table with the prompts of some classes replaced; `prompts`: texts like "road=street,parking lot"."""
+    texts = {}
+    for prompt in prompts:
+        name, separator, values = prompt.partition("=")
+        if not separator or name not in {entry.name for entry in class_table} or not values.strip():
+            raise InputError(f"--prompts {prompt!r} must be NAME=text,text with a class name of {[entry.name for entry in class_table]}")
+        texts[name] = tuple(value.strip() for value in values.split(",") if value.strip())
+    return ClassTable(tuple(replace(entry, prompts=texts.get(entry.name, entry.prompts)) for entry in class_table))
+
+
+def _import(scene: Scene, settings: Segment, class_table: ClassTable) -> dict[str, object]:
+    from sc3d.segmentation.files import import_masks
+
+    if settings.masks is None:
+        if not scene.masks.is_dir():
+            raise InputError("--masks FOLDER is needed (or --backend grounded-sam, which makes masks from the prompts in classes.json)")
+        return {"masks": len(scene.mask_files(scene.masks, class_table)), "source": "already in the scene"}
+    names = import_masks(settings.masks, scene.masks, photo_sizes(scene.images), class_table, settings.confidence, scene.confidence)
+    return {"masks": len(names), "confidence": settings.confidence is not None}

@@ -1,0 +1,29 @@
+"""Settings -> a complete scene with truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tqdm import tqdm
+
+from sc3d.scene import Scene
+from sc3d.settings import Synthesize
+from sc3d.synthetic import synthesize
+
+
+def inputs(scene: Scene, settings: Synthesize) -> list[Path]:
+    return []
+
+
+def outputs(scene: Scene, settings: Synthesize) -> list[Path]:
+    return [scene.images, scene.path / "depth", scene.truth, scene.masks, scene.confidence, scene.sparse, scene.classes, scene.path / "truth.ply"]
+
+
+def run(scene: Scene, settings: Synthesize) -> dict[str, object]:
+    with tqdm(total=100, desc="synthesize", unit="%", disable=None) as bar:
+
+        def show(share: float, text: str) -> None:
+            bar.update(round(100 * share) - bar.n)
+            bar.set_postfix_str(text)
+
+        return synthesize(scene.path, settings, show)

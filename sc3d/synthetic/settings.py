@@ -1,0 +1,42 @@
+"""Settings of the synthetic scene; light to import, so that --help is quick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sc3d.errors import InputError
+
+
+@dataclass(frozen=True)
+class SynthesizeSettings:
+    """What the synthetic scene looks like and how it is photographed."""
+
+    seed: int = 0
+    """Fixes the world, the flight and the mask errors."""
+    views: int = 40
+    """Number of photos: a nadir grid (60 %) and two oblique rings."""
+    width: int = 800
+    """Width of the photos, px; the height follows at 3:2."""
+    mask_noise: float = 1.0
+    """Strength of the mask errors: 0 = perfect masks, 1 = about 77 % of the pixels right."""
+    extent: float = 120.0
+    """Side of the square site, m; ground outside of it is truth 0."""
+    altitude: float = 60.0
+    """Height of the nadir photos above the ground, m."""
+    num_points: int = 1_000_000
+    """Points in truth.ply."""
+    gps_noise: float = 0.0
+    """Standard deviation of the GPS position in the photos' EXIF, m per axis."""
+
+    def __post_init__(self) -> None:
+        if self.views < 1 or self.width < 32 or self.num_points < 1:
+            raise InputError("views and num_points must be at least 1, width at least 32")
+        if self.extent < 40 or self.altitude < 20:
+            raise InputError("extent must be at least 40 m and altitude at least 20 m")
+        if self.mask_noise < 0 or self.gps_noise < 0:
+            raise InputError("mask_noise and gps_noise must not be negative")
+
+    @property
+    def height(self) -> int:
+        """Height of the photos, px."""
+        return round(self.width * 534 / 800)

@@ -1,0 +1,85 @@
+"""The synthetic world: triangles with materials and labels, ready for ray casting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import open3d as o3d
+
+from sc3d.synthetic.ground import Ground, add_ground, plan_ground
+from sc3d.synthetic.layout import build_fences, park_cars, place_buildings, plant
+from sc3d.synthetic.mesh import LEAF, MeshBuilder, face_normals
+from sc3d.synthetic.objects import Building, add_building
+from sc3d.synthetic.settings import SynthesizeSettings
+from sc3d.synthetic.shading import SUN, shade, surface_labels
+
+
+@dataclass(frozen=True)
+class World:
+    """A site centred on the origin, z up, metres.
+
+    corners: (T, 3, 3) float32 triangles; floats: (T, 17) float32 and ints: (T, 3) int32 as `MeshBuilder.finish` returns them
+    """
+
+    seed: int
+    ground: Ground
+    buildings: list[Building]
+    corners: np.ndarray
+    floats: np.ndarray
+    ints: np.ndarray
+    scene: o3d.t.geometry.RaycastingScene = field(repr=False)
+
+    def cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """First hits of rays (N, 3): (N,) float32 range in units of the direction, inf = none; (N,) int64 triangle, -1 = none."""
+        hits = self.scene.cast_rays(_ray_tensor(origins, directions), nthreads=0)
+        triangles = hits["primitive_ids"].numpy()
+        triangles = np.where(triangles == o3d.t.geometry.RaycastingScene.INVALID_ID, -1, triangles.astype(np.int64))
+        return hits["t_hit"].numpy(), triangles
+
+    def hidden(self, origins: np.ndarray, directions: np.ndarray, far: float = float("inf")) -> np.ndarray:
+        """(N,) bool: rays (N, 3) that hit anything before `far` times their direction."""
+        return self.scene.test_occlusions(_ray_tensor(origins, directions), tnear=0.0, tfar=far).numpy()
+
+    def labels(self, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+        """(N,) uint8 labels of surface points (N, 3) on triangles (N,); 0 = other objects, sky, ground outside the site."""
+        return surface_labels(points, triangles, self.ints, self.ground.half, self.ground.extent / 2, self.ground.rasters, self.ground.rects)
+
+    def light(self, points: np.ndarray, triangles: np.ndarray, footprints: np.ndarray) -> np.ndarray:
+        """(N, 3) float32 linear RGB of surface points (N, 3) float32 in sun and shadow; `footprints` (N,) float32 sample sizes, m."""
+        offset = 0.02 * SUN + 0.01 * self.floats[triangles, 9:12]
+        lit = ~self.hidden(points + offset, np.broadcast_to(SUN, points.shape))
+        ground = self.ground
+        return shade(points, triangles, lit.view(np.uint8), footprints, self.floats, self.ints, ground.half, ground.rasters, ground.rects, SUN)
+
+    def normals(self, triangles: np.ndarray) -> np.ndarray:
+        """(N, 3) outward unit normals of triangles (N,); leaves have two sides, theirs point out of the crown."""
+        normals = face_normals(self.corners[triangles].astype(np.float64))
+        leaf = self.ints[triangles, 0] == LEAF
+        inward = (normals * self.floats[triangles, 9:12]).sum(1) < 0
+        normals[leaf & inward] *= -1
+        return normals
+
+
+def build_world(settings: SynthesizeSettings) -> World:
+    """Build the site of `settings.seed` and `settings.extent`: ground, roads, buildings, plants, cars."""
+    streams = np.random.default_rng([settings.seed, 1]).spawn(6)
+    ground = plan_ground(settings.extent, streams[0])
+    buildings = place_buildings(ground, streams[1])
+    builder = MeshBuilder()
+    add_ground(builder, ground)
+    for building in buildings:
+        add_building(builder, building, streams[2])
+    plant(builder, ground, buildings, streams[3])
+    park_cars(builder, ground, streams[4])
+    build_fences(builder, ground, buildings, streams[5])
+    corners, floats, ints = builder.finish()
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(corners.reshape(-1, 3)), o3d.core.Tensor(np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)))
+    return World(settings.seed, ground, buildings, corners, floats, ints, scene)
+
+
+def _ray_tensor(origins: np.ndarray, directions: np.ndarray) -> o3d.core.Tensor:
+    table = np.empty((len(directions), 6), np.float32)
+    table[:, :3], table[:, 3:] = origins, directions
+    return o3d.core.Tensor(table)

@@ -1,0 +1,210 @@
+"""Open3D's two renderers behind one function: Filament on Vulkan, and the OpenGL visualizer through EGL. Neither needs a display.
+
+Known failures, and what is done about them (Open3D 0.20):
+- no Vulkan driver: the process aborts instead of raising, and after a failed start the OpenGL visualizer fails too: so another process tries first;
+- two living OffscreenRenderers abort: each dies in the function that made it;
+- the OpenGL visualizer ignores the principal point and fx != fy: it draws a larger centred picture, from which the view is cut.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from sc3d.errors import Sc3dError
+from sc3d.geometry.cameras import View, pinhole_view
+
+logger = logging.getLogger(__name__)
+
+_NO_RENDERER = "cannot render pictures here: `apt install libvulkan1 mesa-vulkan-drivers` (or libegl1 libgl1-mesa-dri) provides a software renderer"
+_PROBE = "import open3d as o3d; o3d.visualization.rendering.OffscreenRenderer(16, 16).render_to_image()"
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What is drawn, in a frame near the origin, so that float32 suffices.
+
+    points: (N, 3) float32; colors: (N, 3) uint8 RGB; point_size: px
+    triangles: (F, 3) int, rows of `points`; None = a cloud
+    lines: (L, 2, 3) float32 ends of lines; line_color: RGB uint8
+    """
+
+    points: np.ndarray
+    colors: np.ndarray
+    point_size: float = 1.0
+    triangles: np.ndarray | None = None
+    lines: np.ndarray | None = None
+    line_color: tuple[int, int, int] = (240, 160, 20)
+
+
+def render(drawing: Drawing, view: View, background: tuple[int, int, int], renderer: str = "auto") -> np.ndarray:
+    """Draw through a pinhole view.
+
+    view: without distortion, in the frame of `drawing`; renderer: "auto", "vulkan" or "egl"
+    returns: (H, W, 3) uint8 RGB, colours exactly as given: no light, no antialiasing
+    Raises Sc3dError that names the packages to install.
+    """
+    if renderer == "auto":
+        renderer = "vulkan" if vulkan_works() else "egl"
+    with _quiet():
+        return (_render_vulkan if renderer == "vulkan" else _render_egl)(drawing, view, background)
+
+
+@functools.cache
+def vulkan_works() -> bool:
+    """Whether OffscreenRenderer works here, tried in another process because it may abort."""
+    try:
+        probe = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, timeout=120, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    if probe.returncode:
+        logger.info("Open3D's Vulkan renderer does not work here, OpenGL is used")
+    return probe.returncode == 0
+
+
+def _render_vulkan(drawing: Drawing, view: View, background: tuple[int, int, int]) -> np.ndarray:
+    import open3d as o3d
+
+    rendering = o3d.visualization.rendering
+    try:
+        renderer = rendering.OffscreenRenderer(view.width, view.height)
+    except RuntimeError:
+        raise Sc3dError(_NO_RENDERER) from None
+    scene = renderer.scene
+    scene.set_background([*(np.array(background) / 255.0), 1.0])
+    scene.view.set_post_processing(False)  # tone mapping would change class colours
+    scene.view.set_antialiasing(False)
+    scene.view.set_sample_count(1)
+    for name, geometry in _tensor_geometries(drawing).items():
+        material = rendering.MaterialRecord()
+        material.shader = "unlitLine" if name == "lines" else "defaultUnlit"
+        material.point_size = drawing.point_size
+        material.line_width = 3.0
+        scene.add_geometry(name, geometry, material)
+    renderer.setup_camera(view.matrix, view.cam_from_world, view.width, view.height)
+    return np.array(renderer.render_to_image())
+
+
+def _tensor_geometries(drawing: Drawing) -> dict:
+    import open3d as o3d
+
+    tensor = o3d.core.Tensor.from_numpy
+    colors = tensor(np.ascontiguousarray(drawing.colors, dtype=np.float32) / np.float32(255))
+    points = tensor(np.ascontiguousarray(drawing.points, dtype=np.float32))
+    geometries = {}
+    if drawing.triangles is not None and len(drawing.triangles):
+        mesh = o3d.t.geometry.TriangleMesh(points, tensor(np.ascontiguousarray(drawing.triangles, dtype=np.int32)))
+        mesh.vertex.colors = colors
+        mesh.vertex.normals = tensor(np.tile(np.float32([0, 0, 1]), (len(drawing.points), 1)))  # unused, but asked for
+        geometries["mesh"] = mesh
+    elif drawing.triangles is None and len(drawing.points):
+        cloud = o3d.t.geometry.PointCloud(points)
+        cloud.point.colors = colors
+        geometries["cloud"] = cloud
+    if drawing.lines is not None and len(drawing.lines):
+        geometries["lines"] = _line_set(drawing)
+    return geometries
+
+
+def _line_set(drawing: Drawing) -> object:
+    import open3d as o3d
+
+    ends = np.asarray(drawing.lines, np.float64).reshape(-1, 3)
+    lines = o3d.geometry.LineSet(o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(np.arange(len(ends)).reshape(-1, 2)))
+    lines.paint_uniform_color(np.array(drawing.line_color) / 255.0)
+    return lines
+
+
+def _render_egl(drawing: Drawing, view: View, background: tuple[int, int, int]) -> np.ndarray:
+    import open3d as o3d
+
+    canvas, rows, columns = _centred_canvas(view)
+    visualizer = o3d.visualization.Visualizer()
+    if not visualizer.create_window(width=canvas.width, height=canvas.height, visible=False):
+        raise Sc3dError(_NO_RENDERER)
+    try:
+        options = visualizer.get_render_option()
+        options.point_size = drawing.point_size
+        options.background_color = np.array(background) / 255.0
+        options.light_on = False
+        options.mesh_show_back_face = True
+        for geometry in _legacy_geometries(drawing):
+            visualizer.add_geometry(geometry)
+        control = visualizer.get_view_control()
+        camera = o3d.camera.PinholeCameraParameters()
+        camera.intrinsic = o3d.camera.PinholeCameraIntrinsic(canvas.width, canvas.height, canvas.matrix)
+        camera.extrinsic = canvas.cam_from_world
+        control.convert_from_pinhole_camera_parameters(camera, allow_arbitrary=True)
+        near, far = _depth_range(drawing, view)
+        control.set_constant_z_near(near)
+        control.set_constant_z_far(far)
+        visualizer.poll_events()
+        visualizer.update_renderer()
+        image = np.round(np.array(visualizer.capture_screen_float_buffer(True)) * 255).astype(np.uint8)
+    finally:
+        visualizer.destroy_window()
+    return image[rows[:, None], columns]
+
+
+def _centred_canvas(view: View) -> tuple[View, np.ndarray, np.ndarray]:
+    """A view with square pixels and centred principal point that holds `view`, and the canvas rows (H,) and columns (W,) of its pixels."""
+    (focal_x, _, centre_x), (_, focal_y, centre_y) = view.matrix[:2]
+    focal = max(focal_x, focal_y)
+    half_width = int(np.ceil(max(centre_x, view.width - centre_x) * focal / focal_x))
+    half_height = int(np.ceil(max(centre_y, view.height - centre_y) * focal / focal_y))
+    columns = np.floor((np.arange(view.width) + 0.5 - centre_x) * focal / focal_x + half_width).astype(int)
+    rows = np.floor((np.arange(view.height) + 0.5 - centre_y) * focal / focal_y + half_height).astype(int)
+    size = (2 * half_width, 2 * half_height)
+    canvas = pinhole_view(view.name, size, (focal, focal, half_width, half_height), view.cam_from_world)
+    return canvas, np.clip(rows, 0, size[1] - 1), np.clip(columns, 0, size[0] - 1)
+
+
+def _depth_range(drawing: Drawing, view: View) -> tuple[float, float]:
+    ends = [drawing.points] if drawing.lines is None else [drawing.points, np.reshape(drawing.lines, (-1, 3))]
+    depth = np.concatenate(ends) @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
+    depth = depth[depth > 0]
+    if not len(depth):
+        return 0.1, 1000.0
+    far = float(depth.max()) * 1.01
+    return max(float(depth.min()) * 0.99, far * 1e-4), far
+
+
+def _legacy_geometries(drawing: Drawing) -> list:
+    import open3d as o3d
+
+    points, colors = o3d.utility.Vector3dVector(drawing.points.astype(np.float64)), o3d.utility.Vector3dVector(drawing.colors / 255.0)
+    if drawing.triangles is not None:
+        geometry = o3d.geometry.TriangleMesh(points, o3d.utility.Vector3iVector(drawing.triangles.astype(np.int32)))
+        geometry.vertex_colors = colors
+    else:
+        geometry = o3d.geometry.PointCloud(points)
+        geometry.colors = colors
+    return [geometry] + ([_line_set(drawing)] if drawing.lines is not None and len(drawing.lines) else [])
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the renderers' chatter, which C++ writes to both streams, from the user; it goes to the debug log."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    saved = os.dup(1), os.dup(2)
+    with tempfile.TemporaryFile() as chatter:
+        try:
+            os.dup2(chatter.fileno(), 1)
+            os.dup2(chatter.fileno(), 2)
+            yield
+        finally:
+            for target, descriptor in zip((1, 2), saved, strict=True):
+                os.dup2(descriptor, target)
+                os.close(descriptor)
+            chatter.seek(0)
+            logger.debug("renderer: %s", chatter.read().decode(errors="replace").strip())
