@@ -130,7 +130,8 @@ def write_image(path: Path, image: np.ndarray) -> None:
     import cv2
 
     with atomic_path(path) as temporary:
-        cv2.imwrite(str(temporary), image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
+        if not cv2.imwrite(str(temporary), image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])):
+            raise OSError(f"could not write {path}: is the disk full?")
 
 
 def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported late

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
-from sc3d.fusion import LOCKED, PROPAGATED, UNLOCKED, SEED, Labels
-from sc3d.geometry.neighbors import NeighborIndex, curvature, estimate_normals, point_spacing
+from sc3d.fusion import PROPAGATED, SEED, UNLOCKED, Labels
+from sc3d.geometry.neighbors import NeighborIndex, curvature, estimate_normals
 from sc3d.settings import Propagate
 
 ALPHA, BETA, GAMMA = 0.6, 0.4, 1.0  # eq. 7
@@ -78,8 +78,10 @@ def propagate(points: np.ndarray, graph: Graph, seeds: Labels, likelihood: np.nd
     elif settings.method == "geometry":
         label, confidence = grow(graph.weights, start)
     else:
-        label, confidence = mean_field(graph.weights, _log_likelihood(likelihood, start), settings.smoothness)
-        label = np.where(_connected(graph.weights, start), label, 0)
+        grown, _ = grow(graph.weights, start)  # points without votes start from the front's label; votes would take one edge per step to reach them
+        label, confidence = mean_field(graph.weights, _log_likelihood(likelihood, start), settings.smoothness,
+                                       np.where(likelihood[:, 1:].any(axis=1), 0, grown))
+        label = np.where(grown > 0, label, 0)
     if settings.fill and (label == 0).any() and (label > 0).any():
         filled, filled_confidence = vote_nearest(points, label, 1)
         label, confidence = np.where(label == 0, filled, label), np.where(label == 0, 0.5 * filled_confidence, confidence)
@@ -136,13 +138,20 @@ def grow(weights: scipy.sparse.csr_matrix, label: np.ndarray) -> tuple[np.ndarra
     return result, confidence
 
 
-def mean_field(weights: scipy.sparse.csr_matrix, log_likelihood: np.ndarray, smoothness: float) -> tuple[np.ndarray, np.ndarray]:
+def mean_field(
+    weights: scipy.sparse.csr_matrix, log_likelihood: np.ndarray, smoothness: float, start: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Minimise the Potts energy sum_i -log p_i(l_i) + smoothness sum_(i,j) w_ij [l_i != l_j] by mean field (METHOD 0.1).
 
     log_likelihood: (N, C) float32, column 0 = -inf
+    start: (N,) first labels of points, 0 = as the likelihood says
     returns: (N,) uint8 labels, (N,) float32 probability of each
     """
     belief = _softmax(log_likelihood)
+    if start is not None:
+        given = np.flatnonzero(start)
+        belief[given] = 0
+        belief[given, start[given]] = 1
     for _ in range(MEAN_FIELD_STEPS):
         belief = _softmax(log_likelihood + smoothness * (weights @ belief))
     label = belief.argmax(axis=1)
@@ -161,12 +170,6 @@ def _votes(weights: scipy.sparse.csr_matrix, rows: np.ndarray, label: np.ndarray
     one_hot[np.arange(len(label)), label] = 1
     one_hot[:, 0] = 0
     return weights[rows] @ one_hot
-
-
-def _connected(weights: scipy.sparse.csr_matrix, label: np.ndarray) -> np.ndarray:
-    """(N,) bool: points whose connected component holds a labelled point."""
-    count, component = scipy.sparse.csgraph.connected_components(weights, directed=False)
-    return (np.bincount(component, weights=label > 0, minlength=count) > 0)[component]
 
 
 def _log_likelihood(votes: np.ndarray, start: np.ndarray) -> np.ndarray:

@@ -159,7 +159,7 @@ def match_masks(folder: Path, photo_sizes: dict[str, tuple[int, int]], class_tab
     photo_sizes: (width, height) px by photo name
     returns: path of the mask by photo name, for photos that have one
     """
-    files = sorted(folder.glob("*.png")) if folder.is_dir() else []
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() == ".png" and not file.name.startswith(".")) if folder.is_dir() else []
     if not files:
         raise InputError(f"no masks in {folder}: PNG files named like the photos are expected")
     names = {Path(name).stem: name for name in photo_sizes}

@@ -218,7 +218,8 @@ def test_gradient_statistic_is_the_derivative_by_the_2d_mean():
     double, step = with_gradients(gaussians, torch.float64), 1e-4
     slopes = []
     for dx, dy in ((step, 0.0), (0.0, step)):
-        shifted = [weighted_sum(render_reference(double, make_view(calibration=(40.0, 42.0, 27.3 + s * dx, 15.1 + s * dy)))[:1]).item() for s in (-1, 1)]
+        views = [make_view(calibration=(40.0, 42.0, 27.3 + sign * dx, 15.1 + sign * dy)) for sign in (-1, 1)]
+        shifted = [weighted_sum(render_reference(double, shifted_view)[:1]).item() for shifted_view in views]
         slopes.append((shifted[1] - shifted[0]) / (2 * step))
     expected = np.hypot(slopes[0] * 45 / 2, slopes[1] * 37 / 2)
     assert float(rendering.statistics.gradient[0]) == pytest.approx(expected, rel=1e-3)

@@ -109,6 +109,12 @@ def test_road_labels_follow_the_centre_lines(world, views, photos):
     assert (label[on_ground & (distance > 4.65) & ~paved] == GRASS).all()
 
 
+def test_truth_ends_at_the_border_of_the_site(views, photos):
+    for view, photo in zip(views, photos):
+        outside = np.abs(surface_points(view, photo.depth)[:, :2]).max(1) > SETTINGS.extent / 2 + 0.01
+        assert (photo.label.ravel()[outside] == OTHER).all()
+
+
 def test_crowns_let_the_ground_shine_through(photos):
     label = photos[2].label
     tree_share = np.stack([np.roll(label == TREE, (dy, dx), (0, 1)) for dy in (-2, 0, 2) for dx in (-2, 0, 2)]).mean(0)

@@ -40,10 +40,14 @@ class DepthFusion:
 
     def mesh(self, min_weight: float = 1.0) -> o3d.t.geometry.TriangleMesh:
         """Triangles of the zero level set where at least `min_weight` views agree there is a surface."""
+        if not self._grid.hashmap().size():
+            return o3d.t.geometry.TriangleMesh(o3d.core.Tensor.zeros((0, 3)), o3d.core.Tensor.zeros((0, 3), o3d.core.int32))
         return self._grid.extract_triangle_mesh(min_weight)
 
     def cloud(self, min_weight: float = 1.0) -> o3d.t.geometry.PointCloud:
         """Points where the zero level set crosses the grid's edges: positions, colors uint8, unit normals out of the surface."""
+        if not self._grid.hashmap().size():
+            return o3d.t.geometry.PointCloud(o3d.core.Tensor.zeros((0, 3)))
         cloud = self._grid.extract_point_cloud(min_weight)
         if "colors" in cloud.point:
             colors = np.clip(np.round(cloud.point.colors.numpy() * 255), 0, 255).astype(np.uint8)

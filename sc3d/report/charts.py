@@ -15,6 +15,15 @@ def css_color(color: Sequence[int]) -> str:
     return "#" + "".join(f"{int(value):02x}" for value in color)
 
 
+def number(value: object) -> float | None:
+    """A finite number, else None."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value) else None
+
+
+def formatted(value: float | None, pattern: str) -> str:
+    return "–" if value is None else format(value, pattern)
+
+
 def paired_bars(rows: Sequence[tuple[str, Color, float | None, float | None]]) -> str:
     """Two bars per row, on the scale 0 to 1: the upper in the row's colour, the lower grey.
 
@@ -85,7 +94,7 @@ def flight_map(centres: np.ndarray, headings: np.ndarray, names: Sequence[str], 
                      f'width="{(x_high - x_low) * scale:.1f}" height="{(y_high - y_low) * scale:.1f}" preserveAspectRatio="none"/>')
     for (x, y), (east, north), name in zip((centres - low) * scale, headings, names, strict=True):
         y = height - y
-        parts.append(f'<g class="camera"><line x1="{x:.1f}" y1="{y:.1f}" x2="{x + 18 * east:.1f}" y2="{y - 18 * north:.1f}"/>'
+        parts.append(f'<g class="camera"><line x1="{x:.1f}" y1="{y:.1f}" x2="{x + 36 * east:.1f}" y2="{y - 36 * north:.1f}"/>'
                      f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4.5"/><title>{html.escape(name)}</title></g>')
     length = _round_length(span / 4)
     parts.append(f'<path class="scale" d="M10 {height + 12:.1f}v6h{length * scale:.1f}v-6"/>'

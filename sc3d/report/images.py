@@ -20,24 +20,24 @@ from sc3d.view import COLOURINGS, LabelledSurface, Style, color_points, draw_poi
 logger = logging.getLogger(__name__)
 
 BACKGROUND = (238, 240, 242)
-_PICTURE = (1280, 720)
+_SIZES = {"oblique": (1280, 760), "above": (900, 900)}  # px
 _PHOTO_SIZE = 640  # px, longest side of a photo in the comparison
 _MAX_POINTS = 1_500_000
 
 
-def cloud_pictures(material: Material) -> dict[tuple[str, str], str]:
-    """Data URIs by (colouring or "mesh", "oblique" or "above"), of what the cloud has; empty where no renderer works."""
+def cloud_pictures(material: Material) -> dict[tuple[str, str], tuple[str, float]]:
+    """Data URIs and width/height by (colouring or "mesh", "oblique" or "above"), of what the cloud has; empty where no renderer works."""
     pictures = {}
     try:
-        for direction in ("oblique", "above"):
+        for direction, size in _SIZES.items():
             style = Style(from_above=direction == "above", legend=False, background=BACKGROUND, max_points=_MAX_POINTS)
             if material.cloud is not None:
-                point_image = draw_points(material.points, None, _PICTURE, style)
+                point_image = draw_points(material.points, None, size, style)
                 for by, colors in _colorings(material).items():
                     painted = point_image.paint(colors, replace(style, shading=0.0 if by == "photo" else 0.6))
-                    pictures[by, direction] = jpeg(_trimmed(painted))
+                    pictures[by, direction] = _picture(painted)
             if material.mesh is not None:
-                pictures["mesh", direction] = jpeg(_trimmed(screenshot(material.mesh, None, _PICTURE, style)))
+                pictures["mesh", direction] = _picture(screenshot(material.mesh, None, size, style))
     except Sc3dError as error:
         logger.warning("the report has no pictures of the cloud: %s", error)
     return pictures
@@ -74,7 +74,7 @@ def comparison(material: Material, view: View, labelled: LabelledSurface | None)
     return panels
 
 
-def ground_picture(points: np.ndarray, colors: np.ndarray, longest: int = 480) -> tuple[str, tuple[float, float, float, float]]:
+def ground_picture(points: np.ndarray, colors: np.ndarray, longest: int = 640) -> tuple[str, tuple[float, float, float, float]]:
     """The cloud straight from above, parallel projection, north up: the highest point of each cell.
 
     points: (N, 3) world; colors: (N, 3) uint8 RGB
@@ -82,16 +82,16 @@ def ground_picture(points: np.ndarray, colors: np.ndarray, longest: int = 480) -
     """
     low, high = np.quantile(points[:: max(1, len(points) // 200_000), :2], [0.002, 0.998], axis=0)
     inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
-    longest = int(min(longest, max(8, 0.7 * np.sqrt(inside.sum()))))
+    longest = int(min(longest, max(8, 0.6 * np.sqrt(inside.sum()))))
     cell = max(float((high - low).max()) / longest, 1e-9)
     width, height = np.maximum(np.ceil((high - low) / cell).astype(int), 1)
     order = np.argsort(points[inside, 2], kind="stable")
     columns, rows = np.minimum((points[inside, :2] - low) / cell, [width - 1, height - 1]).astype(int)[order].T
     picture = np.zeros((height, width, 4), np.uint8)
     picture[height - 1 - rows, columns] = np.column_stack([colors[inside][order], np.full(len(order), 255)])
-    holes = picture[..., 3] == 0
-    filled = np.stack([cv2.medianBlur(np.ascontiguousarray(picture[..., channel]), 3) for channel in range(4)], axis=-1)
-    picture[holes] = filled[holes]
+    for _ in range(2):  # close single holes between the points
+        holes = picture[..., 3] == 0
+        picture[holes] = cv2.dilate(picture, np.ones((3, 3), np.uint8))[holes]
     return _png_uri(picture[..., [2, 1, 0, 3]]), (low[0], high[1] - height * cell, low[0] + width * cell, high[1])
 
 
@@ -111,7 +111,10 @@ def _png_uri(image: np.ndarray) -> str:
     return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
-def _trimmed(image: np.ndarray) -> np.ndarray:
-    """Without empty rows above and below, but for a margin."""
-    rows = np.flatnonzero((image != np.uint8(BACKGROUND)).any(axis=(1, 2)))
-    return image if not len(rows) else image[max(0, rows[0] - 24) : rows[-1] + 25]
+def _picture(image: np.ndarray) -> tuple[str, float]:
+    """Data URI and aspect of a picture without its empty border, but for a margin."""
+    filled = (image != np.uint8(BACKGROUND)).any(axis=2)
+    rows, columns = np.flatnonzero(filled.any(axis=1)), np.flatnonzero(filled.any(axis=0))
+    if len(rows):
+        image = image[max(0, rows[0] - 20) : rows[-1] + 21, max(0, columns[0] - 20) : columns[-1] + 21]
+    return jpeg(image), image.shape[1] / image.shape[0]

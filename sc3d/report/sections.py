@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from html import escape
 from pathlib import Path
 
 import numpy as np
 
-from sc3d.report.charts import css_color, flight_map, histogram, paired_bars, stacked_bar
+from sc3d.report.charts import css_color, flight_map, formatted, histogram, number, paired_bars, stacked_bar
 from sc3d.report.images import cloud_pictures, comparison, ground_picture
 from sc3d.report.material import Material
+from sc3d.report.processing import processing_section
 from sc3d.view import LabelledSurface, color_points
 from sc3d.view.colors import STATES, confidence_colors, legend_entries
 
@@ -41,7 +41,7 @@ def summary_line(material: Material) -> str:
     if counts is not None:
         parts.append(f"in {_count(int((counts[1:] > 0).sum()), 'class', 'classes')}")
     sentence = " ".join(parts) or "An empty scene"
-    accuracy = _number(material.figures("labels").get("oa"))
+    accuracy = number(material.figures("labels").get("oa"))
     if accuracy is not None:
         photos = material.metrics.get("photos")
         where = f" of {_count(len(photos), 'photo')} with truth" if isinstance(photos, list) else ""
@@ -54,10 +54,10 @@ def headline(material: Material) -> str:
     labels, masks = material.figures("labels"), material.figures("masks")
     tiles = []
     for key, name, pattern in (("oa", "Overall accuracy", "{:.1%}"), ("miou", "Mean IoU", "{:.3f}")):
-        value, before = _number(labels.get(key)), _number(masks.get(key))
+        value, before = number(labels.get(key)), number(masks.get(key))
         if value is not None:
             tiles.append((name, pattern.format(value), "" if before is None else f"given masks {pattern.format(before)}"))
-    coverage, counts = _number(labels.get("coverage")), material.label_counts
+    coverage, counts = number(labels.get("coverage")), material.label_counts
     if coverage is not None:
         tiles.append(("Coverage", f"{coverage:.1%}", "of the pixels carry a label"))
     elif counts is not None:
@@ -75,13 +75,18 @@ def cloud_section(material: Material) -> str:
     pictures = cloud_pictures(material)
     names = [name for name in _COLOURING_NAMES if (name, "oblique") in pictures]
     tabs, panels = [], []
-    for number, name in enumerate(names):
-        tabs.append(f'<button type="button" role="tab" aria-selected="{str(number == 0).lower()}" data-panel="cloud-{name}">{_COLOURING_NAMES[name]}</button>')
-        images = "".join(f'<img src="{pictures[name, direction]}" alt="{_COLOURING_NAMES[name]}, {text}">'
+    for position, name in enumerate(names):
+        title, selected = _COLOURING_NAMES[name], str(position == 0).lower()
+        tabs.append(f'<button type="button" role="tab" aria-selected="{selected}" data-panel="cloud-{name}">{title}</button>')
+        images = "".join(_zoomable(*pictures[name, direction], f"{title}, {text}")
                          for direction, text in (("oblique", "from the south"), ("above", "from above")) if (name, direction) in pictures)
-        panels.append(f'<figure id="cloud-{name}" class="panel" {"" if number == 0 else "hidden"}>'
-                      f'<figcaption class="print-only">{_COLOURING_NAMES[name]}</figcaption>{images}{_legend(material, name)}</figure>')
+        panels.append(f'<figure id="cloud-{name}" class="panel" {"" if position == 0 else "hidden"}>'
+                      f'<figcaption class="print-only">{title}</figcaption><div class="pair">{images}</div>{_legend(material, name)}</figure>')
     return f'<div class="tabs" role="tablist">{"".join(tabs)}</div>{"".join(panels)}' if names else ""
+
+
+def _zoomable(uri: str, aspect: float, text: str) -> str:
+    return f'<img class="zoom" style="flex: {aspect:.3f} 1 0" src="{uri}" alt="{text}" title="{text}; click to enlarge">'
 
 
 def quality_section(material: Material) -> str:
@@ -92,6 +97,9 @@ def quality_section(material: Material) -> str:
     colors = _class_colors(material)
     rows = [(name, colors.get(name, (128, 128, 128)), value, masks.get(name)) for name, value in labels.items()]
     note = "Intersection over union per class against the truth masks. Wide bar: fused labels" + ("; grey bar: the given masks." if masks else ".")
+    near, elsewhere = (number(material.figures(f"labels_{where}").get("oa")) for where in ("near_edges", "elsewhere"))
+    if near is not None and elsewhere is not None:
+        note += f" Near depth edges {near:.1%} of the pixels are right, elsewhere {elsewhere:.1%}."
     return f'<p class="note">{note}</p>{paired_bars(rows)}{_confusion(material)}'
 
 
@@ -122,11 +130,12 @@ def class_section(material: Material) -> str:
         name = material.class_table.name(label)
         mean = "–" if sums is None or not counts[label] else f"{sums[label] / counts[label]:.2f}"
         cells = [f"{counts[label]:,}", f"{counts[label] / total:.1%}"] + ([mean] if sums is not None else [])
-        cells += [_format(iou.get(name), ".3f")] if iou else []
+        cells += [formatted(iou.get(name), ".3f")] if iou else []
         swatch = f'<i style="background:{css_color(material.class_table.palette[label])}"></i>'
         rows.append(f"<tr><th>{swatch}{escape(name)}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
-    heads = ["Class", "Points", "Share"] + (["Mean confidence"] if sums is not None else []) + (["IoU"] if iou else [])
-    return f"<table><thead><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    heads = ["Class", "Points", "Share"] + (["Confidence"] if sums is not None else []) + (["IoU"] if iou else [])
+    head = "".join(f"<th>{name}</th>" for name in heads)
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
 
 
 def certainty_section(material: Material) -> str:
@@ -154,25 +163,9 @@ def flight_section(material: Material) -> str:
     ground = None
     if "colors" in (material.cloud.point if material.cloud is not None else {}):
         ground = ground_picture(material.points, color_points(material.cloud, "photo"))
-    heights = f"{_count(len(centres), 'camera')}, {centres[:, 2].min():,.1f} to {centres[:, 2].max():,.1f} m high (z). The line shows where each looks."
-    return f'<p class="note">{heights}</p>{flight_map(centres[:, :2], headings, [view.name for view in material.views], ground)}'
-
-
-def processing_section(material: Material) -> str:
-    """Time and memory per stage, then every setting and version."""
-    if not material.records:
-        return ""
-    rows, details = [], []
-    for record in material.records:
-        summary = record.get("summary") if isinstance(record.get("summary"), dict) else {}
-        text = "; ".join(f"{key} {_plain(value)}" for key, value in summary.items() if not isinstance(value, dict | list))
-        rows.append(f"<tr><th>{escape(record['stage'])}</th><td>{_format(_number(record.get('seconds')), ',.1f')}</td>"
-                    f"<td>{_format(_number(record.get('peak_memory_mb')), ',.0f')}</td><td class=\"text\">{escape(text)}</td></tr>")
-        blocks = "".join(f"<h4>{title}</h4>{_pairs(record.get(key))}" for key, title in
-                         (("settings", "Settings"), ("summary", "Results"), ("inputs", "Inputs and their hashes"), ("versions", "Versions")) if record.get(key))
-        details.append(f"<details><summary>{escape(record['stage'])} <span>{escape(', '.join(record['outputs']))}</span></summary>{blocks}</details>")
-    head = "<tr><th>Stage</th><th>Time, s</th><th>Peak memory, MB</th><th class=\"text\">Results</th></tr>"
-    return f'<div class="scroll"><table><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table></div><h3>Settings and versions</h3>{"".join(details)}'
+    lowest, highest = centres[:, 2].min(), centres[:, 2].max()
+    note = f"{_count(len(centres), 'camera')} at heights (z) of {lowest:,.1f} to {highest:,.1f} m. The line shows where each looks."
+    return f'<p class="note">{note}</p>{flight_map(centres[:, :2], headings, [view.name for view in material.views], ground)}'
 
 
 def _choose_views(material: Material) -> list:
@@ -182,7 +175,7 @@ def _choose_views(material: Material) -> list:
 
     views = with_file(material.scene.truth) or with_file(material.scene.masks) or material.views
     chosen = np.unique(np.linspace(0, len(views) - 1, min(_NUM_PHOTOS, len(views))).round().astype(int)) if views else []
-    return [views[number] for number in chosen]
+    return [views[position] for position in chosen]
 
 
 def _photo_figures(material: Material, name: str) -> str:
@@ -191,7 +184,8 @@ def _photo_figures(material: Material, name: str) -> str:
     figures = photos.get(name) if isinstance(photos, dict) else None
     if not isinstance(figures, dict):
         return ""
-    found = [(text, _number(figures[key].get("oa"))) for key, text in (("labels", "fused labels"), ("masks", "given mask")) if isinstance(figures.get(key), dict)]
+    sources = {"labels": "fused labels", "masks": "given mask"}
+    found = [(text, number(figures[key].get("oa"))) for key, text in sources.items() if isinstance(figures.get(key), dict)]
     return " ".join(f"<small>{text} {value:.1%} right</small>" for text, value in found if value is not None)
 
 
@@ -227,37 +221,16 @@ def _confusion(material: Material) -> str:
 
 def _iou(material: Material, source: str) -> dict[str, float | None]:
     found = material.figures(source).get("iou")
-    return {str(name): _number(value) for name, value in found.items()} if isinstance(found, dict) else {}
+    return {str(name): number(value) for name, value in found.items()} if isinstance(found, dict) else {}
 
 
 def _class_colors(material: Material) -> dict[str, tuple[int, int, int]]:
     return {entry.name: entry.color for entry in material.class_table} if material.class_table else {}
 
 
-def _pairs(content: object) -> str:
-    if not isinstance(content, dict):
-        return f"<p>{escape(_plain(content))}</p>"
-    return "<dl>" + "".join(f"<dt>{escape(str(key))}</dt><dd>{escape(_plain(value))}</dd>" for key, value in content.items()) + "</dl>"
+def _count(amount: int, noun: str, plural: str | None = None) -> str:
+    return f"{amount:,} {noun if amount == 1 else plural or noun + 's'}"
 
 
-def _plain(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-
-
-def _number(value: object) -> float | None:
-    """A finite number, else None."""
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value) else None
-
-
-def _format(value: float | None, pattern: str) -> str:
-    return "–" if value is None else format(value, pattern)
-
-
-def _count(number: int, noun: str, plural: str | None = None) -> str:
-    return f"{number:,} {noun if number == 1 else plural or noun + 's'}"
-
-
-def _short(number: int) -> str:
-    return f"{number / 1e6:.2f} M" if number >= 1e6 else f"{number:,}"
+def _short(amount: int) -> str:
+    return f"{amount / 1e6:.2f} M" if amount >= 1e6 else f"{amount:,}"

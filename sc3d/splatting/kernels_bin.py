@@ -1,7 +1,7 @@
 """Numba kernels that sort records into tiles of 16 x 16 px: which Gaussians touch which tile, front to back.
 
-An *instance* is a (Gaussian, tile) pair. Instances are numbered Gaussian by Gaussian, so that what each of them sums up can be added per Gaussian in a fixed
-order, whatever the number of threads. Only tiles that the ellipse of alpha >= 1/255 really touches are listed.
+An *instance* is a (Gaussian, tile) pair. Instances are numbered Gaussian by Gaussian, so that what each of them sums up can be added per Gaussian
+in a fixed order, whatever the number of threads. Only tiles that the ellipse of alpha >= 1/255 really touches are listed.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ def _tile_columns(record, tile_row, width, height):
 def count_instances(near_to_far, visible, all_records, records, width, height, histograms, counts):
     """Copies records (M, 16) in depth order; counts tiles per Gaussian, and Gaussians per tile in each of several blocks of the depth order.
 
-    near_to_far: (M,) order of visible (M,), the ids of all_records that matter; counts: (M,) in the order of `visible`; histograms: (blocks, tiles), zero
+    near_to_far: (M,) order of visible (M,), the ids of all_records that matter
+    counts: (M,) in the order of `visible`; histograms: (blocks, tiles), zero on entry
     """
     blocks, tiles_x = histograms.shape[0], (width + TILE - 1) // TILE
     size = (near_to_far.shape[0] + blocks - 1) // blocks

@@ -2,10 +2,10 @@
 
 The exponent of a splat is written with the Schur complement of its 2D covariance S instead of its inverse: with dx, dy = pixel - mean,
     d^T S^-1 d = a u^2 + h dy^2,   u = dx - m dy,   a = Syy / det S,   h = 1 / Syy,   m = Sxy / Syy
-which needs two multiplications per pixel, has no cancellation for thin diagonal splats, and gives the pixel interval of a row in closed form.
+which needs two multiplications per pixel, has no cancellation for thin diagonal splats, and gives the pixel interval of a row at once.
 
-Record of a Gaussian, 16 float32 (64 bytes): mean x, y (px); m; a and h in units of 2^-x (times log2(e) / 2); log2 opacity; half extents in x and y (px)
-where alpha falls to 1/255; colour (3); normal (3) and plane distance, camera frame; dy of the right-most point of that ellipse.
+Record of a Gaussian, 16 float32 (64 bytes): mean x, y (px); m; a and h in units of 2^-x (times log2(e) / 2); log2 opacity; half extents in x and y
+(px) of the ellipse where alpha falls to 1/255; colour (3); normal (3) and plane distance, camera frame; dy of the right-most point of that ellipse.
 Arithmetic is float64 inside: far Gaussians of a large scene keep their place, and it costs nothing in scalar code.
 """
 
@@ -200,5 +200,5 @@ def project(means, log_scales, quats, opacity_logits, sh, degree, camera, order,
     for item in numba.prange(order.shape[0]):
         rotation, axes, scales, rows, basis = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty((2, 3)), np.full(16, _C0)
         for i in range(order[item] * CHUNK, min(count, (order[item] + 1) * CHUNK)):
-            depth, radius = _project_one(i, means, log_scales, quats, opacity_logits, sh, degree, camera, rotation, axes, scales, rows, basis, records)
-            depths[i], radii[i] = depth, radius
+            depths[i], radii[i] = _project_one(
+                i, means, log_scales, quats, opacity_logits, sh, degree, camera, rotation, axes, scales, rows, basis, records)

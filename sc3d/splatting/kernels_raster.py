@@ -3,7 +3,7 @@
 Inside a tile the Gaussian is the outer loop, its rows come next, and runs of 8 pixels between the ends of its ellipse are the inner one.
 All pixel state of a tile lives in one small flat buffer, plane after plane, with rows padded so that a run may start at any column;
 padding and pixels outside the image have transmittance 0 and so never count. See `kernels_project` for the record and its u, m, a, h.
-`kernels_unraster` repeats the walk: what decides whether a fragment counts is written with the same operations in both, so both see the same fragments.
+`kernels_unraster` repeats the walk: what decides whether a fragment counts is the same operations in both, so both see the same fragments.
 """
 
 from __future__ import annotations

@@ -13,7 +13,9 @@ import numpy as np
 
 from sc3d.splatting.kernels_bin import TILE
 from sc3d.splatting.kernels_project import LOG2E_HALF, RECORD
-from sc3d.splatting.kernels_raster import CHANNELS, CHECK, LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, PLANE, STRIDE, finished, measure_rows, open_tile
+from sc3d.splatting.kernels_raster import (
+    CHANNELS, CHECK, LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, PLANE, STRIDE, finished, measure_rows, open_tile,
+)
 from sc3d.splatting.kernels_simd import (
     LANES, absolute, any_at_least, exp2, fma, load, minimum, ramp, splat, store, sums, where_at_least,
 )
@@ -128,7 +130,9 @@ def _load_gradients(pixels, top, left, rows, columns, background, geometry, imag
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def rasterise_backward(records, ranks, instances, starts, order, background, geometry, image, grad_color, grad_normal, grad_distance, grad_alpha, gradients):
+def rasterise_backward(
+    records, ranks, instances, starts, order, background, geometry, image, grad_color, grad_normal, grad_distance, grad_alpha, gradients,
+):
     """Reverse of `rasterise`: fills gradients (P * 16,), zero on entry, from d loss / d outputs.
 
     grad_color: (3, H, W); grad_normal (3, H, W) and grad_distance (H, W) are read only if `geometry`; grad_alpha: (H, W)

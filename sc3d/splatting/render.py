@@ -80,7 +80,7 @@ def render(
     view: pinhole, in the same local world as the Gaussians; its principal point is honoured
     sh_degree: highest active degree, None = all that are stored; colours are clamped at 0 from below
     background: (3,) colour seen through what is left of the transmittance, None = black; gets no gradient
-    geometry: False leaves `normal` and `plane_distance` zero, which saves about a third of the time
+    geometry: False leaves `normal` and `plane_distance` zero, which saves a few percent of the time
     raises ValueError for a view with distortion or parameters that are not float32
     """
     if not view.camera.is_undistorted():
@@ -189,7 +189,7 @@ class _Render(torch.autograd.Function):
                            _plane_array(grad_distance, size if geometry else (0, 0)), _plane_array(grad_alpha, size)]
         gradients = np.zeros(len(frame.ranks) * kernels_project.RECORD, np.float32)
         kernels_unraster.rasterise_backward(frame.records, frame.ranks, frame.instances, frame.starts, frame.order, frame.background, geometry,
-                                          frame.image, *image_gradients, gradients)
+                                            frame.image, *image_gradients, gradients)
         outputs = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in parameters]
         kernels_backproject.project_backward(
             frame.visible, frame.offsets, gradients.reshape(-1, kernels_project.RECORD), *arrays, frame.degree, frame.camera,

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
@@ -16,6 +14,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.io import atomic_path
 from sc3d.splatting import densify, losses
+from sc3d.splatting.data import TrainingData
 from sc3d.splatting.densify import DensifyLimits, Statistics
 from sc3d.splatting.evaluation import depth_map, psnr, score_view
 from sc3d.splatting.gaussians import Gaussians
@@ -33,25 +32,6 @@ LOG_EVERY = 50
 CHECKPOINT_VERSION = 1
 
 
-@dataclass(frozen=True)
-class TrainingData:
-    """What training starts from; positions in a local world frame that float32 can hold.
-
-    views: V pinhole views at training size, V >= 2
-    images: per view (H, W, 3) uint8 RGB, a sequence or a function of the view's index (then read anew each time)
-    points, colors: (N, 3) sparse points; (N, 3) uint8 RGB
-    tracks: per view the row indices of the sparse points it sees; None = unknown
-    masks: per view (H, W) bool, False = ignored; sequence, function (may return None) or None
-    """
-
-    views: list[View]
-    images: Sequence[np.ndarray] | Callable[[int], np.ndarray]
-    points: np.ndarray
-    colors: np.ndarray
-    tracks: list[np.ndarray] | None = None
-    masks: Sequence[np.ndarray] | Callable[[int], np.ndarray | None] | None = None
-
-
 class Trainer:
     """The state of a run. `step` is one iteration; `train` is the usual way in."""
 
@@ -64,13 +44,16 @@ class Trainer:
         if len(self.train_views) < 2:
             raise InputError(f"{len(self.train_views)} photos to train on: at least 2 are needed (test_every holds {len(held_out)} out)")
         self.generator = torch.Generator().manual_seed(settings.seed)
-        self.extent = scene_extent([data.views[index] for index in self.train_views], data.points)
+        used = data.subset(self.train_views)
+        self.extent = scene_extent(used.views, data.points)
         self.limits = DensifyLimits(self.extent, settings.max_gaussians, settings.gradient_threshold, settings.absolute_gradient_threshold)
-        self.optimiser = RowAdam(*self._initial(data))
+        centres = np.stack([view.centre for view in used.views])
+        neighbours = neighbour_views(used.tracks, np.asarray(data.points, np.float64), centres, settings.num_neighbours)
+        self.neighbours = {index: [self.train_views[other] for other in others] for index, others in zip(self.train_views, neighbours, strict=True)}
+        self.optimiser = RowAdam(*self._initial(used, neighbours))
         self.exposure = RowAdam({"exposure": torch.zeros(num_views, 2, requires_grad=True)}, {"exposure": 1e-3})
         self.num_initial = len(self.gaussians)
         self.statistics = Statistics.zeros(self.num_initial)
-        self.neighbours = self._find_neighbours()
         self.iteration, self.queue, self.depths = 0, [], {}
         self.log: list[dict[str, float]] = []
         self._recent: list[tuple[float, float]] = []
@@ -89,7 +72,7 @@ class Trainer:
     def step(self) -> dict[str, float] | None:
         """One photo: render, compare, update, and densify when it is time. Returns a log row every 50 iterations."""
         index, iteration = self._next_view(), self.iteration
-        view, target, mask = self._photo(index, self.settings.coarse(iteration))
+        view, target, mask = self.data.photo(index, self.settings.coarse(iteration))
         gaussians = self.gaussians
         # A different colour behind the surface each time: holes never pay off.
         background = torch.rand(3, generator=self.generator) if self.settings.random_background else None
@@ -114,7 +97,7 @@ class Trainer:
         """Mean PSNR (dB) and SSIM of the held-out views; their exposure is fitted to the photo if exposures are used."""
         if not self.test_views:
             return {}
-        scores = [score_view(self.gaussians, *self._photo(index, False), self.settings.exposure) for index in self.test_views]
+        scores = [score_view(self.gaussians, *self.data.photo(index), self.settings.exposure) for index in self.test_views]
         means = np.mean(scores, axis=0)
         return {"psnr": float(means[0]), "ssim": float(means[1])}
 
@@ -150,12 +133,10 @@ class Trainer:
         self._recent, self._seconds, self._started = state["recent"], state["seconds"], time.perf_counter()
         return True
 
-    def _initial(self, data: TrainingData) -> tuple[dict[str, torch.Tensor], dict[str, float | np.ndarray]]:
+    def _initial(self, data: TrainingData, neighbours: list[np.ndarray]) -> tuple[dict[str, torch.Tensor], dict[str, float | np.ndarray]]:
         points, colors = np.asarray(data.points, np.float64), np.asarray(data.colors)
         if self.settings.fill:
-            chosen, tracks = self.train_views, data.tracks
-            views, seen = [data.views[index] for index in chosen], None if tracks is None else [tracks[index] for index in chosen]
-            more = fill_points(views, lambda row: _item(data.images, chosen[row]), points, seen, self.settings.max_gaussians // 4)
+            more = fill_points(data, neighbours, self.settings.max_gaussians // 4)
             points, colors = np.concatenate([points, more[0]]), np.concatenate([colors, more[1]])
         if len(points) > self.settings.max_gaussians:
             chosen = torch.randperm(len(points), generator=self.generator)[: self.settings.max_gaussians].sort().values.numpy()
@@ -166,32 +147,11 @@ class Trainer:
         rates = {"means": 0.0, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 0.05, "sh": sh_rates}
         return {name: tensor.requires_grad_() for name, tensor in gaussians.parameters().items()}, rates
 
-    def _find_neighbours(self) -> dict[int, np.ndarray]:
-        chosen, data = np.array(self.train_views), self.data
-        tracks = None if data.tracks is None else [data.tracks[index] for index in chosen]
-        centres = np.stack([data.views[index].centre for index in chosen])
-        found = neighbour_views(tracks, np.asarray(data.points, np.float64), centres, self.settings.num_neighbours)
-        return {int(index): chosen[others] for index, others in zip(chosen, found, strict=True)}
-
     def _next_view(self) -> int:
         if not self.queue:
             order = torch.randperm(len(self.train_views), generator=self.generator)
             self.queue = [self.train_views[position] for position in order.tolist()]
         return self.queue.pop()
-
-    def _photo(self, index: int, halved: bool) -> tuple[View, torch.Tensor, torch.Tensor | None]:
-        """View, (H, W, 3) image in [0, 1] and (H, W) bool mask or None, at full or half size."""
-        view, image, mask = self.data.views[index], _item(self.data.images, index), _item(self.data.masks, index)
-        for array, what in ((image, "image"), (mask, "mask")):
-            if array is not None and array.shape[:2] != (view.height, view.width):
-                raise InputError(f"{what} of {view.name} is {array.shape[1]}x{array.shape[0]}, its view {view.width}x{view.height}")
-        if halved:
-            view = view.resized(max(1, view.width // 2), max(1, view.height // 2))
-            image = cv2.resize(image, (view.width, view.height), interpolation=cv2.INTER_AREA)
-            if mask is not None:
-                mask = cv2.resize(mask.astype(np.uint8), (view.width, view.height), interpolation=cv2.INTER_NEAREST)
-        target = (torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).float() / 255).permute(1, 2, 0)  # as `render` stores it
-        return view, target, None if mask is None else torch.from_numpy(mask.astype(bool))
 
     def _surface_terms(self, index: int, view: View, target: torch.Tensor, rendering: Rendering) -> torch.Tensor:
         """Normal and multi-view terms against one random neighbour, whose depth is the one it had when it was trained on last."""
@@ -199,9 +159,9 @@ class Trainer:
         depth = unbiased_depth(rendering, view)
         loss = settings.normal_weight * single_view_normal_loss(rendering, depth, view, target)
         self.depths[index] = torch.where(rendering.alpha > 0.5, depth, 0).detach()
-        if len(others):
-            other = int(others[torch.randint(len(others), (1,), generator=self.generator)])
-            other_view, other_target, _ = self._photo(other, False)
+        if others:
+            other = others[int(torch.randint(len(others), (1,), generator=self.generator))]
+            other_view, other_target, _ = self.data.photo(other)
             if other not in self.depths:
                 self.depths[other] = torch.from_numpy(depth_map(self.gaussians, other_view)[0])
             neighbour = Neighbour(other_view, losses.to_grey(other_target), self.depths[other])
@@ -254,8 +214,3 @@ def scene_extent(views: list[View], points: np.ndarray) -> float:
     distance = np.median(np.linalg.norm(np.asarray(points, np.float64) - middle, axis=1))
     return float(max(1.1 * spread, 0.5 * distance))
 
-
-def _item(source: Sequence | Callable | None, index: int) -> np.ndarray | None:
-    if source is None:
-        return None
-    return source(index) if callable(source) else source[index]

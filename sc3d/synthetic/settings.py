@@ -20,7 +20,7 @@ class SynthesizeSettings:
     mask_noise: float = 1.0
     """Strength of the mask errors: 0 = perfect masks, 1 = about 77 % of the pixels right."""
     extent: float = 120.0
-    """Side of the square site, m; ground outside of it is truth 0."""
+    """Side of the square site, m; what lies outside of it is truth 0."""
     altitude: float = 60.0
     """Height of the nadir photos above the ground, m."""
     num_points: int = 1_000_000

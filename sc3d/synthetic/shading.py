@@ -81,17 +81,17 @@ def shade(points: np.ndarray, triangles: np.ndarray, lit: np.ndarray, footprints
 @njit(cache=True, parallel=True)
 def surface_labels(points: np.ndarray, triangles: np.ndarray, ints: np.ndarray, half: float, site: float, rasters: np.ndarray,
                    rects: np.ndarray) -> np.ndarray:
-    """(N,) uint8 label of surface points: the object's; on the ground road or grass, and 0 outside the site (half side `site`, m)."""
+    """(N,) uint8 label of surface points: the object's, on the ground road or grass; 0 outside the site (half side `site`, m)."""
     out = np.zeros(len(points), np.uint8)
     for n in prange(len(points)):
         t = triangles[n]
         if t < 0:
             continue
-        out[n] = ints[t, 1]
-        if ints[t, 0] == GROUND:
-            x, y = points[n, 0], points[n, 1]
-            if max(abs(x), abs(y)) > site:
-                out[n] = OTHER
-            elif ground_kind(x, y, half, rasters, rects)[0] != LAWN:
-                out[n] = ROAD
+        x, y = points[n, 0], points[n, 1]
+        if max(abs(x), abs(y)) > site:
+            out[n] = OTHER
+        elif ints[t, 0] == GROUND and ground_kind(x, y, half, rasters, rects)[0] != LAWN:
+            out[n] = ROAD
+        else:
+            out[n] = ints[t, 1]
     return out

@@ -42,7 +42,7 @@ class World:
         return self.scene.test_occlusions(_ray_tensor(origins, directions), tnear=0.0, tfar=far).numpy()
 
     def labels(self, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-        """(N,) uint8 labels of surface points (N, 3) on triangles (N,); 0 = other objects, sky, ground outside the site."""
+        """(N,) uint8 labels of surface points (N, 3) on triangles (N,); 0 = other objects, sky, anything outside the site."""
         return surface_labels(points, triangles, self.ints, self.ground.half, self.ground.extent / 2, self.ground.rasters, self.ground.rects)
 
     def light(self, points: np.ndarray, triangles: np.ndarray, footprints: np.ndarray) -> np.ndarray:

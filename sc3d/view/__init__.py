@@ -6,4 +6,7 @@ from sc3d.view.labels import LabelledSurface, render_labels
 from sc3d.view.pictures import PointImage, Style, draw_points, screenshot
 from sc3d.view.window import show
 
-__all__ = ["COLOURINGS", "STATES", "LabelledSurface", "PointImage", "Style", "aerial_view", "color_points", "draw_points", "render_labels", "screenshot", "show"]
+__all__ = [
+    "COLOURINGS", "STATES", "LabelledSurface", "PointImage", "Style",
+    "aerial_view", "color_points", "draw_points", "render_labels", "screenshot", "show",
+]

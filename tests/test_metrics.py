@@ -1,0 +1,50 @@
+"""OA, IoU, mIoU against a hand-made matrix and scikit-learn; the depth edge band."""
+
+import numpy as np
+import pytest
+
+from sc3d.metrics import Confusion, depth_edge_band, total
+
+
+def test_hand_made_matrix():
+    truth = np.uint8([1, 1, 1, 1, 2, 2, 3, 3, 0, 0])
+    predicted = np.uint8([1, 1, 2, 0, 2, 1, 3, 3, 1, 0])  # the last two pixels are not judged
+    confusion = Confusion.of(truth, predicted, 5)
+    expected = np.zeros((5, 5), int)
+    expected[1, 1], expected[1, 2], expected[1, 0], expected[2, 2], expected[2, 1], expected[3, 3] = 2, 1, 1, 1, 1, 2
+    np.testing.assert_array_equal(confusion.counts, expected)
+    assert confusion.accuracy == pytest.approx(5 / 8)
+    assert confusion.iou[1] == pytest.approx(2 / 5) and confusion.iou[2] == pytest.approx(1 / 3) and confusion.iou[3] == 1
+    assert np.isnan(confusion.iou[4])
+    assert confusion.mean_iou == pytest.approx((2 / 5 + 1 / 3 + 1) / 3)
+    assert confusion.coverage == pytest.approx(7 / 8)
+
+
+def test_against_scikit_learn():
+    metrics = pytest.importorskip("sklearn.metrics")
+    rng = np.random.default_rng(0)
+    truth = rng.integers(1, 5, (50, 60)).astype(np.uint8)
+    predicted = np.where(rng.uniform(size=truth.shape) < 0.7, truth, rng.integers(1, 5, truth.shape)).astype(np.uint8)
+    parts = [Confusion.of(truth[rows], predicted[rows], 5) for rows in (slice(0, 20), slice(20, 50))]
+    confusion = total(parts, 5)
+    flat = truth.ravel(), predicted.ravel()
+    np.testing.assert_array_equal(confusion.counts[1:, 1:], metrics.confusion_matrix(*flat))
+    assert confusion.accuracy == pytest.approx(metrics.accuracy_score(*flat))
+    np.testing.assert_allclose(confusion.iou[1:], metrics.jaccard_score(*flat, average=None))
+    assert confusion.mean_iou == pytest.approx(metrics.jaccard_score(*flat, average="macro"))
+
+
+def test_perfect_prediction_is_exactly_one_and_no_truth_is_nan():
+    truth = np.random.default_rng(0).integers(0, 4, (30, 30)).astype(np.uint8)
+    perfect = Confusion.of(truth, truth, 4)
+    assert perfect.accuracy == perfect.mean_iou == perfect.coverage == 1.0
+    assert np.isnan(Confusion.of(np.zeros((3, 3), np.uint8), truth[:3, :3], 4).accuracy)
+
+
+def test_band_follows_a_depth_step():
+    depth = np.full((40, 60), 50.0)
+    depth[:, 30:] = 40.0
+    depth += np.linspace(0, 0.5, 60)  # a slope is no edge
+    band = depth_edge_band(depth, 5)
+    assert band[:, 26:34].all() and not band[:, :23].any() and not band[:, 37:].any()
+    assert not depth_edge_band(np.full((9, 9), 3.0), 5).any()

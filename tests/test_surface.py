@@ -1,0 +1,85 @@
+"""TSDF fusion of exact depth maps: sphere, deep scene, off-centre principal point."""
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from sc3d.geometry.cameras import look_at, pinhole_view
+from sc3d.geometry.raycast import Surface, first_surface
+from sc3d.geometry.surface import DepthFusion, drop_small_parts, near_mesh
+
+VOXEL = 0.05
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    """Fused from 40 exact depth maps; grazing pixels left out, as `extract` does."""
+    mesh = o3d.t.geometry.TriangleMesh.create_sphere(2.0, 200)
+    surface = Surface.from_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), np.zeros(3))
+    fusion = DepthFusion(VOXEL, 2000)
+    color = np.broadcast_to(np.uint8([200, 100, 0]), (300, 400, 3))
+    for row in range(40):  # spread evenly, by the golden angle
+        height, turn = 1 - (2 * row + 1) / 40, np.pi * (3 - np.sqrt(5)) * row
+        centre = np.array([np.cos(turn) * np.sqrt(1 - height**2), np.sin(turn) * np.sqrt(1 - height**2), height])
+        view = pinhole_view("a", (400, 300), (600, 600, 190, 155), look_at(8 * centre, np.zeros(3)))
+        first = first_surface(surface, view)
+        depth = np.where(np.isfinite(first.range) & (first.incidence > np.cos(np.deg2rad(75))), first.range * first.ray_z, 0)
+        fusion.integrate(view, depth.astype(np.float32), color, 20.0)
+    return fusion
+
+
+def test_sphere_within_half_a_voxel_and_closed(sphere):
+    mesh = sphere.mesh()
+    radius = np.linalg.norm(mesh.vertex.positions.numpy(), axis=1)
+    assert np.abs(radius - 2).max() < 0.5 * VOXEL
+    assert abs(radius.mean() - 2) < 0.1 * VOXEL
+    directions = np.random.default_rng(1).normal(size=(5000, 3))
+    onto = 2 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    assert near_mesh(onto, mesh, VOXEL).mean() > 0.999
+
+
+def test_cloud_has_colours_and_outward_normals(sphere):
+    cloud = sphere.cloud()
+    points, normals = cloud.point.positions.numpy(), cloud.point.normals.numpy()
+    assert np.abs(np.linalg.norm(points, axis=1) - 2).max() < 0.5 * VOXEL
+    assert (np.einsum("ij,ij->i", points, normals) > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    assert np.abs(cloud.point.colors.numpy().astype(int) - [200, 100, 0]).max() <= 1
+
+
+def test_triangles_face_outwards(sphere):
+    mesh = sphere.mesh()
+    corners = mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy()]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ij,ij->i", facing, corners[:, 0]) >= 0).all()
+
+
+def test_a_deep_scene_keeps_its_depth():
+    """A plane 120 m away: nothing wraps, as 16-bit millimetres would at 65.5 m."""
+    fusion = DepthFusion(0.5, 2000)
+    for x in (0.0, 10.0):
+        view = pinhole_view("a", (120, 90), (150, 150, 57, 47), look_at(np.array([x, 0, 120.0]), np.array([x, 0, 0.0])))
+        fusion.integrate(view, np.full((90, 120), 120, np.float32), np.zeros((90, 120, 3), np.uint8), 150.0)
+    height = fusion.mesh().vertex.positions.numpy()[:, 2]
+    assert len(height) > 1000 and np.abs(height).max() < 0.05
+
+
+def test_empty_depth_adds_nothing_and_distorted_views_are_refused():
+    import pycolmap
+
+    from sc3d.geometry.cameras import View
+
+    fusion = DepthFusion(0.5, 10)
+    view = pinhole_view("a", (20, 10), (15, 15, 10, 5), np.eye(4))
+    fusion.integrate(view, np.zeros((10, 20), np.float32), np.zeros((10, 20, 3), np.uint8), 150.0)
+    assert len(fusion.cloud().point.positions) == 0 and len(fusion.mesh().triangle.indices) == 0
+    radial = View("b", pycolmap.Camera(model="RADIAL", width=20, height=10, params=[15, 10, 5, 0.1, 0]), np.eye(4))
+    with pytest.raises(ValueError, match="pinhole"):
+        fusion.integrate(radial, np.ones((10, 20), np.float32), np.zeros((10, 20, 3), np.uint8), 150.0)
+
+
+def test_small_parts_are_dropped():
+    large = o3d.t.geometry.TriangleMesh.create_sphere(2.0, 20)
+    small = o3d.t.geometry.TriangleMesh.create_box().translate([10, 0, 0])
+    both = o3d.t.geometry.TriangleMesh.from_legacy(large.to_legacy() + small.to_legacy())
+    assert len(drop_small_parts(both, 50).triangle.indices) == len(large.triangle.indices)

@@ -1,0 +1,7 @@
+#!/usr/bin/env bash
+# Sets up and runs the tests: bash tools/test.sh [pytest arguments]; the long ones with: bash tools/test.sh -m slow
+set -euo pipefail
+source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
+cd "$root"
+[ $# -gt 0 ] || set -- -m "not slow"
+exec "$venv/bin/python" -m pytest "$@"
