@@ -50,6 +50,8 @@ def main(arguments: list[str] | None = None) -> None:
         _dispatch(name, command)
     except InputError as error:
         sys.exit(_fail(str(error)))
+    except PermissionError as error:
+        sys.exit(_fail(f"no permission for {error.filename}: check its permissions or choose another folder"))
     except (Sc3dError, OSError, MemoryError) as error:
         sys.exit(_fail(f"{error or type(error).__name__}", status=1))
     except KeyboardInterrupt:

@@ -24,7 +24,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if not os.access(path.parent, os.W_OK):
+        if not os.access(path.parent, os.W_OK, effective_ids=True):
             raise PermissionError
     except (PermissionError, NotADirectoryError, FileExistsError):
         raise InputError(f"cannot write to {path.parent}: check its permissions or choose another folder") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,13 @@ import open3d as o3d
 
 from sc3d.errors import InputError
 from sc3d.fusion import Labels
+from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, orient_normals, point_spacing
-from sc3d.geometry.raycast import Surface
+from sc3d.geometry.raycast import FirstSurface, Surface, first_surface, nearest_points
 from sc3d.io import read_cloud, read_mesh
 
 NORMAL_NEIGHBORS = 30
+REACH = 4.0  # a pixel shows the label of a cloud point at most this many point spacings away from the surface that it sees
 VOTES = "votes_"  # + class id; PLY has scalar properties only
 
 
@@ -84,3 +87,36 @@ def spacing_of(points: np.ndarray) -> float:
     """Sampling distance of the (N, 3) points, world units, from at most 100 000 of them; 1 if they coincide."""
     sample = points[:: max(1, len(points) // 100_000)]
     return point_spacing(NeighborIndex(points).nearest(sample, 9)[1]) or 1.0
+
+
+@dataclass(frozen=True)
+class LabelledSurface:
+    """A labelled cloud and the surface it lies on; built once, looked at through many views.
+
+    label: (N,) uint8 ids; reach: largest distance between surface and point, world units
+    """
+
+    surface: Surface
+    index: NeighborIndex
+    label: np.ndarray
+    reach: float
+
+    @classmethod
+    def build(cls, cloud: o3d.t.geometry.PointCloud, views: list[View], mesh: Path) -> LabelledSurface:
+        """cloud: with `label`; views: of the scene, for the side that normals face; mesh: file of the surface, surfels if it does not exist."""
+        if "label" not in cloud.point:
+            raise InputError("the cloud has no labels: run `sc3d label SCENE` and `sc3d propagate SCENE`")
+        points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
+        surface = read_surface(mesh, points, normals, local_origin(views))
+        return cls(surface, NeighborIndex(points), cloud.point["label"].numpy().ravel(), REACH * spacing_of(points))
+
+    def see(self, view: View, size: tuple[int, int], wanted: np.ndarray | None = None) -> tuple[np.ndarray, FirstSurface]:
+        """The class at each pixel of a photo, distortion included: that of the cloud point nearest to the first surface.
+
+        size: (width, height) of the result, px; wanted: (H, W) bool pixels to label, None = all
+        returns: (H, W) uint8 ids, 0 = unlabelled or nothing hit; the first surface
+        """
+        sized = view.resized(*size)
+        first = first_surface(self.surface, sized)
+        rows = nearest_points(first, sized, self.index, self.reach, wanted)
+        return np.where(rows >= 0, self.label[rows], 0).astype(np.uint8), first

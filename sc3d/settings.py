@@ -141,8 +141,6 @@ class Evaluate:
 class Report:
     """One self-contained HTML page with figures and pictures."""
 
-    labelled: Path | None = None
-    """Labelled cloud; SCENE/labelled.ply otherwise."""
     output: Path | None = None
     """Page to write; SCENE/report.html otherwise."""
 

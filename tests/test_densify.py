@@ -22,7 +22,7 @@ def tagged(count: int) -> tuple[RowAdam, Statistics]:
     for moments in (optimiser.means, optimiser.squares):
         for name in moments:
             moments[name] = parameters[name].detach().clone()
-    statistics = Statistics(*(tags.clone() for _ in range(5)))
+    statistics = Statistics(*(tags.clone() for _ in range(6)))
     return optimiser, statistics
 
 
@@ -126,14 +126,16 @@ def test_useless_ones_are_pruned():
     assert torch.equal(optimiser.parameters["means"].detach(), kept)
 
 
-def test_trim_drops_what_one_view_saw():
-    optimiser, statistics = small_scene(4)
-    visible = torch.tensor([3, 3, 3, 0])
-    statistics.add(torch.zeros(4), torch.zeros(4), visible, torch.tensor([0.9, 0.9, 0.3, 0.0]))
-    statistics.add(torch.zeros(4), torch.zeros(4), visible, torch.tensor([0.9, 0.2, 0.3, 0.0]))
-    kept = optimiser.parameters["means"][:1].detach().clone()
+def test_trim_drops_what_is_hidden_or_floats():
+    optimiser, statistics = small_scene(5)
+    # seen by two of three; by one of three; by none; by the only one; by one of two
+    for radius, transmittance in (([3, 3, 3, 3, 3], [0.9, 0.9, 0.3, 0.9, 0.8]), ([3, 3, 3, 0, 3], [0.9, 0.2, 0.3, 0, 0.4]), ([3, 3, 3, 0, 0], [0] * 5)):
+        statistics.add(torch.zeros(5), torch.zeros(5), torch.tensor(radius), torch.tensor(transmittance))
+    kept = optimiser.parameters["means"][[0, 3, 4]].detach().clone()
     densify.trim(optimiser, statistics)
-    assert torch.equal(optimiser.parameters["means"].detach(), kept) and not statistics.seen.any()
+    assert torch.equal(optimiser.parameters["means"].detach(), kept)
+    statistics.start_pass()
+    assert not statistics.seen.any() and not statistics.inside.any() and len(statistics.seen) == 3
 
 
 def test_opacity_reset():

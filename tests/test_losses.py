@@ -6,7 +6,8 @@ import torch
 
 from sc3d.geometry.cameras import look_at, pinhole_view, pixel_centres, rays
 from sc3d.splatting import losses
-from sc3d.splatting.consistency import consistent, pixel_rays, reprojection_error
+from sc3d.splatting.consistency import consistent, pinhole, pixel_rays, reprojection_error
+from sc3d.splatting.kernels_normals import depth_normal_loss
 from sc3d.splatting.neighbours import nearest_views, neighbour_views
 
 SIZE, CALIBRATION = (96, 64), (90.0, 85.0, 50.0, 30.0)
@@ -113,6 +114,24 @@ def test_normal_loss_is_zero_on_a_plane_and_positive_off_it():
     tilted = normal @ torch.from_numpy(look_at(np.zeros(3), np.array([0.1, 1.0, 0.2]))[:3, :3]).float()
     assert losses.normal_loss(tilted, depth_normals, alpha, edges) > 0.1
     assert losses.normal_loss(tilted, depth_normals, alpha, edges + 1) == 0
+
+
+def test_normal_kernel_equals_its_reference():
+    view = camera(2, 1)
+    generator = torch.Generator().manual_seed(0)
+    start = plane_depth(view) * (1 + 0.02 * torch.rand(view.height, view.width, generator=generator))
+    start[10:14, 20:25] = 0
+    normal, _ = plane_maps(view)
+    alpha, edges = torch.rand(view.height, view.width, generator=generator), torch.rand(view.height, view.width, generator=generator)
+    results = []
+    for fused in (True, False):
+        depth, normals = start.clone().requires_grad_(), normal.clone().requires_grad_()
+        loss = depth_normal_loss(normals, depth, alpha, edges, pinhole(view)) if fused else losses.normal_loss(
+            normals, losses.normals_from_depth(depth, view), alpha, edges)
+        (3 * loss).backward()
+        results.append((loss.detach(), depth.grad, normals.grad))
+    for one, other in zip(*results, strict=True):
+        assert torch.allclose(one, other, atol=2e-4 * float(other.abs().max()), rtol=1e-3)
 
 
 def test_warped_plane_correlates():

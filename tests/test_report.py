@@ -24,7 +24,7 @@ from sc3d.report.images import comparison, ground_picture
 from sc3d.report.material import gather
 from sc3d.report.sections import certainty_section, class_section, headline, processing_section, quality_section, summary_line
 from sc3d.scene import Scene
-from sc3d.view import LabelledSurface
+from sc3d.labelled import LabelledSurface
 
 UTM = np.array([500_000.0, 4_500_000.0, 100.0])
 GRASS, BUILDING = 1, 2

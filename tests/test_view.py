@@ -15,7 +15,8 @@ import pytest
 from sc3d.classes import parse_classes
 from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View, in_image, look_at, pinhole_view, project, undistorted
-from sc3d.view import COLOURINGS, STATES, LabelledSurface, Style, aerial_view, color_points, draw_points, render_labels, screenshot, show
+from sc3d.labelled import LabelledSurface
+from sc3d.view import COLOURINGS, STATES, Style, aerial_view, color_points, draw_points, screenshot, show
 from sc3d.view.aerial import frusta
 from sc3d.view.renderers import vulkan_works
 
@@ -223,13 +224,13 @@ def test_without_any_vulkan_driver_the_other_renderer_is_used():
     assert done.returncode == 0, done.stderr[-2000:]
 
 
-def test_labels_in_a_photo_match_what_the_camera_sees():
+def test_labels_in_a_photo_match_what_the_camera_sees(tmp_path):
     grid = np.stack(np.meshgrid(np.linspace(-10, 10, 120), np.linspace(-10, 10, 120)), axis=-1).reshape(-1, 2)
     label = np.where(grid[:, 0] < 2, 1, 4).astype(np.uint8)
     cloud = make_cloud(np.c_[grid, np.zeros(len(grid))] + UTM, label=label[:, None])
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=[600, 320, 240, -0.05])
     view = View("a.jpg", camera, look_at(UTM + [0, 0, 12.0], UTM))
-    image = render_labels(LabelledSurface.build(cloud, [view]), view, 320)
+    image = LabelledSurface.build(cloud, [view], tmp_path / 'no_mesh.ply').see(view, (320, 240))[0]
     assert image.shape == (240, 320) and image.dtype == np.uint8
     border = project(view, UTM + [[2.0, 0, 0]])[0][0, 0] / 2
     row = image[120]

@@ -15,7 +15,8 @@ from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View
 from sc3d.io import read_image, read_index_image
 from sc3d.report.material import Material
-from sc3d.view import COLOURINGS, LabelledSurface, Style, color_points, draw_points, render_labels, screenshot
+from sc3d.labelled import LabelledSurface
+from sc3d.view import COLOURINGS, Style, color_points, draw_points, screenshot
 
 logger = logging.getLogger(__name__)
 
@@ -63,9 +64,9 @@ def comparison(material: Material, view: View, labelled: LabelledSurface | None)
     if material.class_table is None:
         return panels
     palette = material.class_table.palette
-    for caption, file in (("given mask", scene.masks / f"{stem}.png"), ("fused labels", None), ("truth", scene.truth / f"{stem}.png")):
+    for caption, file in (("given mask", scene.masks / f"{stem}.png"), ("fused labels", None), ("truth", material.truth / f"{stem}.png")):
         if file is None and labelled is not None:
-            labels = render_labels(labelled, view, _PHOTO_SIZE)
+            labels, _ = labelled.see(view, size)
         elif file is not None and file.exists():
             labels = cv2.resize(read_index_image(file), size, interpolation=cv2.INTER_NEAREST)
         else:

@@ -59,6 +59,13 @@ class Material:
         labels = self.values("label")
         return None if labels is None else np.bincount(labels.astype(np.uint8), minlength=256)
 
+    @cached_property
+    def truth(self) -> Path:
+        """The folder of truth masks that was evaluated against, else the scene's own."""
+        used = next((record.get("settings") for record in self.records if record["stage"] == "evaluate"), None)
+        folder = used.get("truth") if isinstance(used, dict) else None
+        return Path(folder) if isinstance(folder, str) and Path(folder).is_dir() else self.scene.truth
+
     def figures(self, source: str) -> dict:
         """Figures of "labels" or "masks" in metrics.json; empty if there are none."""
         found = self.metrics.get(source)

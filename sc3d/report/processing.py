@@ -35,6 +35,8 @@ def _pairs(content: object) -> str:
 
 
 def _plain(value: object) -> str:
+    if value is None:
+        return "–"
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, int) and not isinstance(value, bool):

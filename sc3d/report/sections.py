@@ -12,7 +12,8 @@ from sc3d.report.charts import css_color, flight_map, formatted, histogram, numb
 from sc3d.report.images import cloud_pictures, comparison, ground_picture
 from sc3d.report.material import Material
 from sc3d.report.processing import processing_section
-from sc3d.view import LabelledSurface, color_points
+from sc3d.labelled import LabelledSurface
+from sc3d.view import color_points
 from sc3d.view.colors import STATES, confidence_colors, legend_entries
 
 _NUM_PHOTOS = 4
@@ -115,7 +116,7 @@ def photo_section(material: Material) -> str:
             images = "".join(f'<figure><img src="{uri}" alt="{caption} of {escape(view.name)}"><figcaption>{caption}</figcaption></figure>'
                              for caption, uri in panels)
             rows.append(f'<h3>{escape(view.name)}{_photo_figures(material, view.name)}</h3><div class="row">{images}</div>')
-    return "".join(rows) + _legend(material, "label") if rows else ""
+    return "".join(rows) + _legend(material, "label", everything=True) if rows else ""
 
 
 def class_section(material: Material) -> str:
@@ -173,7 +174,7 @@ def _choose_views(material: Material) -> list:
     def with_file(folder: Path) -> list:
         return [view for view in material.views if (folder / f"{Path(view.name).stem}.png").exists()]
 
-    views = with_file(material.scene.truth) or with_file(material.scene.masks) or material.views
+    views = with_file(material.truth) or with_file(material.scene.masks) or material.views
     chosen = np.unique(np.linspace(0, len(views) - 1, min(_NUM_PHOTOS, len(views))).round().astype(int)) if views else []
     return [views[position] for position in chosen]
 
@@ -189,12 +190,13 @@ def _photo_figures(material: Material, name: str) -> str:
     return " ".join(f"<small>{text} {value:.1%} right</small>" for text, value in found if value is not None)
 
 
-def _legend(material: Material, by: str) -> str:
+def _legend(material: Material, by: str, everything: bool = False) -> str:
+    """What the colours mean; of classes and states only those that the cloud has, unless `everything`."""
     if by == "confidence":
         stops = ", ".join(css_color(color) for color in confidence_colors(np.linspace(0, 1, 9)))
         return f'<p class="legend">confidence 0 <i class="ramp" style="background:linear-gradient(90deg, {stops})"></i> 1</p>'
     values = material.values(by) if by in ("label", "state") else None
-    present = None if values is None else set(np.unique(values).tolist())
+    present = None if values is None or everything else set(np.unique(values).tolist())
     entries = legend_entries(by, material.class_table, present)
     items = "".join(f'<li><i style="background:{css_color(color)}"></i>{escape(name)}</li>' for name, color in entries)
     return f'<ul class="legend">{items}</ul>' if items else ""

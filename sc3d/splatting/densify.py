@@ -20,7 +20,8 @@ class Statistics:
 
     gradient: (N,) sum of the loss' gradient norms by the image position, NDC units; absolute_gradient: (N,) the same of absolute values
     count: (N,) views in which it was visible; radius: (N,) largest radius, px
-    seen: (N,) views since the last trim in which it was hit with transmittance above 0.5
+    seen: (N,) views since the last pass over all views began in which it was hit with transmittance above 0.5
+    inside: (N,) views since then in which it was visible at all
     """
 
     gradient: torch.Tensor
@@ -28,6 +29,7 @@ class Statistics:
     count: torch.Tensor
     radius: torch.Tensor
     seen: torch.Tensor
+    inside: torch.Tensor
 
     @classmethod
     def zeros(cls, size: int) -> Statistics:
@@ -42,14 +44,20 @@ class Statistics:
         self.count += visible
         self.radius = torch.maximum(self.radius, radius.float())
         self.seen += max_transmittance > 0.5
+        self.inside += visible
 
     def take(self, source: torch.Tensor) -> None:
         """Rows `source` (M,) of the present ones."""
         for field in fields(self):
             setattr(self, field.name, getattr(self, field.name)[source])
 
+    def start_pass(self) -> None:
+        """All views were seen: count `seen` and `inside` anew."""
+        self.seen.zero_()
+        self.inside.zero_()
+
     def restart(self) -> None:
-        """Forget the gradients and radii; `seen` lives until the trim."""
+        """Forget the gradients and radii; `seen` and `inside` live until the end of the pass over all views."""
         for values in (self.gradient, self.absolute_gradient, self.count, self.radius):
             values.zero_()
 
@@ -149,10 +157,12 @@ def densify(optimiser: RowAdam, statistics: Statistics, limits: DensifyLimits, g
     statistics.restart()
 
 
-def trim(optimiser: RowAdam, statistics: Statistics, min_views: int = 2) -> None:
-    """Drop Gaussians that fewer than `min_views` views saw unoccluded since the last trim, and start counting again."""
-    prune(optimiser, statistics, statistics.seen < min_views)
-    statistics.seen.zero_()
+def trim(optimiser: RowAdam, statistics: Statistics) -> None:
+    """Drop Gaussians that no view, or one of more than two that could, saw unoccluded during the last pass: hidden or floating ones.
+
+    What only one or two photos contain, at the border of a flight, stays.
+    """
+    prune(optimiser, statistics, (statistics.seen == 0) | ((statistics.seen < 2) & (statistics.inside > 2)))
 
 
 def reset_opacity(optimiser: RowAdam, ceiling: float = 0.01) -> None:

@@ -8,7 +8,8 @@ import torch
 
 from sc3d.geometry.cameras import View
 from sc3d.splatting import losses
-from sc3d.splatting.consistency import pixel_rays, reprojection_error
+from sc3d.splatting.consistency import pinhole, pixel_rays, reprojection_error
+from sc3d.splatting.kernels_normals import depth_normal_loss
 from sc3d.splatting.render import Rendering
 
 PIXELS_PER_PATCH = 4
@@ -27,7 +28,7 @@ class Neighbour:
 def single_view_normal_loss(rendering: Rendering, depth: torch.Tensor, view: View, target: torch.Tensor) -> torch.Tensor:
     """Rendered normals against those of the rendered depth, (H, W), away from the edges of the photo `target` (H, W, 3)."""
     depth = torch.where(rendering.alpha > 0.5, depth, 0)
-    return losses.normal_loss(rendering.normal, losses.normals_from_depth(depth, view), rendering.alpha, losses.image_edges(target))
+    return depth_normal_loss(rendering.normal, depth, rendering.alpha, losses.image_edges(target), pinhole(view))
 
 
 def multi_view_losses(

@@ -32,7 +32,7 @@ class TrainSettings:
     """share of 1 - SSIM in the image loss; the rest is L1"""
     flatten_weight: float = 10.0
     """weight of the smallest scale (relative to the scene), which presses Gaussians flat"""
-    normal_weight: float = 0.015
+    normal_weight: float = 0.05
     """weight of the agreement between rendered normals and those of the rendered depth"""
     geometric_weight: float = 0.03
     """weight of the depth agreement between neighbouring views"""

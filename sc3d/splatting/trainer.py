@@ -185,7 +185,7 @@ class Trainer:
         if not self.queue:  # every view was seen once
             if settings.trims(iteration, num_views):
                 densify.trim(self.optimiser, self.statistics)
-            self.statistics.seen.zero_()
+            self.statistics.start_pass()
         if settings.densifies(iteration, num_views):
             limits = replace(self.limits, max_gaussians=settings.allowed_gaussians(iteration, self.num_initial))
             densify.densify(self.optimiser, self.statistics, limits, self.generator)

@@ -77,7 +77,7 @@ def peak_memory_mb() -> int:
 def require_writable(folder: Path) -> None:
     """Raise InputError, before any work, if a scene folder cannot be written."""
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK):
+    if not existing.is_dir() or not os.access(existing, os.W_OK, effective_ids=True):
         raise InputError(f"cannot write to {existing}: check its permissions or choose another folder")
 
 

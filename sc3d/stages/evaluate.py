@@ -8,17 +8,11 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from sc3d.geometry.cameras import local_origin
-from sc3d.geometry.neighbors import NeighborIndex
-from sc3d.geometry.raycast import first_surface, nearest_points
 from sc3d.io import read_index_image, write_json
-from sc3d.labelled import point_arrays, read_labelled, read_surface, spacing_of
+from sc3d.labelled import LabelledSurface, read_labelled
 from sc3d.metrics import Confusion, depth_edge_band, total
 from sc3d.scene import Scene
 from sc3d.settings import Evaluate
-
-REACH = 4.0  # a pixel takes the label of a cloud point at most this many point spacings away
-
 
 def inputs(scene: Scene, settings: Evaluate) -> list[Path]:
     return [scene.sparse, scene.classes, scene.masks, scene.mesh, settings.truth or scene.truth, settings.labelled or scene.labelled]
@@ -33,19 +27,14 @@ def run(scene: Scene, settings: Evaluate) -> dict[str, object]:
     scene.require(settings.truth or scene.truth, hint="pass --truth FOLDER with manual masks")
     truth_files = scene.mask_files(settings.truth or scene.truth, class_table)
     mask_files = scene.mask_files(scene.masks, class_table) if scene.masks.is_dir() else {}
-    cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
+    cloud, _ = read_labelled(settings.labelled or scene.labelled, "propagate")
+    labelled = LabelledSurface.build(cloud, scene.model.views, scene.mesh)
     views = [view for view in scene.model.views if view.name in truth_files]
-    points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
-    surface = read_surface(scene.mesh, points, normals, local_origin(scene.model.views))
-    index, reach = NeighborIndex(points), REACH * spacing_of(points)
     parts: dict[str, list[Confusion]] = {"labels": [], "masks": [], "labels_near_edges": [], "labels_elsewhere": []}
     per_photo = {}
     for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
         truth = read_index_image(truth_files[view.name])
-        sized = view.resized(truth.shape[1], truth.shape[0])
-        first = first_surface(surface, sized)
-        rows = nearest_points(first, sized, index, reach, wanted=truth > 0)
-        predicted = np.where(rows >= 0, labels.label[rows], 0).astype(np.uint8)
+        predicted, first = labelled.see(view, truth.shape[::-1], wanted=truth > 0)
         band = depth_edge_band(first.range, settings.band)
         parts["labels"].append(Confusion.of(truth, predicted, class_table.num_ids))
         parts["labels_near_edges"].append(Confusion.of(np.where(band, truth, 0), predicted, class_table.num_ids))

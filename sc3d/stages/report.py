@@ -10,7 +10,7 @@ from sc3d.settings import Report
 
 
 def inputs(scene: Scene, settings: Report) -> list[Path]:
-    return [scene.labelled, scene.metrics, scene.sparse, scene.masks, scene.classes]
+    return [scene.labelled, scene.metrics, scene.sparse, scene.masks, scene.classes, scene.mesh, scene.images]
 
 
 def outputs(scene: Scene, settings: Report) -> list[Path]:
@@ -18,7 +18,7 @@ def outputs(scene: Scene, settings: Report) -> list[Path]:
 
 
 def run(scene: Scene, settings: Report) -> dict[str, object]:
-    scene.require(scene.labelled, scene.classes, hint="run `sc3d propagate SCENE` first")
+    scene.require(scene.classes, hint="the report needs the class table")
     output = settings.output or scene.report
     write_report(scene, output)
     return {"kilobytes": output.stat().st_size // 1024}

@@ -2,11 +2,10 @@
 
 from sc3d.view.aerial import aerial_view
 from sc3d.view.colors import COLOURINGS, STATES, color_points
-from sc3d.view.labels import LabelledSurface, render_labels
 from sc3d.view.pictures import PointImage, Style, draw_points, screenshot
 from sc3d.view.window import show
 
 __all__ = [
-    "COLOURINGS", "STATES", "LabelledSurface", "PointImage", "Style",
-    "aerial_view", "color_points", "draw_points", "render_labels", "screenshot", "show",
+    "COLOURINGS", "STATES", "PointImage", "Style",
+    "aerial_view", "color_points", "draw_points", "screenshot", "show",
 ]

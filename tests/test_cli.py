@@ -1,0 +1,196 @@
+"""Help is quick; bad input gives one clear line, status 2 and no half-written output."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from PIL import Image
+from scenes import write_bare_scene
+
+import sc3d.stages.label  # noqa: F401 - loaded before a test gives up its rights
+from sc3d.cli import COMMANDS, STAGES, main
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return write_bare_scene(tmp_path / "scene")
+
+
+def fails(capsys, *arguments, status: int = 2) -> str:
+    """Run a command that must fail; returns its one line."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        main([str(argument) for argument in arguments])
+    error = capsys.readouterr().err
+    assert stopped.value.code == status, error
+    lines = [line for line in error.splitlines() if line.startswith("sc3d:")]
+    assert len(lines) == 1 and "Traceback" not in error, error
+    return lines[0]
+
+
+def files(folder: Path) -> set:
+    return {(str(file.relative_to(folder)), file.stat().st_size) for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize("name", [*STAGES, *COMMANDS])
+def test_help_answers_in_under_a_second(name):
+    code = "from sc3d.cli import main; main()"
+    spent = []
+    for _ in range(3):  # the machine may be busy: the best of three
+        started = time.perf_counter()
+        result = subprocess.run([sys.executable, "-c", code, name, "--help"], capture_output=True, text=True, env=os.environ)
+        spent.append(time.perf_counter() - started)
+        assert result.returncode == 0 and "usage: sc3d " + name in result.stdout
+        if spent[-1] < 1:
+            break
+    assert min(spent) < 1
+
+
+def test_usage_and_unknown_command(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--help"])
+    listed = capsys.readouterr().out
+    assert stopped.value.code == 0 and all(name in listed for name in [*STAGES, *COMMANDS])
+    assert "unknown command" in fails(capsys, "lable", "x")
+
+
+def test_scripts_in_tools_are_the_commands():
+    tools = Path(__file__).parent.parent / "tools"
+    assert {file.stem for file in tools.glob("*.py")} == {*STAGES, *COMMANDS}
+    result = subprocess.run([sys.executable, str(tools / "label.py"), "--help"], capture_output=True, text=True, env=os.environ)
+    assert "usage: sc3d label" in result.stdout
+
+
+class TestBadInput:
+    def check(self, capsys, scene, expected, *arguments):
+        before = files(scene)
+        message = fails(capsys, *arguments)
+        assert all(word in message for word in expected), message
+        assert files(scene) == before
+
+    def test_no_photos(self, capsys, scene, tmp_path):
+        (tmp_path / "empty").mkdir()
+        self.check(capsys, scene, ["no photos", "empty"], "reconstruct", tmp_path / "empty", scene)
+        self.check(capsys, scene, ["not a folder"], "reconstruct", tmp_path / "nowhere", scene)
+
+    def test_unreadable_photo(self, capsys, scene, tmp_path):
+        photos = tmp_path / "photos"
+        photos.mkdir()
+        Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(photos / "a.jpg")
+        (photos / "b.jpg").write_bytes(b"not an image")
+        self.check(capsys, scene, ["cannot read", "b.jpg"], "reconstruct", photos, scene)
+        self.check(capsys, scene, ["cannot read", "b.jpg"], "run", photos, scene, "--masks", scene / "masks")
+
+    def test_mask_for_an_unknown_photo(self, capsys, scene):
+        Image.fromarray(np.ones((120, 160), np.uint8)).save(scene / "masks" / "other.png")
+        self.check(capsys, scene, ["other.png", "no photo"], "label", scene)
+
+    def test_mask_of_another_aspect(self, capsys, scene):
+        Image.fromarray(np.ones((120, 150), np.uint8)).save(scene / "masks" / "photo_1.png")
+        self.check(capsys, scene, ["photo_1.png", "150x120", "160x120"], "label", scene)
+
+    def test_class_id_not_in_the_table(self, capsys, scene):
+        Image.fromarray(np.full((120, 160), 2, np.uint8)).save(scene / "masks" / "photo_1.png")
+        self.check(capsys, scene, ["photo_1.png", "class id 2"], "label", scene)
+
+    def test_mask_with_colours(self, capsys, scene):
+        Image.fromarray(np.full((120, 160, 3), 2, np.uint8)).save(scene / "masks" / "photo_1.png")
+        self.check(capsys, scene, ["photo_1.png", "colours"], "label", scene)
+
+    def test_missing_cameras(self, capsys, scene):
+        for file in (scene / "sparse" / "0").iterdir():
+            file.unlink()
+        self.check(capsys, scene, ["no cameras", "reconstruct"], "label", scene)
+
+    def test_broken_cameras(self, capsys, scene):
+        (scene / "sparse" / "0" / "images.bin").write_bytes(b"\x05")
+        self.check(capsys, scene, ["COLMAP model"], "label", scene)
+
+    def test_empty_cloud(self, capsys, scene):
+        (scene / "cloud.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n")
+        self.check(capsys, scene, ["no points"], "label", scene)
+
+    def test_points_that_are_not_numbers(self, capsys, scene):
+        points = np.zeros((10, 3))
+        points[3, 1] = np.nan
+        o3d.t.io.write_point_cloud(str(scene / "cloud.ply"), o3d.t.geometry.PointCloud(o3d.core.Tensor(points)))
+        self.check(capsys, scene, ["not finite"], "label", scene)
+
+    @pytest.mark.parametrize("share", [0.5, 0.999])
+    def test_truncated_ply(self, capsys, scene, share):
+        content = (scene / "cloud.ply").read_bytes()
+        (scene / "cloud.ply").write_bytes(content[: int(share * len(content))])
+        self.check(capsys, scene, ["truncated"], "label", scene)
+
+    def test_not_a_ply(self, capsys, scene):
+        (scene / "cloud.ply").write_text("hello")
+        self.check(capsys, scene, ["not a PLY"], "label", scene)
+
+    def test_class_table(self, capsys, scene):
+        for broken, word in (([], "non-empty"), ([{"id": 0, "name": "a", "color": [0, 0, 0]}], "0 means unlabelled"),
+                             ([{"id": 1, "name": "a", "color": [0, 0, 999]}], "color"), ([{"id": 1, "name": "a", "color": [0, 0, 0]}] * 2, "twice")):
+            (scene / "classes.json").write_text(json.dumps(broken))
+            self.check(capsys, scene, [word], "label", scene)
+        (scene / "classes.json").write_text("{")
+        self.check(capsys, scene, ["JSON"], "label", scene)
+        (scene / "classes.json").unlink()
+        self.check(capsys, scene, ["classes.json is missing"], "label", scene)
+
+    def test_steps_in_the_wrong_order(self, capsys, scene):
+        self.check(capsys, scene, ["run `sc3d label"], "propagate", scene)
+        self.check(capsys, scene, ["run `sc3d propagate"], "evaluate", scene)
+        self.check(capsys, scene, ["run `sc3d train"], "extract", scene)
+        self.check(capsys, scene, ["cannot read the image"], "train", scene)
+
+    def test_scene_that_does_not_exist(self, capsys, scene, tmp_path):
+        self.check(capsys, scene, ["does not exist"], "view", tmp_path / "nowhere")
+
+    def test_photo_names_that_leave_the_scene(self, capsys, scene):
+        import shutil
+
+        from scenes import views, write_model
+
+        shutil.rmtree(scene / "sparse")
+        evil = views()
+        object.__setattr__(evil[0], "name", "../../etc/passwd")
+        write_model(scene / "sparse" / "0", evil)
+        self.check(capsys, scene, ["outside the scene"], "label", scene)
+
+    def test_folder_without_permission_to_write(self, capsys):
+        with tempfile.TemporaryDirectory() as folder:  # pytest's own folder is closed to others
+            os.chmod(folder, 0o755)
+            scene = write_bare_scene(Path(folder) / "scene")
+            before = files(scene)
+            os.chmod(scene, 0o555)
+            if os.getuid() == 0:  # root may write anywhere
+                os.seteuid(65534)
+            try:
+                message = fails(capsys, "label", scene)
+            finally:
+                os.seteuid(os.getuid())
+                os.chmod(scene, 0o755)
+            assert "cannot write" in message and "permissions" in message
+            assert files(scene) == before
+
+    def test_usage_errors_exit_with_2(self, capsys, scene):
+        with pytest.raises(SystemExit) as stopped:
+            main(["label", str(scene), "--consensus", "much"])
+        assert stopped.value.code == 2
+
+
+def test_interrupted_output_leaves_the_old_file(tmp_path):
+    from sc3d.io import atomic_path
+
+    target = tmp_path / "cloud.ply"
+    target.write_text("old")
+    with pytest.raises(KeyboardInterrupt), atomic_path(target) as temporary:
+        temporary.write_text("half")
+        raise KeyboardInterrupt
+    assert target.read_text() == "old" and list(tmp_path.iterdir()) == [target]

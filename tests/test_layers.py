@@ -1,0 +1,80 @@
+"""Imports point down only, and heavy packages stay where they belong."""
+
+import ast
+from pathlib import Path
+
+import sc3d
+
+ROOT = Path(sc3d.__file__).parent
+# lowest first; a module may import its own layer and those below
+LAYERS = [
+    ["sc3d.errors"],
+    ["sc3d.splatting.settings", "sc3d.synthetic.settings"],
+    ["sc3d.settings"],
+    ["sc3d.geometry"],
+    ["sc3d.classes", "sc3d.io"],
+    ["sc3d.scene"],
+    ["sc3d.splatting", "sc3d.sfm", "sc3d.segmentation", "sc3d.synthetic", "sc3d.fusion", "sc3d.metrics"],
+    ["sc3d.propagation", "sc3d.labelled"],
+    ["sc3d.view"],
+    ["sc3d.report"],
+    ["sc3d.stages"],
+    ["sc3d.cli"],
+]
+SIDE_BY_SIDE = {"sc3d.splatting", "sc3d.sfm", "sc3d.segmentation", "sc3d.synthetic"}  # stages' packages that must not know one another
+
+
+def layer(module: str) -> int:
+    fitting = [(len(name), row) for row, names in enumerate(LAYERS) for name in names if module == name or module.startswith(name + ".")]
+    return max(fitting)[1] if fitting else -1
+
+
+def package(module: str) -> str:
+    return ".".join(module.split(".")[:2])
+
+
+def imports_of(file: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: relative import"
+            found.add(node.module)
+            found |= {f"{node.module}.{alias.name}" for alias in node.names if (ROOT.parent / node.module.replace(".", "/") / f"{alias.name}.py").exists()}
+    return found
+
+
+def modules() -> dict[str, set[str]]:
+    return {".".join(file.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): imports_of(file) for file in ROOT.rglob("*.py")}
+
+
+def test_imports_point_down():
+    upward = [f"{module} imports {name}" for module, names in modules().items() if module != "sc3d" for name in names
+              if name.startswith("sc3d.") and layer(name) > layer(module)]
+    assert not upward
+
+
+def test_every_module_has_a_layer():
+    assert not [module for module in modules() if module != "sc3d" and layer(module) < 0]
+
+
+def test_stage_packages_do_not_know_one_another():
+    crossing = [f"{module} imports {name}" for module, names in modules().items() for name in names
+                if package(module) in SIDE_BY_SIDE and package(name) in SIDE_BY_SIDE and package(module) != package(name)]
+    stages = [f"{module} imports {name}" for module, names in modules().items() if module.startswith("sc3d.stages.") and module != "sc3d.stages.run"
+              for name in names if name.startswith("sc3d.stages.")]
+    assert not crossing and not stages
+
+
+def test_torch_lives_in_splatting_and_segmentation_only():
+    homes = ("sc3d.splatting", "sc3d.segmentation")
+    assert not [module for module, names in modules().items() if not module.startswith(homes) and any(name.split(".")[0] in ("torch", "transformers") for name in names)]
+
+
+def test_no_pickle_and_no_print_in_the_package():
+    for file in ROOT.rglob("*.py"):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        calls = [node.func.id for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)]
+        assert "print" not in calls, file
+        assert not imports_of(file) & {"pickle", "dill", "joblib"}, file
