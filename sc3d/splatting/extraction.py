@@ -15,6 +15,7 @@ from tqdm import tqdm
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.neighbors import orient_normals
+from sc3d.geometry.raycast import Surface, first_surface
 from sc3d.geometry.surface import DepthFusion, drop_small_parts, near_mesh
 from sc3d.settings import Extract
 from sc3d.splatting.consistency import consistent, pixel_rays
@@ -26,49 +27,96 @@ NUM_NEIGHBOURS = 6
 MIN_PART = 200  # triangles; smaller components are floaters
 
 
+LOOSE = 4.0  # px; how far two views may disagree where nothing better is known
+
+
 @dataclass(frozen=True)
 class Surfaces:
-    """mesh, cloud: in the views' local world; coverage: share of all pixels whose depth entered the surface; voxel_size: world units."""
+    """mesh, cloud: in the views' local world; voxel_size: world units.
+
+    confirmed: share of all pixels whose depth was confirmed by neighbour views; coverage: share whose ray hits the mesh
+    """
 
     mesh: o3d.t.geometry.TriangleMesh
     cloud: o3d.t.geometry.PointCloud
-    coverage: float
     voxel_size: float
+    confirmed: float
+    coverage: float
 
 
-def extract_surface(
-    gaussians: Gaussians, views: list[View], image: Callable[[int], np.ndarray], neighbours: list[np.ndarray], depth_limit: float, settings: Extract
-) -> Surfaces:
-    """Fuse the rendered depth of all views.
+@dataclass(frozen=True)
+class DepthViews:
+    """The views whose depth is fused.
 
-    views: pinhole; image: index to (H, W, 3) uint8 RGB of the view's size; neighbours: per view, rows of views that see the same surface
-    depth_limit: farthest depth, world units
+    views: pinhole; image: index to (H, W, 3) uint8 RGB of the view's size
+    neighbours: per view, rows of views that see the same surface; depth_limit: farthest depth, world units
     """
+
+    views: list[View]
+    image: Callable[[int], np.ndarray]
+    neighbours: list[np.ndarray]
+    depth_limit: float
+
+
+def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -> Surfaces:
+    """Fuse the rendered depth of all views; raises Sc3dError where the views show or share no surface."""
     with tempfile.TemporaryDirectory(prefix="sc3d-depth-") as folder:
-        files = [Path(folder) / f"{row}.npy" for row in range(len(views))]
+        maps = _DepthMaps(Path(folder), data)
+        voxel_size = settings.voxel_size or _default_voxel_size(gaussians, maps.render(gaussians))
+        fusion, confirmed, pixels = DepthFusion(voxel_size), 0, sum(view.width * view.height for view in data.views)
+        for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
+            depth = maps.confirmed(row, settings.min_views)
+            fusion.integrate(view, depth, data.image(row), data.depth_limit)
+            confirmed += int((depth > 0).sum())
+        if not confirmed:
+            raise Sc3dError("the views' depths do not agree anywhere: train longer, or lower --min-views")
+        if settings.complete:
+            surface = _surface(drop_small_parts(fusion.mesh(), MIN_PART))
+            for row, view in enumerate(tqdm(data.views, desc="completing", unit="view", disable=None)):
+                hole = ~np.isfinite(first_surface(surface, view).range)
+                fusion.integrate(view, np.where(hole, maps.plausible(row), 0), data.image(row), data.depth_limit)
+    mesh, cloud = drop_small_parts(fusion.mesh(), MIN_PART), fusion.cloud()
+    cloud = cloud.select_by_mask(o3d.core.Tensor(near_mesh(cloud.point.positions.numpy(), mesh, 0.5 * voxel_size)))
+    surface = _surface(mesh)
+    hit = sum(int(np.isfinite(first_surface(surface, view).range).sum()) for view in data.views)
+    return Surfaces(mesh, cloud, voxel_size, confirmed / pixels, hit / pixels)
+
+
+class _DepthMaps:
+    """Depth of every view, kept on disk, and what the neighbours say of it."""
+
+    def __init__(self, folder: Path, data: DepthViews) -> None:
+        self.folder, self.data = folder, data
+
+    def render(self, gaussians: Gaussians) -> float:
+        """Write all maps; returns the median size of a pixel on the surface, world units."""
         footprints = []
-        for view, file in tqdm(zip(views, files, strict=True), total=len(views), desc="depth", unit="view", disable=None):
-            depth = _reliable_depth(gaussians, view, depth_limit)
-            np.save(file, depth)
+        for row, view in enumerate(tqdm(self.data.views, desc="depth", unit="view", disable=None)):
+            depth = _reliable_depth(gaussians, view, self.data.depth_limit)
+            np.save(self.folder / f"{row}.npy", depth)
             if (depth > 0).any():
                 footprints.append(float(np.median(depth[depth > 0])) / view.focal)
         if not footprints:
             raise Sc3dError("no view shows a surface: train longer, or check the cameras")
-        voxel_size = settings.voxel_size or _default_voxel_size(gaussians, float(np.median(footprints)))
-        fusion, kept, total = DepthFusion(voxel_size), 0, 0
-        for row, view in enumerate(tqdm(views, desc="fusing", unit="view", disable=None)):
-            depth = torch.from_numpy(np.load(files[row]))
-            others = [(torch.from_numpy(np.load(files[other])), views[other]) for other in neighbours[row][:NUM_NEIGHBOURS]]
-            confirmed = consistent(depth, view, others).numpy() >= min(settings.min_views, len(others))
-            depth = np.where(confirmed, depth.numpy(), 0).astype(np.float32)
-            fusion.integrate(view, depth, image(row), depth_limit)
-            kept, total = kept + int((depth > 0).sum()), total + depth.size
-    mesh, cloud = fusion.mesh(), fusion.cloud()
-    if not len(cloud.point.positions):
-        raise Sc3dError("the views' depths do not agree anywhere: train longer, or lower --min-views")
-    mesh = drop_small_parts(mesh, MIN_PART)
-    cloud = cloud.select_by_mask(o3d.core.Tensor(near_mesh(cloud.point.positions.numpy(), mesh, 0.5 * voxel_size)))
-    return Surfaces(mesh, cloud, kept / total, voxel_size)
+        return float(np.median(footprints))
+
+    def read(self, row: int) -> torch.Tensor:
+        return torch.from_numpy(np.load(self.folder / f"{row}.npy"))
+
+    def counts(self, row: int, tolerance: float) -> np.ndarray:
+        """(H, W) number of neighbours that see a pixel's surface within `tolerance` px of where this view has it."""
+        others = [(self.read(other), self.data.views[other]) for other in self.data.neighbours[row][:NUM_NEIGHBOURS]]
+        return consistent(self.read(row), self.data.views[row], others, tolerance).numpy()
+
+    def confirmed(self, row: int, min_views: int) -> np.ndarray:
+        """(H, W) float32 depth that enough neighbours confirm, else 0."""
+        enough = self.counts(row, 1.0) >= min(min_views, len(self.data.neighbours[row]))
+        return np.where(enough, self.read(row).numpy(), 0).astype(np.float32)
+
+    def plausible(self, row: int) -> np.ndarray:
+        """(H, W) float32 depth that a neighbour confirms roughly, or that no neighbour can judge, else 0."""
+        accepted = (self.counts(row, LOOSE) >= 1) | (self.counts(row, np.inf) == 0)
+        return np.where(accepted, self.read(row).numpy(), 0).astype(np.float32)
 
 
 def centre_cloud(gaussians: Gaussians, centres: np.ndarray, min_opacity: float) -> o3d.t.geometry.PointCloud:
@@ -94,3 +142,7 @@ def _reliable_depth(gaussians: Gaussians, view: View, depth_limit: float) -> np.
 def _default_voxel_size(gaussians: Gaussians, footprint: float) -> float:
     low, high = np.quantile(gaussians.means.detach().numpy(), [0.01, 0.99], axis=0)
     return max(1.5 * footprint, float((high - low).max()) / 2048)
+
+
+def _surface(mesh: o3d.t.geometry.TriangleMesh) -> Surface:
+    return Surface.from_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), np.zeros(3))

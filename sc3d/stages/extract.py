@@ -12,7 +12,7 @@ from sc3d.geometry.cameras import local_origin, project, resample, undistorted
 from sc3d.io import read_image, write_geometry
 from sc3d.scene import Scene, check_photos
 from sc3d.settings import Extract
-from sc3d.splatting.extraction import centre_cloud, extract_surface
+from sc3d.splatting.extraction import DepthViews, centre_cloud, extract_surface
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.neighbours import neighbour_views
 
@@ -42,13 +42,15 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
     def image(row: int) -> np.ndarray:
         return resample(read_image(scene.photo(model.views[row].name)), model.views[row].shifted(origin), views[row])
 
-    surfaces = extract_surface(gaussians, views, image, neighbour_views(model.tracks, model.points, centres), _depth_limit(model), settings)
+    data = DepthViews(views, image, neighbour_views(model.tracks, model.points, centres), _depth_limit(model))
+    surfaces = extract_surface(gaussians, data, settings)
     write_geometry(scene.mesh, _placed(surfaces.mesh, origin))
     write_geometry(scene.cloud, _placed(surfaces.cloud, origin))
     return {
         "points": len(surfaces.cloud.point.positions),
         "triangles": len(surfaces.mesh.triangle.indices),
         "voxel_size": round(surfaces.voxel_size, 5),
+        "confirmed": f"{surfaces.confirmed:.1%} of the pixels",
         "coverage": f"{surfaces.coverage:.1%} of the pixels",
     }
 
