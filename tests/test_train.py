@@ -10,6 +10,8 @@ import torch
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import look_at, pinhole_view, rays
 from sc3d.splatting.evaluation import depth_map
+from sc3d.splatting.initialise import fill_points
+from sc3d.splatting.neighbours import neighbour_views
 from sc3d.splatting.settings import TrainSettings
 from sc3d.splatting.train import TrainingData, train, write_log
 
@@ -76,6 +78,22 @@ def test_training_recovers_colour_and_depth(scene, plain, tolerance):
         lengths = np.linalg.norm(normals, axis=2)
         assert np.allclose(lengths[depth > 0], 1, atol=1e-5) and normals[..., 2][depth > 0].max() < 0.2
     assert np.median(np.concatenate(errors)) < tolerance
+
+
+def test_empty_parts_are_filled_at_the_right_depth(scene):
+    data, _ = scene
+    sparse = data.points[:, 0] < -1  # the right half has no sparse points
+    data = replace(data, points=data.points[sparse], colors=data.colors[sparse])
+    neighbours = neighbour_views(None, data.points, np.stack([view.centre for view in data.views]))
+    points, colors = fill_points(data, neighbours, 3000)
+    right = points[points[:, 0] > 0.5]
+    assert len(right) > 150
+    height = right[:, 2] - 0.3 * np.abs(right[:, 0])
+    assert np.median(np.abs(height)) < 0.15 and np.abs(np.median(height)) < 0.1  # at 9 units distance
+    expected = surface_colour(points) * 255
+    assert np.median(np.abs(colors - expected)) < 15
+    masked = replace(data, masks=lambda index: np.zeros((HEIGHT, WIDTH), bool))
+    assert len(fill_points(masked, neighbours, 3000)[0]) == 0
 
 
 def test_same_seed_same_result_and_resume_is_exact(scene, tmp_path):

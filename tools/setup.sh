@@ -52,4 +52,3 @@ if [ "$(cat "$venv/.sc3d-stamp" 2>/dev/null)" != "$stamp" ]; then
     "$venv/bin/python" -c 'import open3d' || { say "Open3D does not load; please run: sudo apt-get install --no-install-recommends ${libraries[*]}"; exit 1; }
     printf '%s' "$stamp" >"$venv/.sc3d-stamp"
 fi
-export OMP_WAIT_POLICY=PASSIVE

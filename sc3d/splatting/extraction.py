@@ -62,7 +62,8 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
     """Fuse the rendered depth of all views; raises Sc3dError where the views show or share no surface."""
     with tempfile.TemporaryDirectory(prefix="sc3d-depth-") as folder:
         maps = _DepthMaps(Path(folder), data)
-        voxel_size = settings.voxel_size or _default_voxel_size(gaussians, maps.render(gaussians))
+        footprint = maps.render(gaussians)
+        voxel_size = settings.voxel_size or _default_voxel_size(gaussians, footprint)
         fusion, confirmed, pixels = DepthFusion(voxel_size), 0, sum(view.width * view.height for view in data.views)
         for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
             depth = maps.confirmed(row, settings.min_views)

@@ -112,10 +112,9 @@ def _settled(grid: np.ndarray, depth: np.ndarray, good: np.ndarray, step: float)
 
 
 def _interpolated(pixels: np.ndarray, depths: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """(G,) depth from the 8 nearest known pixels; 1 / depth is what is averaged, for it is linear on a plane."""
-    gaps, near = cKDTree(pixels).query(grid, k=MIN_SPARSE)
-    weights = 1 / np.maximum(gaps, 1e-3) ** 2
-    return weights.sum(1) / (weights / depths[near]).sum(1)
+    """(G,) third quartile of the depths of the 8 nearest known pixels: what no patch matches is more often the ground beside a roof than the roof."""
+    near = cKDTree(pixels).query(grid, k=MIN_SPARSE)[1]
+    return np.quantile(depths[near], 0.75, axis=1)
 
 
 def _thinned(points: np.ndarray, colors: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:

@@ -59,7 +59,7 @@ class TrainSettings:
     """mean image-position gradient (NDC) that asks for more Gaussians"""
     absolute_gradient_threshold: float = 8e-4
     """mean absolute gradient that splits Gaussians with a large radius"""
-    means_rate: float = 1.6e-4
+    means_rate: float = 3.2e-4
     """first learning rate of positions, relative to the scene; it falls to 1 % log-linearly"""
 
     def active_sh_degree(self, iteration: int) -> int:

@@ -16,6 +16,7 @@ import os
 import platform
 import resource
 import time
+from contextlib import suppress
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
@@ -43,6 +44,7 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
         logger.info("%s: up to date (--overwrite runs it again)", name)
         return previous["summary"]
     started = time.perf_counter()
+    reset_peak_memory()
     for output in outputs:
         sidecar(output).unlink(missing_ok=True)
     summary = _plain(stage.run(scene, settings))
@@ -69,8 +71,17 @@ def versions() -> dict[str, str]:
     return found
 
 
+def reset_peak_memory() -> None:
+    """Start measuring the peak anew (Linux; elsewhere it stays that of the whole process)."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
 def peak_memory_mb() -> int:
-    """Largest resident memory of this process so far, MB."""
+    """Largest resident memory since `reset_peak_memory`, MB."""
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) // 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
 
 

@@ -12,7 +12,7 @@ from sc3d.classes import read_classes
 from sc3d.errors import InputError
 from sc3d.io import atomic_path
 from sc3d.scene import Scene, match_masks, photo_sizes
-from sc3d.stages import execute, peak_memory_mb
+from sc3d.stages import execute
 from sc3d.stages.reconstruct import prepare
 
 logger = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ def main(command: options.Run) -> None:
         stages.append(("evaluate", options.Evaluate(truth=command.truth)))
     for name, settings in [*stages, ("report", options.Report())]:
         execute(name, scene, settings, command.overwrite)
-    logger.info("run: %.0f s, peak memory %d MB; look at %s", time.perf_counter() - started, peak_memory_mb(), scene.report)
+    logger.info("run: %.0f s; look at %s", time.perf_counter() - started, scene.report)
 
 
 def check(command: options.Run, segment: options.Segment) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from functools import lru_cache
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin, resample, undistorted
-from sc3d.io import read_image
+from sc3d.io import digest, read_image
 from sc3d.scene import Scene, check_photos
 from sc3d.settings import Train
 from sc3d.splatting.train import TrainingData, train, write_log
@@ -37,7 +38,7 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
     def image(index: int) -> np.ndarray:
         return resample(read_image(scene.photo(model.views[index].name)), model.views[index].shifted(origin), views[index])
 
-    checkpoint = scene.path / "train.checkpoint"
+    checkpoint = _checkpoint(scene, settings)
     data = TrainingData(views, image, model.points - origin, model.colors, model.tracks)
     result = train(data, settings, checkpoint if settings.checkpoint_every else None)
     result.gaussians.save(scene.gaussians, [f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}"])
@@ -47,3 +48,13 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
     held_out = {f"held_out_{name}": round(value, 3) for name, value in result.metrics.items()}
     return {"photos": len(views), "size": f"{views[0].width}x{views[0].height}", "gaussians": len(result.gaussians)} | {
         "psnr": round(last.get("psnr", float("nan")), 2)} | held_out
+
+
+def _checkpoint(scene: Scene, settings: Train) -> Path:
+    """Where this run's checkpoint lies; those of other settings, photos or cameras are removed."""
+    state = hashlib.blake2b(repr((settings, digest(scene.images), digest(scene.sparse))).encode(), digest_size=8).hexdigest()
+    mine = scene.path / f"train.{state}.checkpoint"
+    for other in scene.path.glob("train.*.checkpoint"):
+        if other != mine:
+            other.unlink()
+    return mine

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import config, njit, prange
+from numba import njit, prange
 
 from sc3d.synthetic.mesh import BRICK, FLAT_ROOF, GLASS, GROUND, LEAF, OTHER, PLAIN, ROAD, TILES, WALL
 from sc3d.synthetic.texture import (LAWN, flat_roof_color, fractal_noise, ground_color, ground_kind, random01, tile_color, wall_color)
 
-if config.THREADING_LAYER == "default":
-    config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # the order of numba warns about every old TBB
 SUN = np.array([-0.48, -0.42, 0.77]) / np.linalg.norm([-0.48, -0.42, 0.77])  # direction to the sun, world
 
 

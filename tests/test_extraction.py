@@ -1,0 +1,72 @@
+"""Gaussians on known planes come out as mesh and cloud where they are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sc3d.errors import Sc3dError
+from sc3d.geometry.cameras import look_at, pinhole_view
+from sc3d.settings import Extract
+from sc3d.splatting.extraction import DepthViews, centre_cloud, extract_surface
+from sc3d.splatting.gaussians import Gaussians
+
+STEP = 0.1
+
+
+def flat_square(half: float, height: float) -> Gaussians:
+    """Opaque discs with normals along z."""
+    x, y = np.meshgrid(np.arange(-half, half, STEP), np.arange(-half, half, STEP))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
+    gaussians = Gaussians.from_points(points, np.tile(np.uint8([200, 120, 40]), (len(points), 1)), 0, opacity=0.95)
+    scales = torch.full_like(gaussians.log_scales, float(np.log(STEP)))
+    scales[:, 2] = -8
+    quats = torch.zeros_like(gaussians.quats)
+    quats[:, 0] = 1
+    return replace(gaussians, log_scales=scales, quats=quats)
+
+
+def views() -> list:
+    centres = [[-2, -2, 12], [2, -2, 12], [2, 2, 12], [-2, 2, 12], [0, 0, 13]]
+    return [pinhole_view(f"{row}.jpg", (160, 120), (150, 150, 78, 62), look_at(np.array(centre, float), np.zeros(3))) for row, centre in enumerate(centres)]
+
+
+def data() -> DepthViews:
+    neighbours = [np.array([other for other in range(5) if other != row]) for row in range(5)]
+    return DepthViews(views(), lambda row: np.full((120, 160, 3), 90, np.uint8), neighbours, 30.0)
+
+
+def test_plane_comes_out_flat_closed_and_upwards():
+    surfaces = extract_surface(flat_square(4.0, 0.5), data(), Extract(voxel_size=0.15))
+    points = surfaces.cloud.point.positions.numpy()
+    inner = np.abs(points[:, :2]).max(axis=1) < 3.5
+    assert inner.sum() > 1000 and np.abs(points[inner, 2] - 0.5).max() < 0.05
+    assert surfaces.cloud.point.normals.numpy()[inner, 2].min() > 0.95
+    assert np.abs(surfaces.cloud.point.colors.numpy().astype(int) - 90).max() <= 1
+    cells = np.floor(points[inner, :2] / 0.3).astype(int)
+    assert len(np.unique(cells, axis=0)) >= 23**2
+    assert 0 < surfaces.confirmed <= 1 and surfaces.coverage >= surfaces.confirmed - 0.02
+
+
+def test_completion_covers_what_only_one_view_sees():
+    lonely = replace(data(), neighbours=[np.array([4]), np.array([4]), np.array([4]), np.array([4]), np.array([0])])
+    without = extract_surface(flat_square(8.0, 0.0), lonely, Extract(voxel_size=0.15, complete=False))
+    completed = extract_surface(flat_square(8.0, 0.0), lonely, Extract(voxel_size=0.15))
+    assert completed.coverage > without.coverage + 0.02
+    assert np.abs(completed.cloud.point.positions.numpy()[:, 2]).max() < 0.1
+
+
+def test_nothing_to_see_is_said():
+    with pytest.raises(Sc3dError, match="no view shows a surface"):
+        extract_surface(flat_square(1.0, 50.0), data(), Extract())
+
+
+def test_centres_with_colours_and_normals_towards_the_cameras():
+    gaussians = flat_square(2.0, 0.0)
+    cloud = centre_cloud(gaussians, np.array([view.centre for view in views()]), 0.3)
+    assert len(cloud.point.positions) == len(gaussians)
+    assert (cloud.point.normals.numpy()[:, 2] > 0.99).all()
+    assert np.abs(cloud.point.colors.numpy().astype(int) - [200, 120, 40]).max() <= 1
+    with pytest.raises(Sc3dError, match="min-opacity"):
+        centre_cloud(gaussians, np.zeros((1, 3)), 0.99)
