@@ -160,6 +160,20 @@ def test_exposure_of_photos_is_found(scene):
     assert brightness[gains > 1].min() > brightness[gains < 1].max()
 
 
+@pytest.mark.parametrize("iterations", [100, 1500, 7000, 30_000])
+def test_schedules_scale_with_the_run(iterations):
+    settings = TrainSettings(iterations=iterations, sh_degree=3)
+    growing = [step for step in range(iterations + 1) if settings.densifies(step, 40)]
+    assert growing and growing[0] >= 0.02 * iterations and growing[-1] <= 0.5 * iterations
+    assert settings.densify_interval(40) >= min(40, iterations // 60)
+    assert [settings.active_sh_degree(iterations * k // 30) for k in (0, 30)] == [0, 3]
+    assert settings.position_rate(iterations, 10.0) == pytest.approx(0.01 * settings.position_rate(0, 10.0))
+    assert settings.allowed_gaussians(0, 1000) <= 1000 and settings.allowed_gaussians(iterations, 1000) == settings.max_gaussians
+    assert any(settings.resets_opacity(step) for step in range(iterations)) == (iterations >= 7000)
+    assert settings.shapes_surface(iterations // 2) and not settings.shapes_surface(iterations // 10)
+    assert not TrainSettings(iterations=iterations, plain=True).shapes_surface(iterations - 1)
+
+
 def test_log_is_a_table(scene, tmp_path):
     data, _ = scene
     result = train(data, SHORT, progress=False)

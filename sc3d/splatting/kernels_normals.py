@@ -1,4 +1,6 @@
-"""The single-view normal loss with its analytic gradient as two passes over the image; `losses.normal_loss` with `normals_from_depth` is the slow twin.
+"""The single-view normal loss with its analytic gradient as two passes over the image.
+
+`losses.normal_loss` with `losses.normals_from_depth` is the slow twin.
 
 With a, b the differences of the 4 neighbours' points across and down, m = b x a, n = m / |m| and residual signs s = sign(A n - N):
     dL/dm = (I - n n^T) (w A s) / |m|,   dL/da = dL/dm x b,   dL/db = a x dL/dm,   and each point is its depth times a fixed ray.

@@ -16,7 +16,9 @@ NOISE = 1 / 255**2
 """variance of grey values that counts as noise"""
 
 
-def patch_dissimilarity(normals: Tensor, distances: Tensor, pixels: Tensor, greys: tuple[Tensor, Tensor], cameras: np.ndarray) -> tuple[Tensor, Tensor]:
+def patch_dissimilarity(
+    normals: Tensor, distances: Tensor, pixels: Tensor, greys: tuple[Tensor, Tensor], cameras: np.ndarray
+) -> tuple[Tensor, Tensor]:
     """(M,) 1 - NCC, differentiable in `normals` (M, 3) and `distances` (M,); (M,) bool: both patches lie inside their images.
 
     pixels: (M, 2) int64 column, row; greys: (H, W) and (h, w)

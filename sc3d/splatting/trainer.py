@@ -86,7 +86,8 @@ class Trainer:
         if self.settings.flatten_weight:
             loss = loss + self.settings.flatten_weight * losses.flatten_loss(gaussians.log_scales, rendering.radii > 0, self.extent)
         if self.settings.shapes_surface(iteration):
-            loss = loss + self._surface_terms(index, view, target, rendering)
+            depth = unbiased_depth(rendering, view)
+            loss = loss + self._surface_terms(index, target, rendering, depth if mask is None else torch.where(mask, depth, 0))
         loss.backward()
         self._update(index, rendering)
         self.iteration += 1
@@ -104,7 +105,7 @@ class Trainer:
     def save(self, path: Path) -> None:
         """Write everything the rest of the run depends on."""
         state = {
-            "version": CHECKPOINT_VERSION, "settings": asdict(self.settings), "iteration": self.iteration, "queue": self.queue,
+            **self._identity(), "iteration": self.iteration, "queue": self.queue,
             "parameters": {name: tensor.detach() for name, tensor in self.optimiser.parameters.items()},
             "optimiser": self.optimiser.state(), "exposure": self.exposure.parameters["exposure"].detach(),
             "exposure_optimiser": self.exposure.state(), "statistics": vars(self.statistics), "depths": self.depths,
@@ -114,14 +115,14 @@ class Trainer:
             torch.save(state, temporary)
 
     def resume(self, path: Path) -> bool:
-        """Continue from `save`; False (and a warning) if the file belongs to other settings."""
+        """Continue from `save`; False (and a warning) if the file belongs to other settings or photos."""
         try:
             state = torch.load(path, weights_only=True)
-            matches = state["version"] == CHECKPOINT_VERSION and state["settings"] == asdict(self.settings)
+            matches = all(state[name] == value for name, value in self._identity().items())
         except Exception as error:  # torch raises many types for broken files
             raise InputError(f"{path} is not a readable checkpoint ({type(error).__name__}): delete it to start over") from None
         if not matches:
-            log.warning("%s was made with other settings: starting over", path)
+            log.warning("%s was made with other settings or photos: starting over", path)
             return False
         self.optimiser.parameters.update({name: tensor.requires_grad_() for name, tensor in state["parameters"].items()})
         self.optimiser.restore(state["optimiser"])
@@ -132,6 +133,11 @@ class Trainer:
         self.generator.set_state(state["generator"])
         self._recent, self._seconds, self._started = state["recent"], state["seconds"], time.perf_counter()
         return True
+
+    def _identity(self) -> dict[str, object]:
+        """What must be the same for a checkpoint to fit."""
+        views = [f"{view.name} {view.width}x{view.height}" for view in self.data.views]
+        return {"version": CHECKPOINT_VERSION, "settings": asdict(self.settings), "views": views, "num_points": len(self.data.points)}
 
     def _initial(self, data: TrainingData, neighbours: list[np.ndarray]) -> tuple[dict[str, torch.Tensor], dict[str, float | np.ndarray]]:
         points, colors = np.asarray(data.points, np.float64), np.asarray(data.colors)
@@ -153,10 +159,9 @@ class Trainer:
             self.queue = [self.train_views[position] for position in order.tolist()]
         return self.queue.pop()
 
-    def _surface_terms(self, index: int, view: View, target: torch.Tensor, rendering: Rendering) -> torch.Tensor:
+    def _surface_terms(self, index: int, target: torch.Tensor, rendering: Rendering, depth: torch.Tensor) -> torch.Tensor:
         """Normal and multi-view terms against one random neighbour, whose depth is the one it had when it was trained on last."""
-        settings, others = self.settings, self.neighbours[index]
-        depth = unbiased_depth(rendering, view)
+        settings, view, others = self.settings, self.data.views[index], self.neighbours[index]
         loss = settings.normal_weight * single_view_normal_loss(rendering, depth, view, target)
         self.depths[index] = torch.where(rendering.alpha > 0.5, depth, 0).detach()
         if others:
@@ -165,7 +170,8 @@ class Trainer:
             if other not in self.depths:
                 self.depths[other] = torch.from_numpy(depth_map(self.gaussians, other_view)[0])
             neighbour = Neighbour(other_view, losses.to_grey(other_target), self.depths[other])
-            geometric, photometric = multi_view_losses(rendering, depth, (losses.to_grey(target), view), neighbour, (settings.num_patches, self.generator))
+            source, draw = (losses.to_grey(target), view), (settings.num_patches, self.generator)
+            geometric, photometric = multi_view_losses(rendering, depth, source, neighbour, draw)
             loss = loss + settings.geometric_weight * geometric + settings.photometric_weight * photometric
         return loss
 
