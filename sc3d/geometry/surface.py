@@ -38,13 +38,13 @@ class DepthFusion:
         blocks = self._grid.compute_unique_block_coordinates(depth_image, intrinsic, extrinsic, 1.0, depth_max, TRUNCATION)
         self._grid.integrate(blocks, depth_image, color_image, intrinsic, extrinsic, 1.0, depth_max, TRUNCATION)
 
-    def mesh(self, min_weight: float = 1.0) -> o3d.t.geometry.TriangleMesh:
-        """Triangles of the zero level set where at least `min_weight` views agree there is a surface."""
+    def mesh(self, min_weight: float = 0.5) -> o3d.t.geometry.TriangleMesh:
+        """Triangles of the zero level set seen by more than `min_weight` views."""
         if not self._grid.hashmap().size():
             return o3d.t.geometry.TriangleMesh(o3d.core.Tensor.zeros((0, 3)), o3d.core.Tensor.zeros((0, 3), o3d.core.int32))
         return self._grid.extract_triangle_mesh(min_weight)
 
-    def cloud(self, min_weight: float = 1.0) -> o3d.t.geometry.PointCloud:
+    def cloud(self, min_weight: float = 0.5) -> o3d.t.geometry.PointCloud:
         """Points where the zero level set crosses the grid's edges: positions, colors uint8, unit normals out of the surface."""
         if not self._grid.hashmap().size():
             return o3d.t.geometry.PointCloud(o3d.core.Tensor.zeros((0, 3)))

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
+
+from sc3d.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -15,6 +18,10 @@ class TrainSettings:
     """never more Gaussians than this: bounds memory and time"""
     max_size: int = 800
     """longest side of the training images, px"""
+    downscale: float = 0.0
+    """divide the photos' size by this instead of fitting max_size; 0 = fit max_size"""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """where to train; only the CPU kernels exist so far"""
     sh_degree: int = 2
     """degree of the view-dependent colour, 0 to 3; 0 = the same from everywhere"""
     seed: int = 0
@@ -25,7 +32,7 @@ class TrainSettings:
     """fit a brightness gain and offset per photo"""
     test_every: int = 0
     """hold out every Nth photo and report PSNR and SSIM on them; 0 = none"""
-    checkpoint_every: int = 0
+    checkpoint_every: int = 500
     """save a checkpoint every N iterations, to continue an interrupted run; 0 = never"""
 
     ssim_weight: float = 0.2
@@ -61,6 +68,14 @@ class TrainSettings:
     """mean absolute gradient that splits Gaussians with a large radius"""
     means_rate: float = 1.6e-4
     """first learning rate of positions in a run of 30 000, relative to the scene; up to 4 times that in shorter ones; falls to 1 %"""
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1 or self.max_gaussians < 1 or self.max_size < 16 or not 0 <= self.sh_degree <= 3 or self.downscale < 0:
+            raise InputError("iterations and max_gaussians must be at least 1, max_size at least 16, sh_degree 0 to 3, downscale not negative")
+
+    def size(self, longest: int) -> int:
+        """Longest side of the training image of a photo whose longest side is `longest`, px."""
+        return round(longest / self.downscale) if self.downscale else min(longest, self.max_size)
 
     def active_sh_degree(self, iteration: int) -> int:
         """One degree more every 30th of the run."""

@@ -45,9 +45,15 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
         return previous["summary"]
     started = time.perf_counter()
     reset_peak_memory()
-    for output in outputs:
-        sidecar(output).unlink(missing_ok=True)
-    summary = _plain(stage.run(scene, settings))
+    kept = {sidecar(output): sidecar(output).read_bytes() for output in outputs if sidecar(output).exists()}
+    for path in kept:  # an output that is being replaced must not pass for finished
+        path.unlink()
+    try:
+        summary = _plain(stage.run(scene, settings))
+    except InputError:  # raised before anything is written
+        for path, content in kept.items():
+            path.write_bytes(content)
+        raise
     record |= {"versions": versions(), "seconds": round(time.perf_counter() - started, 2), "peak_memory_mb": peak_memory_mb(), "summary": summary}
     for output in outputs:
         write_json(sidecar(output), record)

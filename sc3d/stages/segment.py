@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 from sc3d.classes import ClassTable
 from sc3d.errors import InputError
-from sc3d.io import find_photos
+from sc3d.io import find_photos, read_json, write_json
 from sc3d.scene import Scene, photo_sizes
 from sc3d.settings import Segment
 
@@ -29,8 +30,15 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
     from sc3d.segmentation.run import segment_photos
 
     names = GroundedSamSettings.__dataclass_fields__.keys() & Segment.__dataclass_fields__.keys()
-    segmenter = GroundedSam(GroundedSamSettings(**{name: getattr(settings, name) for name in names}), with_prompts(class_table, settings.prompts))
+    class_table = with_prompts(class_table, settings.prompts)
+    segmenter = GroundedSam(GroundedSamSettings(**{name: getattr(settings, name) for name in names}), class_table)
+    # Masks of an interrupted run are gone on with if they were made with the same settings; others are the user's to remove.
+    marker, state = scene.path / "segment.unfinished.json", json.loads(json.dumps([repr(settings), class_table.as_json()]))
+    if scene.masks.exists() and not (marker.exists() and read_json(marker) == state):
+        raise InputError(f"{scene.masks} holds masks that other settings made: remove the folder to make new ones")
+    write_json(marker, state)
     summary = segment_photos(find_photos(scene.images), scene.masks, scene.confidence, segmenter)
+    marker.unlink()
     pixels = {class_table.name(label): int(count) for label, count in enumerate(summary.num_pixels) if count}
     return {"segmented": len(summary.segmented), "already_there": len(summary.skipped)} | {f"pixels_{name}": count for name, count in pixels.items()}
 

@@ -27,12 +27,14 @@ def outputs(scene: Scene, settings: Train) -> list[Path]:
 
 
 def run(scene: Scene, settings: Train) -> dict[str, object]:
+    if settings.device == "cuda":
+        raise InputError("there is no CUDA renderer yet: use --device cpu (or auto)")
     model = scene.model
     check_photos(scene, [view.name for view in model.views])
     if len(model.points) < 10:
         raise InputError(f"{scene.sparse} has {len(model.points)} sparse points, too few to start from: run `sc3d reconstruct` with more overlap")
     origin = local_origin(model.views)
-    views = [undistorted(view.shifted(origin), settings.max_size) for view in model.views]
+    views = [undistorted(view.shifted(origin), settings.size(max(view.width, view.height))) for view in model.views]
 
     @lru_cache(maxsize=max(2, CACHED_PIXELS // max(view.width * view.height for view in views)))
     def image(index: int) -> np.ndarray:
