@@ -117,7 +117,7 @@ class Propagate:
     """Neighbours per point in the graph."""
     fill: bool = False
     """Label also the points that no edge connects to a seed, from the nearest labelled point."""
-    smoothness: float = 1.0
+    smoothness: float = 5.0
     """Weight of the pairwise term (map)."""
     seeds: Path | None = None
     """Cloud written by label; SCENE/seeds.ply otherwise."""

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 
-from sc3d.geometry.cameras import View
+from sc3d.geometry.cameras import View, rays
 
 BLOCK = 8
 TRUNCATION = 4.0  # voxels
 CPU = o3d.core.Device("CPU:0")
+
+Part = tuple[o3d.t.geometry.TriangleMesh, o3d.t.geometry.PointCloud]  # a surface, as mesh and as cloud
 
 
 class DepthFusion:
@@ -56,6 +58,33 @@ class DepthFusion:
             normals = cloud.point.normals.numpy()
             cloud.point.normals = o3d.core.Tensor(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12).astype(np.float32))
         return cloud
+
+
+def pixel_squares(view: View, depth: np.ndarray, color: np.ndarray, wanted: np.ndarray) -> Part:
+    """The surface that a single depth map shows, where nothing better is known: a square as large as the pixel, facing the camera.
+
+    Squares, not a connected sheet: between leaves, a sheet would hang in the air along the view's rays and hide things from other views.
+
+    view: pinhole; depth: (H, W) z, world units, 0 = none; color: (H, W, 3) uint8; wanted: (H, W) bool
+    returns: mesh with vertex colours and normals, and cloud of the squares' centres with colors uint8 and normals; both may be empty
+    """
+    rows, columns = np.nonzero(wanted & (depth > 0))
+    z = depth[rows, columns].astype(np.float64)
+    right, down, forward = view.cam_from_world[:3, :3]
+    directions, ray_z = rays(view, np.stack([columns + 0.5, rows + 0.5], axis=1))
+    points = view.centre + directions * (z / ray_z)[:, None]
+    half = (0.75 * z / view.focal)[:, None]  # more than half a pixel: neighbours overlap, seen from elsewhere too
+    corners = [points + half * (u * right + v * down) for u, v in ((-1, -1), (-1, 1), (1, 1), (1, -1))]
+    base = 4 * np.arange(len(points))[:, None]
+    triangles = np.concatenate([base + [[0, 1, 2]], base + [[0, 2, 3]]], axis=1).reshape(-1, 3)
+    vertices = np.stack(corners, axis=1).reshape(-1, 3).astype(np.float32)
+    mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles.astype(np.int32)))
+    mesh.vertex.normals = o3d.core.Tensor(np.tile(-forward.astype(np.float32), (len(vertices), 1)))
+    mesh.vertex.colors = o3d.core.Tensor(np.repeat(color[rows, columns].astype(np.float32) / np.float32(255), 4, axis=0))
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points.astype(np.float32)))
+    cloud.point.normals = o3d.core.Tensor(np.tile(-forward.astype(np.float32), (len(points), 1)))
+    cloud.point.colors = o3d.core.Tensor(color[rows, columns])
+    return mesh, cloud
 
 
 def drop_small_parts(mesh: o3d.t.geometry.TriangleMesh, min_triangles: int) -> o3d.t.geometry.TriangleMesh:

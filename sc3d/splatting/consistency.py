@@ -77,6 +77,25 @@ def consistent(depth: torch.Tensor, view: View, others: list[tuple[torch.Tensor,
     return count
 
 
+def blocking(depth: torch.Tensor, view: View, others: list[tuple[torch.Tensor, View]], margin: float) -> torch.Tensor:
+    """(H, W) uint8: how many other views look through a pixel's point: they know a surface there that is farther by `margin` of its depth.
+
+    depth: (H, W), 0 = none; others: depth maps that can be trusted, 0 = unknown, with their views
+    """
+    count = torch.zeros(depth.shape, dtype=torch.uint8)
+    present = depth > 0
+    points_cam = (pixel_rays(view) * depth[..., None])[present]
+    for other_depth, other in others:
+        rotation, translation = relative_pose(view, other)
+        points_other = points_cam @ rotation.T + translation
+        pixels = _project(points_other, other)
+        inside = (points_other[:, 2] > 1e-6) & (pixels >= 0).all(1) & (pixels[:, 0] < other.width) & (pixels[:, 1] < other.height)
+        columns, rows = torch.where(inside[:, None], pixels, torch.zeros_like(pixels)).long().unbind(1)
+        known = other_depth[rows, columns]
+        count[present] += (inside & (known > 0) & (points_other[:, 2] < (1 - margin) * known)).to(torch.uint8)
+    return count
+
+
 def _project(points_cam: torch.Tensor, view: View) -> torch.Tensor:
     fx, fy, cx, cy = pinhole(view)
     depth = points_cam[:, 2].clamp_min(1e-6)

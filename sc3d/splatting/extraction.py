@@ -16,17 +16,19 @@ from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.neighbors import orient_normals
 from sc3d.geometry.raycast import Surface, first_surface
-from sc3d.geometry.surface import DepthFusion, drop_small_parts, near_mesh
+from sc3d.geometry.surface import DepthFusion, Part, drop_small_parts, near_mesh, pixel_squares
 from sc3d.settings import Extract
-from sc3d.splatting.consistency import consistent, pixel_rays
+from sc3d.splatting.consistency import blocking, consistent, pixel_rays
 from sc3d.splatting.evaluation import depth_map
 from sc3d.splatting.gaussians import Gaussians
 
 MAX_ANGLE = 80.0  # degrees between ray and normal
 NUM_NEIGHBOURS = 6
-MIN_PART = 200  # triangles; smaller components are floaters
+MIN_PART = 100  # triangles; smaller components are floaters
 
 
+ROUNDS = 4  # of completion, each with every fourth view
+MARGIN = 0.03  # share of the depth by which a surface must lie behind to be another one
 LOOSE = 4.0  # px; how far two views may disagree where nothing better is known
 
 
@@ -71,16 +73,49 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
             confirmed += int((depth > 0).sum())
         if not confirmed:
             raise Sc3dError("the views' depths do not agree anywhere: train longer, or lower --min-views")
-        if settings.complete:
-            surface = _surface(drop_small_parts(fusion.mesh(), MIN_PART))
-            for row, view in enumerate(tqdm(data.views, desc="completing", unit="view", disable=None)):
-                hole = ~np.isfinite(first_surface(surface, view).range)
-                fusion.integrate(view, np.where(hole, maps.plausible(row), 0), data.image(row), data.depth_limit)
-    mesh, cloud = drop_small_parts(fusion.mesh(), MIN_PART), fusion.cloud()
-    cloud = cloud.select_by_mask(o3d.core.Tensor(near_mesh(cloud.point.positions.numpy(), mesh, 0.5 * voxel_size)))
+        parts = [_part(fusion)]
+        for turn in range(ROUNDS if settings.complete else 0):
+            parts.append(_complete(maps, _joined(parts)[0], voxel_size, range(turn, len(data.views), ROUNDS)))
+    mesh, cloud = _joined(parts)
     surface = _surface(mesh)
     hit = sum(int(np.isfinite(first_surface(surface, view).range).sum()) for view in data.views)
     return Surfaces(mesh, cloud, voxel_size, confirmed / pixels, hit / pixels)
+
+
+def _part(fusion: DepthFusion) -> Part:
+    """Mesh and cloud of a field, without floaters."""
+    mesh, cloud = drop_small_parts(fusion.mesh(), MIN_PART), fusion.cloud()
+    if not len(mesh.triangle.indices):
+        return mesh, cloud.select_by_index(o3d.core.Tensor(np.empty(0, np.int64)))
+    return mesh, cloud.select_by_mask(o3d.core.Tensor(near_mesh(cloud.point.positions.numpy(), mesh, 0.5 * fusion.voxel_size)))
+
+
+def _complete(maps: _DepthMaps, mesh: o3d.t.geometry.TriangleMesh, voxel_size: float, rows: range) -> Part:
+    """Surface from the plausible depth of pixels that look through the holes of `mesh`, of some views.
+
+    Each view's own: where views disagree, as in tree crowns, their average would be no surface at all.
+    """
+    surface, data, parts = _surface(mesh), maps.data, []
+    for row in tqdm(rows, desc="completing", unit="view", disable=None):
+        view = data.views[row]
+        first, depth = first_surface(surface, view), maps.plausible(row)
+        hole = depth < (1 - MARGIN) * first.range * first.ray_z  # nothing is hit, or only something far behind
+        squares, centres = pixel_squares(view, depth, data.image(row), hole)
+        parts.append((squares, centres.voxel_down_sample(voxel_size) if len(centres.point.positions) else centres))
+    return _joined(parts)
+
+
+def _joined(parts: list[Part]) -> Part:
+    meshes, clouds = zip(*parts, strict=True)
+    mesh = o3d.t.geometry.TriangleMesh()
+    starts = np.cumsum([0, *(len(each.vertex.positions) for each in meshes[:-1])])
+    for name in ("positions", "normals", "colors"):
+        mesh.vertex[name] = o3d.core.Tensor(np.concatenate([each.vertex[name].numpy() for each in meshes]))
+    mesh.triangle.indices = o3d.core.Tensor(np.concatenate([each.triangle.indices.numpy() + start for each, start in zip(meshes, starts, strict=True)]))
+    cloud = o3d.t.geometry.PointCloud()
+    for name in ("positions", "normals", "colors"):
+        cloud.point[name] = o3d.core.Tensor(np.concatenate([each.point[name].numpy() for each in clouds]))
+    return mesh, cloud
 
 
 class _DepthMaps:
@@ -101,8 +136,8 @@ class _DepthMaps:
             raise Sc3dError("no view shows a surface: train longer, or check the cameras")
         return float(np.median(footprints))
 
-    def read(self, row: int) -> torch.Tensor:
-        return torch.from_numpy(np.load(self.folder / f"{row}.npy"))
+    def read(self, row: int, kind: str = "") -> torch.Tensor:
+        return torch.from_numpy(np.load(self.folder / f"{row}{kind}.npy"))
 
     def counts(self, row: int, tolerance: float) -> np.ndarray:
         """(H, W) number of neighbours that see a pixel's surface within `tolerance` px of where this view has it."""
@@ -112,12 +147,16 @@ class _DepthMaps:
     def confirmed(self, row: int, min_views: int) -> np.ndarray:
         """(H, W) float32 depth that enough neighbours confirm, else 0."""
         enough = self.counts(row, 1.0) >= min(min_views, len(self.data.neighbours[row]))
-        return np.where(enough, self.read(row).numpy(), 0).astype(np.float32)
+        depth = np.where(enough, self.read(row).numpy(), 0).astype(np.float32)
+        np.save(self.folder / f"{row}-confirmed.npy", depth)
+        return depth
 
     def plausible(self, row: int) -> np.ndarray:
-        """(H, W) float32 depth that a neighbour confirms roughly, or that no neighbour can judge, else 0."""
-        accepted = (self.counts(row, LOOSE) >= 1) | (self.counts(row, np.inf) == 0)
-        return np.where(accepted, self.read(row).numpy(), 0).astype(np.float32)
+        """(H, W) float32 depth that a neighbour confirms roughly, or that hides nothing two neighbours are sure of, else 0; after `confirmed` of all."""
+        sure = [(self.read(other, "-confirmed"), self.data.views[other]) for other in self.data.neighbours[row][:NUM_NEIGHBOURS]]
+        depth = self.read(row)
+        accepted = (self.counts(row, LOOSE) >= 1) | (blocking(depth, self.data.views[row], sure, MARGIN).numpy() <= 1)
+        return np.where(accepted, depth.numpy(), 0).astype(np.float32)
 
 
 def centre_cloud(gaussians: Gaussians, centres: np.ndarray, min_opacity: float) -> o3d.t.geometry.PointCloud:
