@@ -6,7 +6,7 @@ import pytest
 
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.geometry.raycast import Surface, first_surface
-from sc3d.geometry.surface import DepthFusion, drop_small_parts, near_mesh
+from sc3d.geometry.surface import DepthFusion, drop_small_parts, near_mesh, pixel_squares
 
 VOXEL = 0.05
 
@@ -83,3 +83,28 @@ def test_small_parts_are_dropped():
     small = o3d.t.geometry.TriangleMesh.create_box().translate([10, 0, 0])
     both = o3d.t.geometry.TriangleMesh.from_legacy(large.to_legacy() + small.to_legacy())
     assert len(drop_small_parts(both, 50).triangle.indices) == len(large.triangle.indices)
+
+
+def test_pixel_squares_cover_exactly_the_wanted_pixels_at_their_depth():
+    view = pinhole_view("a", (80, 60), (90, 90, 37, 32), look_at(np.array([3.0, 1, 20]), np.array([0.0, 0, 0])))
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(15, 16, (60, 80)).astype(np.float32)
+    wanted = np.zeros((60, 80), bool)
+    wanted[10:40, 20:60] = True
+    depth[12, 30] = 0
+    mesh, cloud = pixel_squares(view, depth, np.full((60, 80, 3), 77, np.uint8), wanted)
+    assert len(mesh.triangle.indices) == 2 * len(cloud.point.positions) == 2 * (30 * 40 - 1)
+    first = first_surface(Surface.from_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), np.zeros(3)), view)
+    seen = first.range * first.ray_z
+    inner = wanted.copy()
+    inner[12, 30] = False
+    assert np.isfinite(seen[inner]).all()
+    assert (seen[inner] <= depth[inner] + 1e-3).all() and np.median(np.abs(seen - depth)[inner]) < 0.5
+    outside = np.ones_like(wanted)
+    outside[9:41, 19:61] = False  # squares reach half a pixel further
+    assert not np.isfinite(seen[outside]).any()
+    corners = mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy()]
+    facing = np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), view.centre - corners[:, 0])
+    assert (facing > 0).all()
+    empty, none = pixel_squares(view, depth, np.zeros((60, 80, 3), np.uint8), np.zeros((60, 80), bool))
+    assert len(empty.triangle.indices) == 0 and len(none.point.positions) == 0

@@ -44,7 +44,10 @@ class DepthFusion:
         """Triangles of the zero level set seen by more than `min_weight` views."""
         if not self._grid.hashmap().size():
             return o3d.t.geometry.TriangleMesh(o3d.core.Tensor.zeros((0, 3)), o3d.core.Tensor.zeros((0, 3), o3d.core.int32))
-        return self._grid.extract_triangle_mesh(min_weight)
+        mesh = self._grid.extract_triangle_mesh(min_weight)
+        if "colors" in mesh.vertex:  # interpolation overshoots a little
+            mesh.vertex.colors = mesh.vertex.colors.clip(0, 1)
+        return mesh
 
     def cloud(self, min_weight: float = 0.5) -> o3d.t.geometry.PointCloud:
         """Points where the zero level set crosses the grid's edges: positions, colors uint8, unit normals out of the surface."""

@@ -25,8 +25,6 @@ from sc3d.splatting.gaussians import Gaussians
 MAX_ANGLE = 80.0  # degrees between ray and normal
 NUM_NEIGHBOURS = 6
 MIN_PART = 100  # triangles; smaller components are floaters
-
-
 ROUNDS = 4  # of completion, each with every fourth view
 MARGIN = 0.03  # share of the depth by which a surface must lie behind to be another one
 LOOSE = 4.0  # px; how far two views may disagree where nothing better is known
