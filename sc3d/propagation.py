@@ -79,9 +79,10 @@ def propagate(points: np.ndarray, graph: Graph, seeds: Labels, likelihood: np.nd
         label, confidence = grow(graph.weights, start)
     else:
         grown, _ = grow(graph.weights, start)  # points without votes start from the front's label; votes would take one edge per step to reach them
-        label, confidence = mean_field(graph.weights, _log_likelihood(likelihood, start), settings.smoothness,
-                                       np.where(likelihood[:, 1:].any(axis=1), 0, grown))
+        first = np.where(likelihood[:, 1:].any(axis=1), 0, grown)
+        label, _ = mean_field(graph.weights, _log_likelihood(likelihood, start), settings.smoothness, first)
         label = np.where(grown > 0, label, 0)
+        confidence = vote_support(graph.weights, likelihood, label)
     if settings.fill and (label == 0).any() and (label > 0).any():
         filled, filled_confidence = vote_nearest(points, label, 1)
         label, confidence = np.where(label == 0, filled, label), np.where(label == 0, 0.5 * filled_confidence, confidence)
@@ -156,6 +157,20 @@ def mean_field(
         belief = _softmax(log_likelihood + smoothness * (weights @ belief))
     label = belief.argmax(axis=1)
     return label.astype(np.uint8), belief[np.arange(len(label)), label]
+
+
+def vote_support(weights: scipy.sparse.csr_matrix, votes: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """(N,) share of the votes for a point's label: the mean of its own share and its neighbours', of whichever have votes; 0.5 where none has.
+
+    The probabilities of `mean_field` are no confidence: they are near 1 almost everywhere.
+    """
+    total = votes[:, 1:].sum(axis=1, keepdims=True)
+    shares = votes / np.maximum(total, 1e-12)
+    rows, seen = np.arange(len(label)), (total[:, 0] > 0).astype(np.float32)
+    around, weight = (weights @ shares)[rows, label], weights @ seen
+    parts = np.stack([shares[rows, label] * seen, around / np.maximum(weight, 1e-12)])
+    counted = np.stack([seen, weight > 0])
+    return np.where(counted.any(axis=0), parts.sum(axis=0) / np.maximum(counted.sum(axis=0), 1), 0.5).astype(np.float32)
 
 
 def potts_energy(weights: scipy.sparse.csr_matrix, log_likelihood: np.ndarray, label: np.ndarray, smoothness: float) -> float:

@@ -9,7 +9,7 @@ import scipy.sparse
 
 from sc3d.fusion import LOCKED, PROPAGATED, SEED, UNSEEN, Labels
 from sc3d.geometry.neighbors import curvature
-from sc3d.propagation import build_graph, grow, mean_field, potts_energy, propagate, similarity, vote_nearest
+from sc3d.propagation import build_graph, grow, mean_field, potts_energy, propagate, similarity, vote_nearest, vote_support
 from sc3d.settings import Propagate
 
 
@@ -141,3 +141,10 @@ def test_two_points_and_no_neighbours():
     label = np.uint8([1, 0])
     result = propagate(points, build_graph(points, None, 16), seeds_of(label), votes_of(label), Propagate(method="geometry"))
     assert result.label[0] == 1
+
+
+def test_vote_support_by_hand():
+    weights = scipy.sparse.csr_matrix(np.array([[0, 1, 0, 0], [1, 0, 2, 0], [0, 2, 0, 0], [0, 0, 0, 0]], np.float32))
+    votes = np.float32([[0, 3, 1], [0, 0, 2], [0, 0, 0], [0, 0, 0]])
+    support = vote_support(weights, votes, np.array([1, 2, 2, 1]))
+    np.testing.assert_allclose(support, [(0.75 + 0) / 2, (1 + 0.25) / 2, 1.0, 0.5], rtol=1e-6)
