@@ -34,7 +34,7 @@ def views() -> list:
 
 def data() -> DepthViews:
     neighbours = [np.array([other for other in range(5) if other != row]) for row in range(5)]
-    return DepthViews(views(), lambda row: np.full((120, 160, 3), 90, np.uint8), neighbours, 30.0)
+    return DepthViews(views(), lambda row: np.full((120, 160, 3), 90, np.uint8), neighbours, (1.0, 30.0))
 
 
 def test_plane_comes_out_flat_closed_and_upwards():

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import open3d as o3d
 import torch
@@ -27,6 +28,7 @@ NUM_NEIGHBOURS = 6
 MIN_PART = 100  # triangles; smaller components are floaters
 ROUNDS = 4  # of completion, each with every fourth view
 MARGIN = 0.03  # share of the depth by which a surface must lie behind to be another one
+WINDOW = 8  # that part of the image's longest side is around a pixel
 LOOSE = 4.0  # px; how far two views may disagree where nothing better is known
 
 
@@ -49,13 +51,13 @@ class DepthViews:
     """The views whose depth is fused.
 
     views: pinhole; image: index to (H, W, 3) uint8 RGB of the view's size
-    neighbours: per view, rows of views that see the same surface; depth_limit: farthest depth, world units
+    neighbours: per view, rows of views that see the same surface; depth_range: nearest and farthest depth, world units
     """
 
     views: list[View]
     image: Callable[[int], np.ndarray]
     neighbours: list[np.ndarray]
-    depth_limit: float
+    depth_range: tuple[float, float]
 
 
 def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -> Surfaces:
@@ -67,11 +69,12 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
         fusion, confirmed, pixels = DepthFusion(voxel_size), 0, sum(view.width * view.height for view in data.views)
         for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
             depth = maps.confirmed(row, settings.min_views)
-            fusion.integrate(view, depth, data.image(row), data.depth_limit)
+            fusion.integrate(view, depth, data.image(row), data.depth_range[1])
             confirmed += int((depth > 0).sum())
         if not confirmed:
             raise Sc3dError("the views' depths do not agree anywhere: train longer, or lower --min-views")
         parts = [_part(fusion)]
+        maps.trust(parts[0][0])
         for turn in range(ROUNDS if settings.complete else 0):
             parts.append(_complete(maps, _joined(parts)[0], voxel_size, range(turn, len(data.views), ROUNDS)))
     mesh, cloud = _joined(parts)
@@ -96,9 +99,11 @@ def _complete(maps: _DepthMaps, mesh: o3d.t.geometry.TriangleMesh, voxel_size: f
     surface, data, parts = _surface(mesh), maps.data, []
     for row in tqdm(rows, desc="completing", unit="view", disable=None):
         view = data.views[row]
-        first, depth = first_surface(surface, view), maps.plausible(row)
-        hole = depth < (1 - MARGIN) * first.range * first.ray_z  # nothing is hit, or only something far behind
-        squares, centres = pixel_squares(view, depth, data.image(row), hole)
+        first, depth = first_surface(surface, view), maps.read(row).numpy()
+        agreeing, blocked = maps.counts(row, LOOSE), maps.blocks(row)
+        before = depth < (1 - MARGIN) * first.range * first.ray_z  # where nothing is hit, or only something far behind
+        wanted = before & maps.usual(row) & ((agreeing > blocked) | ((blocked == 0) & ~np.isfinite(first.range)))
+        squares, centres = pixel_squares(view, depth, data.image(row), wanted)
         parts.append((squares, centres.voxel_down_sample(voxel_size) if len(centres.point.positions) else centres))
     return _joined(parts)
 
@@ -126,7 +131,7 @@ class _DepthMaps:
         """Write all maps; returns the median size of a pixel on the surface, world units."""
         footprints = []
         for row, view in enumerate(tqdm(self.data.views, desc="depth", unit="view", disable=None)):
-            depth = _reliable_depth(gaussians, view, self.data.depth_limit)
+            depth = _reliable_depth(gaussians, view, self.data.depth_range)
             np.save(self.folder / f"{row}.npy", depth)
             if (depth > 0).any():
                 footprints.append(float(np.median(depth[depth > 0])) / view.focal)
@@ -145,16 +150,26 @@ class _DepthMaps:
     def confirmed(self, row: int, min_views: int) -> np.ndarray:
         """(H, W) float32 depth that enough neighbours confirm, else 0."""
         enough = self.counts(row, 1.0) >= min(min_views, len(self.data.neighbours[row]))
-        depth = np.where(enough, self.read(row).numpy(), 0).astype(np.float32)
-        np.save(self.folder / f"{row}-confirmed.npy", depth)
-        return depth
+        return np.where(enough, self.read(row).numpy(), 0).astype(np.float32)
 
-    def plausible(self, row: int) -> np.ndarray:
-        """(H, W) float32 depth that a neighbour confirms roughly, or that hides nothing two neighbours are sure of, else 0; after `confirmed` of all."""
-        sure = [(self.read(other, "-confirmed"), self.data.views[other]) for other in self.data.neighbours[row][:NUM_NEIGHBOURS]]
-        depth = self.read(row)
-        accepted = (self.counts(row, LOOSE) >= 1) | (blocking(depth, self.data.views[row], sure, MARGIN).numpy() <= 1)
-        return np.where(accepted, depth.numpy(), 0).astype(np.float32)
+    def trust(self, mesh: o3d.t.geometry.TriangleMesh) -> None:
+        """Take what the views see of a mesh for sure."""
+        surface = _surface(mesh)
+        for row, view in enumerate(self.data.views):
+            first = first_surface(surface, view)
+            np.save(self.folder / f"{row}-sure.npy", np.where(np.isfinite(first.range), first.range * first.ray_z, 0).astype(np.float32))
+
+    def usual(self, row: int) -> np.ndarray:
+        """(H, W) whether a pixel's depth is within what is sure somewhere around it in the image; a floater is nearer than all of that."""
+        depth, sure = self.read(row).numpy(), self.read(row, "-sure").numpy()
+        window = np.ones((max(depth.shape) // WINDOW | 1,) * 2, np.uint8)
+        low = cv2.erode(np.where(sure > 0, sure, np.float32(1e30)), window)
+        return (depth > (1 - MARGIN) * low) & (depth < (1 + MARGIN) * cv2.dilate(sure, window))
+
+    def blocks(self, row: int) -> np.ndarray:
+        """(H, W) number of neighbours that are sure of a surface behind a pixel's point, so that it would be in their way; after `trust`."""
+        sure = [(self.read(other, "-sure"), self.data.views[other]) for other in self.data.neighbours[row][:NUM_NEIGHBOURS]]
+        return blocking(self.read(row), self.data.views[row], sure, MARGIN).numpy()
 
 
 def centre_cloud(gaussians: Gaussians, centres: np.ndarray, min_opacity: float) -> o3d.t.geometry.PointCloud:
@@ -170,11 +185,11 @@ def centre_cloud(gaussians: Gaussians, centres: np.ndarray, min_opacity: float) 
     return cloud
 
 
-def _reliable_depth(gaussians: Gaussians, view: View, depth_limit: float) -> np.ndarray:
+def _reliable_depth(gaussians: Gaussians, view: View, depth_range: tuple[float, float]) -> np.ndarray:
     depth, _, normals_cam = depth_map(gaussians, view)
     rays_cam = torch.nn.functional.normalize(pixel_rays(view), dim=2).numpy()
     facing = -(normals_cam * rays_cam).sum(axis=2) > np.cos(np.deg2rad(MAX_ANGLE))
-    return np.where(facing & (depth < depth_limit), depth, 0).astype(np.float32)
+    return np.where(facing & (depth > depth_range[0]) & (depth < depth_range[1]), depth, 0).astype(np.float32)
 
 
 def _default_voxel_size(gaussians: Gaussians, footprint: float) -> float:

@@ -42,7 +42,7 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
     def image(row: int) -> np.ndarray:
         return resample(read_image(scene.photo(model.views[row].name)), model.views[row].shifted(origin), views[row])
 
-    data = DepthViews(views, image, neighbour_views(model.tracks, model.points, centres), _depth_limit(model))
+    data = DepthViews(views, image, neighbour_views(model.tracks, model.points, centres), _depth_range(model))
     surfaces = extract_surface(gaussians, data, settings)
     write_geometry(scene.mesh, _placed(surfaces.mesh, origin))
     write_geometry(scene.cloud, _placed(surfaces.cloud, origin))
@@ -55,12 +55,13 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
     }
 
 
-def _depth_limit(model) -> float:  # noqa: ANN001 - SparseModel
-    """1.2 times the 99th percentile of the sparse points' depths."""
+def _depth_range(model) -> tuple[float, float]:  # noqa: ANN001 - SparseModel
+    """0.7 times the 1st and 1.2 times the 99th percentile of the sparse points' depths."""
     depths = [project(view, model.points[track])[1] for view, track in zip(model.views, model.tracks, strict=True) if len(track)]
     if not depths:
         raise InputError("the COLMAP model has no tracks: sparse points with the photos that see them are needed")
-    return 1.2 * float(np.quantile(np.concatenate(depths), 0.99))
+    near, far = np.quantile(np.concatenate(depths), [0.01, 0.99])
+    return 0.7 * float(near), 1.2 * float(far)
 
 
 def _placed(geometry, origin: np.ndarray):  # noqa: ANN001, ANN202 - tensor PointCloud or TriangleMesh
