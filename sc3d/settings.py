@@ -45,8 +45,9 @@ class Extract:
     """TSDF voxel, world units; 0 = 1.5 times the median ground sampling distance, at least box / 2048."""
     min_views: int = 2
     """Neighbour views that must confirm a depth (within 1 px)."""
-    complete: bool = True
-    """Where the confirmed surface has holes, take the depth of the views that look into them: more complete, less exact."""
+    complete: Literal["full", "careful", "no"] = "full"
+    """Where the confirmed surface has holes, take the depth of the views that look into them. full: nearly every pixel gets a surface, best for
+    labels, but oblique flights leave floaters; careful: only what is as high as its surroundings and what no other view contradicts; no: leave holes."""
     min_opacity: float = 0.3
     """Smallest opacity of a Gaussian whose centre becomes a point (centres)."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -28,7 +28,7 @@ NUM_NEIGHBOURS = 6
 MIN_PART = 100  # triangles; smaller components are floaters
 ROUNDS = 4  # of completion, each with every fourth view
 MARGIN = 0.03  # share of the depth by which a surface must lie behind to be another one
-WINDOW = 8  # that part of the image's longest side is around a pixel
+CELLS, AROUND = 64, 6  # cells along the map, and how many of them on each side are around a point
 LOOSE = 4.0  # px; how far two views may disagree where nothing better is known
 
 
@@ -75,8 +75,9 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
             raise Sc3dError("the views' depths do not agree anywhere: train longer, or lower --min-views")
         parts = [_part(fusion)]
         maps.trust(parts[0][0])
-        for turn in range(ROUNDS if settings.complete else 0):
-            parts.append(_complete(maps, _joined(parts)[0], voxel_size, range(turn, len(data.views), ROUNDS)))
+        for turn in range(ROUNDS if settings.complete != "no" else 0):
+            rows = range(turn, len(data.views), ROUNDS)
+            parts.append(_complete(maps, _joined(parts)[0], voxel_size, rows, settings.complete == "careful"))
     mesh, cloud = _joined(parts)
     surface = _surface(mesh)
     hit = sum(int(np.isfinite(first_surface(surface, view).range).sum()) for view in data.views)
@@ -91,7 +92,7 @@ def _part(fusion: DepthFusion) -> Part:
     return mesh, cloud.select_by_mask(o3d.core.Tensor(near_mesh(cloud.point.positions.numpy(), mesh, 0.5 * fusion.voxel_size)))
 
 
-def _complete(maps: _DepthMaps, mesh: o3d.t.geometry.TriangleMesh, voxel_size: float, rows: range) -> Part:
+def _complete(maps: _DepthMaps, mesh: o3d.t.geometry.TriangleMesh, voxel_size: float, rows: range, careful: bool) -> Part:
     """Surface from the plausible depth of pixels that look through the holes of `mesh`, of some views.
 
     Each view's own: where views disagree, as in tree crowns, their average would be no surface at all.
@@ -102,7 +103,10 @@ def _complete(maps: _DepthMaps, mesh: o3d.t.geometry.TriangleMesh, voxel_size: f
         first, depth = first_surface(surface, view), maps.read(row).numpy()
         agreeing, blocked = maps.counts(row, LOOSE), maps.blocks(row)
         before = depth < (1 - MARGIN) * first.range * first.ray_z  # where nothing is hit, or only something far behind
-        wanted = before & maps.usual(row) & ((agreeing > blocked) | ((blocked == 0) & ~np.isfinite(first.range)))
+        if careful:
+            wanted = before & maps.usual(row) & ((agreeing > blocked) | ((blocked == 0) & ~np.isfinite(first.range)))
+        else:
+            wanted = before & ((agreeing >= 1) | (blocked <= 1))
         squares, centres = pixel_squares(view, depth, data.image(row), wanted)
         parts.append((squares, centres.voxel_down_sample(voxel_size) if len(centres.point.positions) else centres))
     return _joined(parts)
@@ -119,6 +123,44 @@ def _joined(parts: list[Part]) -> Part:
     for name in ("positions", "normals", "colors"):
         cloud.point[name] = o3d.core.Tensor(np.concatenate([each.point[name].numpy() for each in clouds]))
     return mesh, cloud
+
+
+@dataclass(frozen=True)
+class _Relief:
+    """Lowest and highest height of a surface around each cell of a coarse map.
+
+    axes: (3, 3) rows: two horizontal axes and up, which is against the mean viewing direction; start: (2,) corner; size: cell, world units
+    low, high: (CELLS, CELLS) float32
+    """
+
+    axes: np.ndarray
+    start: np.ndarray
+    size: float
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def of(cls, vertices: np.ndarray, views: list[View]) -> _Relief:
+        up = -np.sum([view.cam_from_world[2, :3] for view in views], axis=0)
+        axes = np.linalg.svd(up[None])[2][[1, 2, 0]]
+        axes[2] *= np.sign(axes[2] @ up)
+        placed = vertices @ axes.T
+        start = placed[:, :2].min(axis=0)
+        relief = cls(axes, start, float(np.ptp(placed[:, :2], axis=0).max()) / CELLS * 1.001, np.empty(0), np.empty(0))
+        cells, height = relief.place(vertices)
+        low, high = np.full(CELLS**2, np.inf, np.float32), np.full(CELLS**2, -np.inf, np.float32)
+        np.minimum.at(low, cells, height)
+        np.maximum.at(high, cells, height)
+        window = np.ones((2 * AROUND + 1,) * 2, np.uint8)
+        low, high = cv2.erode(low.reshape(CELLS, CELLS), window), cv2.dilate(high.reshape(CELLS, CELLS), window)
+        overall = np.quantile(height, [0.01, 0.99])  # where nothing sure is around
+        return replace(relief, low=np.where(np.isfinite(low), low, overall[0]), high=np.where(np.isfinite(high), high, overall[1]))
+
+    def place(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) cell of each (N, 3) point (the nearest one for points off the map) and (N,) height."""
+        placed = points @ self.axes.T
+        column, row = np.clip(((placed[:, :2] - self.start) / self.size).astype(np.int64), 0, CELLS - 1).T
+        return row * CELLS + column, placed[:, 2]
 
 
 class _DepthMaps:
@@ -155,16 +197,19 @@ class _DepthMaps:
     def trust(self, mesh: o3d.t.geometry.TriangleMesh) -> None:
         """Take what the views see of a mesh for sure."""
         surface = _surface(mesh)
+        self.relief = _Relief.of(mesh.vertex.positions.numpy(), self.data.views)
         for row, view in enumerate(self.data.views):
             first = first_surface(surface, view)
             np.save(self.folder / f"{row}-sure.npy", np.where(np.isfinite(first.range), first.range * first.ray_z, 0).astype(np.float32))
 
     def usual(self, row: int) -> np.ndarray:
-        """(H, W) whether a pixel's depth is within what is sure somewhere around it in the image; a floater is nearer than all of that."""
-        depth, sure = self.read(row).numpy(), self.read(row, "-sure").numpy()
-        window = np.ones((max(depth.shape) // WINDOW | 1,) * 2, np.uint8)
-        low = cv2.erode(np.where(sure > 0, sure, np.float32(1e30)), window)
-        return (depth > (1 - MARGIN) * low) & (depth < (1 + MARGIN) * cv2.dilate(sure, window))
+        """(H, W) whether a pixel's point is as high as something sure around it on the map; a floater is higher. After `trust`."""
+        view, depth = self.data.views[row], self.read(row).numpy()
+        points_cam = pixel_rays(view).numpy() * depth[..., None]
+        points = (points_cam - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
+        cells, height = self.relief.place(points.reshape(-1, 3))
+        margin = MARGIN * depth.ravel()
+        return ((height > self.relief.low.ravel()[cells] - margin) & (height < self.relief.high.ravel()[cells] + margin)).reshape(depth.shape)
 
     def blocks(self, row: int) -> np.ndarray:
         """(H, W) number of neighbours that are sure of a surface behind a pixel's point, so that it would be in their way; after `trust`."""
