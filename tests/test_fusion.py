@@ -118,21 +118,19 @@ def test_votes_do_not_depend_on_the_order_of_views_or_points():
 
 def test_reprojection_unlocks_what_only_mask_edges_disputed():
     """Masks whose boundary wobbles by a few pixels: with edges taken out, the views agree."""
-    cloud, views = cloud_of(plane(half=2.0)), cameras_above(12)
-    rng = np.random.default_rng(0)
+    cloud = cloud_of(plane(half=2.0))
 
-    def read(view):
+    def read(_):
         mask = np.full((120, 120), 1, np.uint8)
-        column = 60 + rng.integers(-1, 2)
-        pixels = (np.arange(120) + 0.5 - view.matrix[0, 2]) / view.focal * 12
-        mask[:, pixels + view.centre[0] * 0 > (column - 60) * 0.1] = 2
+        mask[:, 60 + rng.integers(-1, 2) :] = 2
         return mask, None
 
     straight = [pinhole_view(f"s{row:02d}.jpg", (120, 120), (120, 120, 60, 60), look_at(np.array([0.0, 0, 12.0]), np.zeros(3))) for row in range(12)]
+    rng = np.random.default_rng(0)
     locked = fuse(cloud, straight, read, None, 5, replace(PLAIN, consensus=0.95, reproject=False)).labels
     rng = np.random.default_rng(0)
     again = fuse(cloud, straight, read, None, 5, replace(PLAIN, consensus=0.95, edge_width=0.9)).labels
-    assert len(views) == 12 and (locked.state == LOCKED).sum() > 0
+    assert (locked.state == LOCKED).sum() > 0
     assert (again.state == UNLOCKED).sum() > 0
     assert (again.label[again.state == UNLOCKED] > 0).all()
 
