@@ -13,19 +13,20 @@ def pinhole(view: View) -> tuple[float, float, float, float]:
     return view.matrix[0, 0], view.matrix[1, 1], view.matrix[0, 2], view.matrix[1, 2]
 
 
-def pixel_rays(view: View) -> torch.Tensor:
+def pixel_rays(view: View, device: torch.device | str = "cpu") -> torch.Tensor:
     """(H, W, 3) rays ((u - cx) / fx, (v - cy) / fy, 1) of the pixel centres, camera frame: a pixel's point is depth * ray."""
     fx, fy, cx, cy = pinhole(view)
-    columns = (torch.arange(view.width, dtype=torch.float32) + 0.5 - cx) / fx
-    rows = (torch.arange(view.height, dtype=torch.float32) + 0.5 - cy) / fy
-    return torch.stack([columns.expand(view.height, -1), rows[:, None].expand(-1, view.width), torch.ones(view.height, view.width)], 2)
+    columns = (torch.arange(view.width, dtype=torch.float32, device=device) + 0.5 - cx) / fx
+    rows = (torch.arange(view.height, dtype=torch.float32, device=device) + 0.5 - cy) / fy
+    columns, rows = columns.expand(view.height, -1), rows[:, None].expand(-1, view.width)
+    return torch.stack([columns, rows, torch.ones_like(columns)], 2)
 
 
-def relative_pose(view: View, other: View) -> tuple[torch.Tensor, torch.Tensor]:
+def relative_pose(view: View, other: View, device: torch.device | str = "cpu") -> tuple[torch.Tensor, torch.Tensor]:
     """(3, 3) and (3,) of other_from_view between the camera frames; composed in float64, returned as float32."""
     rotation = other.cam_from_world[:3, :3] @ view.cam_from_world[:3, :3].T
     translation = other.cam_from_world[:3, 3] - rotation @ view.cam_from_world[:3, 3]
-    return torch.from_numpy(rotation.astype(np.float32)), torch.from_numpy(translation.astype(np.float32))
+    return torch.from_numpy(rotation.astype(np.float32)).to(device), torch.from_numpy(translation.astype(np.float32)).to(device)
 
 
 def sample(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
@@ -44,7 +45,7 @@ def reprojection_error(
     other_depth: (h, w) depth of `other`; 0 = none
     returns: (N,) phi, px of `view`, differentiable in both depths; (N,) bool: the pixel is seen by `other` and has a depth there
     """
-    rotation, translation = relative_pose(view, other)
+    rotation, translation = relative_pose(view, other, points_cam.device)
     points_other = points_cam @ rotation.T + translation
     in_front = points_other[:, 2] > 1e-6
     pixels = _project(points_other, other)
@@ -68,9 +69,9 @@ def consistent(depth: torch.Tensor, view: View, others: list[tuple[torch.Tensor,
 
     depth: (H, W), 0 = none; others: depth maps with their views, any sizes
     """
-    count = torch.zeros(depth.shape, dtype=torch.uint8)
+    count = torch.zeros(depth.shape, dtype=torch.uint8, device=depth.device)
     present = depth > 0
-    points_cam = (pixel_rays(view) * depth[..., None])[present]
+    points_cam = (pixel_rays(view, depth.device) * depth[..., None])[present]
     for other_depth, other in others:
         error, valid = reprojection_error(points_cam, view, other_depth, other)
         count[present] += (valid & (error < tolerance)).to(torch.uint8)
@@ -82,11 +83,11 @@ def blocking(depth: torch.Tensor, view: View, others: list[tuple[torch.Tensor, V
 
     depth: (H, W), 0 = none; others: depth maps that can be trusted, 0 = unknown, with their views
     """
-    count = torch.zeros(depth.shape, dtype=torch.uint8)
+    count = torch.zeros(depth.shape, dtype=torch.uint8, device=depth.device)
     present = depth > 0
-    points_cam = (pixel_rays(view) * depth[..., None])[present]
+    points_cam = (pixel_rays(view, depth.device) * depth[..., None])[present]
     for other_depth, other in others:
-        rotation, translation = relative_pose(view, other)
+        rotation, translation = relative_pose(view, other, points_cam.device)
         points_other = points_cam @ rotation.T + translation
         pixels = _project(points_other, other)
         inside = (points_other[:, 2] > 1e-6) & (pixels >= 0).all(1) & (pixels[:, 0] < other.width) & (pixels[:, 1] < other.height)

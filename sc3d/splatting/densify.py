@@ -32,9 +32,9 @@ class Statistics:
     inside: torch.Tensor
 
     @classmethod
-    def zeros(cls, size: int) -> Statistics:
+    def zeros(cls, size: int, device: torch.device | str = "cpu") -> Statistics:
         """Statistics of `size` Gaussians that no view has seen."""
-        return cls(*(torch.zeros(size) for _ in fields(cls)))
+        return cls(*(torch.zeros(size, device=device) for _ in fields(cls)))
 
     def add(self, gradient: torch.Tensor, absolute_gradient: torch.Tensor, radius: torch.Tensor, max_transmittance: torch.Tensor) -> None:
         """Add one view's (N,) values; radius 0 = not visible."""
@@ -138,8 +138,8 @@ def clone_and_split(optimiser: RowAdam, statistics: Statistics, clones: torch.Te
         return
     with torch.no_grad():
         gaussians = current(optimiser)
-        parts = gaussians[torch.arange(first, len(source))]
-        offsets = parts.scales * torch.randn(len(parts), 3, generator=generator)
+        parts = gaussians[first:]
+        offsets = parts.scales * torch.randn(len(parts), 3, generator=generator).to(parts.scales)
         gaussians.means[first:] += (parts.rotations @ offsets[..., None])[..., 0]
         gaussians.log_scales[first:] -= math.log(1.6)
 
@@ -175,6 +175,6 @@ def reset_opacity(optimiser: RowAdam, ceiling: float = 0.01) -> None:
 
 
 def _faintest(opacities: torch.Tensor, count: int) -> torch.Tensor:
-    removed = torch.zeros(len(opacities), dtype=torch.bool)
+    removed = torch.zeros_like(opacities, dtype=torch.bool)
     removed[torch.argsort(opacities.detach(), stable=True)[:count]] = True
     return removed

@@ -24,10 +24,13 @@ def score_view(
 ) -> tuple[float, float]:
     """PSNR (dB) and SSIM of a rendered view against its (H, W, 3) photo; outside the (H, W) mask nothing counts.
 
+    target, mask: on any device
     fit_exposure: allow the photo its own gain and offset, as in training
     """
     image = render(gaussians, view).color
+    target = target.to(image.device)
     used = torch.ones(target.shape[:2], dtype=torch.bool) if mask is None else mask
+    used = used.to(image.device)
     if fit_exposure:
         image = losses.apply_exposure(image, losses.fit_exposure(image[used], target[used]))
     image = torch.where(used[..., None], image.clamp(0, 1), target)
@@ -45,4 +48,4 @@ def depth_map(gaussians: Gaussians, view: View, min_alpha: float = 0.5) -> tuple
     depth = unbiased_depth(rendering, view)
     present = (rendering.alpha >= min_alpha) & torch.isfinite(depth) & (depth > 0)
     normals = torch.nn.functional.normalize(rendering.normal, dim=2) * present[..., None]
-    return torch.where(present, depth, 0).numpy(), rendering.alpha.numpy(), normals.numpy()
+    return torch.where(present, depth, 0).cpu().numpy(), rendering.alpha.cpu().numpy(), normals.cpu().numpy()

@@ -103,6 +103,10 @@ class Gaussians:
         """The same values outside the autograd graph; memory is shared."""
         return Gaussians(**{name: tensor.detach() for name, tensor in self.parameters().items()})
 
+    def to(self, device: torch.device | str) -> Gaussians:
+        """The same Gaussians on another device."""
+        return Gaussians(**{name: tensor.to(device) for name, tensor in self.parameters().items()})
+
     def __getitem__(self, chosen: torch.Tensor) -> Gaussians:
         """The Gaussians of an index or bool tensor."""
         return Gaussians(**{name: tensor[chosen] for name, tensor in self.parameters().items()})

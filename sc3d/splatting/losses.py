@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from sc3d.geometry.cameras import View
-from sc3d.splatting import kernels_patches
+from sc3d.splatting import device, kernels_normals, kernels_patches
 from sc3d.splatting.consistency import pinhole, pixel_rays, relative_pose, sample
 
 PATCH_RADIUS = 3
@@ -18,7 +18,8 @@ GREY = (0.299, 0.587, 0.114)
 
 
 def apply_exposure(image: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
-    """exp(a) image + b: a photo's brightness against the scene's. exposure: (2,) a, b; zeros change nothing."""
+    """exp(a) image + b: a photo's brightness against the scene's. exposure: (2,) a, b, on any device; zeros change nothing."""
+    exposure = exposure.to(image.device)
     return exposure[0].exp() * image + exposure[1]
 
 
@@ -53,7 +54,7 @@ def normals_from_depth(depth: torch.Tensor, view: View) -> torch.Tensor:
 
     depth: (H, W), 0 = none. Zero at the image border and where one of the four has no depth.
     """
-    points = pixel_rays(view) * depth[..., None]
+    points = pixel_rays(view, depth.device) * depth[..., None]
     across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
     known = (depth[1:-1, 2:] > 0) & (depth[1:-1, :-2] > 0) & (depth[2:, 1:-1] > 0) & (depth[:-2, 1:-1] > 0)
     normals = torch.linalg.cross(down, across)
@@ -61,6 +62,13 @@ def normals_from_depth(depth: torch.Tensor, view: View) -> torch.Tensor:
     known = known[..., None] & (length > 0)
     normals = torch.where(known, normals / torch.where(known, length, torch.ones_like(length)), torch.zeros_like(normals))
     return torch.nn.functional.pad(normals, (0, 0, 1, 1, 1, 1))
+
+
+def depth_normal_loss(normal: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, edges: torch.Tensor, view: View) -> torch.Tensor:
+    """`normal_loss` against `normals_from_depth` of a depth map, (H, W), 0 = none; differentiable in `normal` and `depth`."""
+    if device.has_kernels(normal):
+        return kernels_normals.depth_normal_loss(normal, depth, alpha, edges, pinhole(view))
+    return normal_loss(normal, normals_from_depth(depth, view), alpha, edges)
 
 
 def normal_loss(normal: torch.Tensor, depth_normals: torch.Tensor, alpha: torch.Tensor, edges: torch.Tensor) -> torch.Tensor:
@@ -108,6 +116,8 @@ def patch_dissimilarity(
 
     returns: (M,) in [0, 2], about 1 where there is no texture; (M,) bool: both patches lie inside their images
     """
+    if not device.has_kernels(planes[0]):
+        return patch_dissimilarity_reference(planes, pixels, source, other)
     rotation, translation = relative_pose(source[1], other[1])
     cameras = np.concatenate([pinhole(source[1]), pinhole(other[1]), rotation.numpy().ravel(), translation.numpy()])
     return kernels_patches.patch_dissimilarity(*planes, pixels, (source[0], other[0]), cameras)
@@ -116,12 +126,12 @@ def patch_dissimilarity(
 def patch_dissimilarity_reference(
     planes: tuple[torch.Tensor, torch.Tensor], pixels: torch.Tensor, source: tuple[torch.Tensor, View], other: tuple[torch.Tensor, View]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """`patch_dissimilarity` in plain torch: slow, for tests."""
+    """`patch_dissimilarity` in plain torch: for GPUs, and for tests of the kernel."""
     (grey, view), (other_grey, other_view) = source, other
-    steps = torch.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
+    steps = torch.arange(-PATCH_RADIUS, PATCH_RADIUS + 1, device=pixels.device)
     offsets = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), 2).reshape(-1, 2)
     patch = pixels[:, None] + offsets
-    limits = torch.tensor([view.width - 1, view.height - 1])
+    limits = pixels.new_tensor([view.width - 1, view.height - 1])
     inside = ((patch >= 0) & (patch <= limits)).all(2).all(1)
     patch = patch.clamp_min(0).minimum(limits)
     values = grey[patch[..., 1], patch[..., 0]]
@@ -147,7 +157,7 @@ def to_grey(image: torch.Tensor) -> torch.Tensor:
 def _warp(pixels: torch.Tensor, planes: tuple[torch.Tensor, torch.Tensor], view: View, other: View) -> torch.Tensor:
     """(M, P, 2) pixels of `view`, each row on its own plane, in `other`; far outside where the plane is behind."""
     normal, distance = planes
-    rotation, translation = relative_pose(view, other)
+    rotation, translation = relative_pose(view, other, pixels.device)
     fx, fy, cx, cy = pinhole(view)
     rays = torch.stack([(pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy, torch.ones_like(pixels[..., 0])], 2)
     # x' = R x - t (n . x) / d, per pixel up to scale; multiplied by d > 0, which also cancels the scale of N and D.

@@ -8,8 +8,7 @@ import torch
 
 from sc3d.geometry.cameras import View
 from sc3d.splatting import losses
-from sc3d.splatting.consistency import pinhole, pixel_rays, reprojection_error
-from sc3d.splatting.kernels_normals import depth_normal_loss
+from sc3d.splatting.consistency import pixel_rays, reprojection_error
 from sc3d.splatting.render import Rendering
 
 PIXELS_PER_PATCH = 4
@@ -28,7 +27,7 @@ class Neighbour:
 def single_view_normal_loss(rendering: Rendering, depth: torch.Tensor, view: View, target: torch.Tensor) -> torch.Tensor:
     """Rendered normals against those of the rendered depth, (H, W), away from the edges of the photo `target` (H, W, 3)."""
     depth = torch.where(rendering.alpha > 0.5, depth, 0)
-    return depth_normal_loss(rendering.normal, depth, rendering.alpha, losses.image_edges(target), pinhole(view))
+    return losses.depth_normal_loss(rendering.normal, depth, rendering.alpha, losses.image_edges(target), view)
 
 
 def multi_view_losses(
@@ -42,9 +41,9 @@ def multi_view_losses(
     num_patches, generator = draw
     present = torch.nonzero(((rendering.alpha > 0.5) & (depth > 0)).reshape(-1))[:, 0]
     chosen = torch.randint(max(len(present), 1), (min(PIXELS_PER_PATCH * num_patches, len(present)),), generator=generator)
-    chosen = present[chosen]
+    chosen = present[chosen.to(present.device)]
     view = source[1]
-    points_cam = pixel_rays(view).reshape(-1, 3)[chosen] * depth.reshape(-1)[chosen, None]
+    points_cam = pixel_rays(view, depth.device).reshape(-1, 3)[chosen] * depth.reshape(-1)[chosen, None]
     error, valid = reprojection_error(points_cam, view, neighbour.depth, neighbour.view)
     near = torch.nonzero(valid & (error.detach() < 1))[:num_patches, 0]
     if not len(near):

@@ -8,6 +8,8 @@ import numba
 import numpy as np
 import torch
 
+from sc3d.splatting import device
+
 BETAS = (0.9, 0.999)
 EPSILON = 1e-15
 
@@ -33,20 +35,23 @@ class RowAdam:
         for name, tensor in self.parameters.items():
             if tensor.grad is None or not len(tensor):
                 continue
-            chosen = np.ones(len(tensor), bool) if rows is None else rows.numpy()
-            columns = tensor.numel() // len(tensor)
-            rates = np.broadcast_to(np.float32(self.rates[name]), columns) * np.float32(corrections[1] / corrections[0])
-            flat = [part.detach().numpy().reshape(len(tensor), -1)
-                    for part in (tensor, tensor.grad.contiguous(), self.means[name], self.squares[name])]
-            _update_rows(*flat, np.ascontiguousarray(rates, np.float32), chosen, np.float32(EPSILON * corrections[1]))
+            rates = np.broadcast_to(np.float32(self.rates[name]), tensor.numel() // len(tensor)) * np.float32(corrections[1] / corrections[0])
+            rates, epsilon = torch.from_numpy(np.ascontiguousarray(rates, np.float32)), np.float32(EPSILON * corrections[1])
+            flat = [part.detach().view(len(tensor), -1) for part in (tensor, tensor.grad.contiguous(), self.means[name], self.squares[name])]
+            chosen = tensor.new_ones(len(tensor), dtype=torch.bool) if rows is None else rows.to(tensor.device)
+            if device.has_kernels(tensor):
+                _update_rows(*(part.numpy() for part in (*flat, rates, chosen)), epsilon)
+            else:
+                _update_rows_torch(flat, rates.to(tensor.device), chosen, float(epsilon))
             tensor.grad = None
 
     def take(self, source: torch.Tensor, fresh: torch.Tensor) -> None:
         """Rebuild every tensor from rows of the present one: new[i] = old[source[i]]; its moments too, but zero where `fresh`.
 
-        source: (M,) int64; fresh: (M,) bool. The entries of `parameters` are replaced by new leaves.
+        source: (M,) int64; fresh: (M,) bool; on any device. The entries of `parameters` are replaced by new leaves.
         """
         for name, tensor in self.parameters.items():
+            source, fresh = source.to(tensor.device), fresh.to(tensor.device)
             self.parameters[name] = tensor.detach()[source].requires_grad_(tensor.requires_grad)
             for moments in (self.means, self.squares):
                 moments[name] = moments[name][source]
@@ -57,8 +62,19 @@ class RowAdam:
         return {"count": self.count, "means": dict(self.means), "squares": dict(self.squares)}
 
     def restore(self, state: dict) -> None:
-        """Undo `state`."""
-        self.count, self.means, self.squares = state["count"], dict(state["means"]), dict(state["squares"])
+        """Undo `state`; moments go to the device of their parameters."""
+        self.count = state["count"]
+        for kept, saved in ((self.means, state["means"]), (self.squares, state["squares"])):
+            kept.update({name: moments.to(self.parameters[name].device) for name, moments in saved.items()})
+
+
+def _update_rows_torch(flat: list[torch.Tensor], rates: torch.Tensor, chosen: torch.Tensor, epsilon: float) -> None:
+    """`_update_rows` in torch operations, for GPUs. flat: (N, C) values, gradient, means and squares."""
+    values, gradient, means, squares = flat
+    chosen = chosen[:, None]
+    means.copy_(torch.where(chosen, BETAS[0] * means + (1 - BETAS[0]) * gradient, means))
+    squares.copy_(torch.where(chosen, BETAS[1] * squares + (1 - BETAS[1]) * gradient.square(), squares))
+    values.sub_(torch.where(chosen, rates * means / (squares.sqrt() + epsilon), 0))
 
 
 @numba.njit(parallel=True, cache=True, fastmath={"contract", "nsz", "arcp"})

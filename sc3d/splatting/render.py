@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sc3d.geometry.cameras import View
-from sc3d.splatting import kernels_backproject, kernels_bin, kernels_project, kernels_raster, kernels_unraster
+from sc3d.splatting import device, kernels_backproject, kernels_bin, kernels_project, kernels_raster, kernels_unraster
 from sc3d.splatting.gaussians import Gaussians
 
 _JACOBIAN_MARGIN = 0.3  # half image sizes that a mean may lie outside the image before its Jacobian is clamped: 1.3 tan(fov / 2)
@@ -77,11 +77,13 @@ def render(
 ) -> Rendering:
     """Render Gaussians, differentiable in all five parameter tensors (eq. 1-3; rules in `kernels_project` and `kernels_raster`).
 
+    Gaussians on a GPU are rendered there by gsplat, with the differences that `gsplat_backend` lists; images and statistics stay on it.
+
     view: pinhole, in the same local world as the Gaussians; its principal point is honoured
     sh_degree: highest active degree, None = all that are stored; colours are clamped at 0 from below
     background: (3,) colour seen through what is left of the transmittance, None = black; gets no gradient
     geometry: False leaves `normal` and `plane_distance` zero, which saves a few percent of the time
-    raises ValueError for a view with distortion or parameters that are not float32
+    raises ValueError for a view with distortion or parameters that are not float32, MissingPackageError on a GPU without gsplat
     """
     if not view.camera.is_undistorted():
         raise ValueError(f"{view.name}: only undistorted views can be rendered")
@@ -90,6 +92,10 @@ def render(
         raise ValueError("Gaussians must be float32 to be rendered")
     stored = int(np.sqrt(gaussians.sh.shape[1])) - 1
     degree = stored if sh_degree is None else min(sh_degree, stored)
+    if not device.has_kernels(gaussians.means):
+        from sc3d.splatting import gsplat_backend  # it imports this module, and gsplat is optional
+
+        return gsplat_backend.render_gsplat(gaussians, view, degree, background, geometry, gsplat_backend.cuda_functions())
     count = len(gaussians)
     statistics = ViewStatistics(*(torch.zeros(count) for _ in range(4)))
     radii = torch.zeros(count)
@@ -104,8 +110,8 @@ def unbiased_depth(rendering: Rendering, view: View) -> Tensor:
 
     returns: (H, W) depth z, world units; 0 where nothing was rendered or the plane is seen from behind; differentiable
     """
-    column, row = _ray_slopes(view)
     normal = rendering.normal
+    column, row = (slopes.to(normal.device) for slopes in _ray_slopes(view))
     facing = -(normal[..., 0] * column + normal[..., 1] * row[:, None] + normal[..., 2])
     seen = facing > 1e-6
     return torch.where(seen, rendering.plane_distance / torch.where(seen, facing, 1.0), 0.0)

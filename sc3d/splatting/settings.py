@@ -21,7 +21,7 @@ class TrainSettings:
     downscale: float = 0.0
     """divide the photos' size by this instead of fitting max_size; 0 = fit max_size"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """where to train; only the CPU kernels exist so far"""
+    """where to train: on the CPU, or on a GPU with gsplat (pip install 'sc3d[cuda]'); auto = the GPU if there are both"""
     sh_degree: int = 2
     """degree of the view-dependent colour, 0 to 3; 0 = the same from everywhere"""
     seed: int = 0
@@ -76,6 +76,10 @@ class TrainSettings:
     def size(self, longest: int) -> int:
         """Longest side of the training image of a photo whose longest side is `longest`, px."""
         return round(longest / self.downscale) if self.downscale else min(longest, self.max_size)
+
+    def held_out(self, num_views: int) -> list[int]:
+        """Indices of the views that are not trained on."""
+        return list(range(self.test_every - 1, num_views, self.test_every)) if self.test_every else []
 
     def active_sh_degree(self, iteration: int) -> int:
         """One degree more every 30th of the run."""

@@ -47,7 +47,7 @@ def train(data: TrainingData, settings: TrainSettings = TrainSettings(), checkpo
                 bar.set_postfix(loss=f"{row['loss']:.4f}", psnr=f"{row['psnr']:.2f}", gaussians=row["num_gaussians"])
             if checkpoint is not None and settings.checkpoint_every and trainer.iteration % settings.checkpoint_every == 0:
                 trainer.save(checkpoint)
-    return TrainResult(trainer.gaussians.detached(), trainer.exposures, trainer.log, trainer.evaluate())
+    return TrainResult(trainer.gaussians.detached().to("cpu"), trainer.exposures, trainer.log, trainer.evaluate())
 
 
 def write_log(rows: list[dict[str, float]], path: Path) -> None:

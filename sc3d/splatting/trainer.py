@@ -16,6 +16,7 @@ from sc3d.io import atomic_path
 from sc3d.splatting import densify, losses
 from sc3d.splatting.data import TrainingData
 from sc3d.splatting.densify import DensifyLimits, Statistics
+from sc3d.splatting.device import pick_device
 from sc3d.splatting.evaluation import depth_map, psnr, score_view
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.initialise import fill_points
@@ -36,13 +37,12 @@ class Trainer:
     """The state of a run. `step` is one iteration; `train` is the usual way in."""
 
     def __init__(self, data: TrainingData, settings: TrainSettings) -> None:
-        self.data, self.settings = data, settings
+        self.data, self.settings, self.device = data, settings, pick_device(settings.device)
         num_views = len(data.views)
-        held_out = set(range(settings.test_every - 1, num_views, settings.test_every)) if settings.test_every else set()
-        self.test_views = sorted(held_out)
-        self.train_views = [index for index in range(num_views) if index not in held_out]
+        self.test_views = settings.held_out(num_views)
+        self.train_views = [index for index in range(num_views) if index not in self.test_views]
         if len(self.train_views) < 2:
-            raise InputError(f"{len(self.train_views)} photos to train on: at least 2 are needed (test_every holds {len(held_out)} out)")
+            raise InputError(f"{len(self.train_views)} photos to train on: at least 2 are needed (test_every holds {len(self.test_views)} out)")
         self.generator = torch.Generator().manual_seed(settings.seed)
         used = data.subset(self.train_views)
         self.extent = scene_extent(used.views, data.points)
@@ -53,7 +53,7 @@ class Trainer:
         self.optimiser = RowAdam(*self._initial(used, neighbours))
         self.exposure = RowAdam({"exposure": torch.zeros(num_views, 2, requires_grad=True)}, {"exposure": 1e-3})
         self.num_initial = len(self.gaussians)
-        self.statistics = Statistics.zeros(self.num_initial)
+        self.statistics = Statistics.zeros(self.num_initial, self.device)
         self.iteration, self.queue, self.depths = 0, [], {}
         self.log: list[dict[str, float]] = []
         self._recent: list[tuple[float, float]] = []
@@ -72,7 +72,7 @@ class Trainer:
     def step(self) -> dict[str, float] | None:
         """One photo: render, compare, update, and densify when it is time. Returns a log row every 50 iterations."""
         index, iteration = self._next_view(), self.iteration
-        view, target, mask = self.data.photo(index, self.settings.coarse(iteration))
+        view, target, mask = self._photo(index, self.settings.coarse(iteration))
         gaussians = self.gaussians
         # A different colour behind the surface each time: holes never pay off.
         background = torch.rand(3, generator=self.generator) if self.settings.random_background else None
@@ -117,19 +117,20 @@ class Trainer:
     def resume(self, path: Path) -> bool:
         """Continue from `save`; False (and a warning) if the file belongs to other settings or photos."""
         try:
-            state = torch.load(path, weights_only=True)
+            state = torch.load(path, map_location="cpu", weights_only=True)
             matches = all(state[name] == value for name, value in self._identity().items())
         except Exception as error:  # torch raises many types for broken files
             raise InputError(f"{path} is not a readable checkpoint ({type(error).__name__}): delete it to start over") from None
         if not matches:
             log.warning("%s was made with other settings or photos: starting over", path)
             return False
-        self.optimiser.parameters.update({name: tensor.requires_grad_() for name, tensor in state["parameters"].items()})
+        self.optimiser.parameters.update({name: tensor.to(self.device).requires_grad_() for name, tensor in state["parameters"].items()})
         self.optimiser.restore(state["optimiser"])
         self.exposure.parameters["exposure"] = state["exposure"].requires_grad_()
         self.exposure.restore(state["exposure_optimiser"])
-        self.statistics = Statistics(**state["statistics"])
-        self.iteration, self.queue, self.depths, self.log = state["iteration"], state["queue"], state["depths"], state["log"]
+        self.statistics = Statistics(**{name: values.to(self.device) for name, values in state["statistics"].items()})
+        self.depths = {index: depth.to(self.device) for index, depth in state["depths"].items()}
+        self.iteration, self.queue, self.log = state["iteration"], state["queue"], state["log"]
         self.generator.set_state(state["generator"])
         self._recent, self._seconds, self._started = state["recent"], state["seconds"], time.perf_counter()
         return True
@@ -151,7 +152,12 @@ class Trainer:
         sh_rates = np.full(3 * gaussians.sh.shape[1], 1.25e-4)
         sh_rates[:3] = 2.5e-3
         rates = {"means": 0.0, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 0.05, "sh": sh_rates}
-        return {name: tensor.requires_grad_() for name, tensor in gaussians.parameters().items()}, rates
+        return {name: tensor.to(self.device).requires_grad_() for name, tensor in gaussians.parameters().items()}, rates
+
+    def _photo(self, index: int, halved: bool = False) -> tuple[View, torch.Tensor, torch.Tensor | None]:
+        """`TrainingData.photo` on the device."""
+        view, image, mask = self.data.photo(index, halved)
+        return view, image.to(self.device), None if mask is None else mask.to(self.device)
 
     def _next_view(self) -> int:
         if not self.queue:
@@ -166,9 +172,9 @@ class Trainer:
         self.depths[index] = torch.where(rendering.alpha > 0.5, depth, 0).detach()
         if others:
             other = others[int(torch.randint(len(others), (1,), generator=self.generator))]
-            other_view, other_target, _ = self.data.photo(other)
+            other_view, other_target, _ = self._photo(other)
             if other not in self.depths:
-                self.depths[other] = torch.from_numpy(depth_map(self.gaussians, other_view)[0])
+                self.depths[other] = torch.from_numpy(depth_map(self.gaussians, other_view)[0]).to(self.device)
             neighbour = Neighbour(other_view, losses.to_grey(other_target), self.depths[other])
             source, draw = (losses.to_grey(target), view), (settings.num_patches, self.generator)
             geometric, photometric = multi_view_losses(rendering, depth, source, neighbour, draw)

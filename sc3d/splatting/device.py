@@ -1,0 +1,33 @@
+"""Where the numbers live: the numba kernels work on the CPU; on a GPU gsplat renders and plain torch does the rest."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import torch
+
+from sc3d.errors import InputError, MissingPackageError
+
+INSTALL = "the GPU renderer needs gsplat: pip install 'sc3d[cuda]' (or use --device cpu)"
+
+
+def has_kernels(tensor: torch.Tensor) -> bool:
+    """Whether the numba kernels can work on this tensor; if not, each of them has a twin in torch operations."""
+    return tensor.device.type == "cpu"
+
+
+def pick_device(name: str) -> torch.device:
+    """The device to train on. name: cpu, cuda, or auto = CUDA if torch finds a GPU and gsplat is installed, else the CPU.
+
+    Choosing CUDA switches TF32 convolutions off: the variances of SSIM are differences of large numbers, which TF32 cannot hold.
+    Raises InputError if `cuda` is asked for and torch finds no GPU, MissingPackageError if gsplat is not installed.
+    """
+    available, installed = torch.cuda.is_available(), importlib.util.find_spec("gsplat") is not None
+    if name == "cpu" or (name == "auto" and not (available and installed)):
+        return torch.device("cpu")
+    if not available:
+        raise InputError("torch finds no CUDA device here: use --device cpu (or auto)")
+    if not installed:
+        raise MissingPackageError(INSTALL)
+    torch.backends.cudnn.allow_tf32 = False
+    return torch.device("cuda")
