@@ -20,6 +20,7 @@ SWEEP_SIZE = 250  # px, longest side of the images compared: 7x7 patches must ho
 NUM_DEPTHS = 64
 MAX_COST = 0.4  # mean 1 - NCC of the two best neighbours
 MIN_SPARSE = 8
+FARTHEST = 3.0  # in depths of the farthest sparse points: what lies behind is backdrop
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,32 @@ class _Sight:
     grid: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Layer:
+    """The layer of space that an aerial scene fills: between two planes with all cameras above.
+
+    up: (3,) unit, world; low, high: heights along it, world units
+    """
+
+    up: np.ndarray
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, points: np.ndarray, views: list[View]) -> _Layer | None:
+        """The layer of the sparse points, across the mean viewing direction; None if a camera is not above it: then it is no flight."""
+        up = -np.sum([view.cam_from_world[2, :3] for view in views], axis=0)
+        up = up / np.maximum(np.linalg.norm(up), 1e-12)
+        low, high = np.quantile(points @ up, [0.005, 0.995])
+        margin = 0.1 * (high - low)
+        above = all(view.centre @ up > high + 2 * margin for view in views)
+        return cls(up, low - margin, high + margin) if above else None
+
+    def plane(self, view: View, height: float) -> tuple[np.ndarray, float]:
+        """Normal (camera frame, towards the camera) and distance of the horizontal plane at a height."""
+        return view.cam_from_world[:3, :3] @ self.up, float(view.centre @ self.up - height)
+
+
 def fill_points(data: TrainingData, neighbours: list[np.ndarray], budget: int) -> tuple[np.ndarray, np.ndarray]:
     """Points on a pixel grid of every photo, away from sparse points.
 
@@ -40,16 +67,20 @@ def fill_points(data: TrainingData, neighbours: list[np.ndarray], budget: int) -
     """
     step = max(4.0, np.sqrt(sum(view.width * view.height for view in data.views) / max(budget, 1)))
     greys = [_small_grey(data, index) for index in range(len(data.views))]
+    layer = _Layer.of(np.asarray(data.points, np.float64), data.views)
     found, colors, sizes = [], [], []
     for index, view in enumerate(data.views):
         sight = _sight(data, index, step)
         if sight is None:
             continue
-        swept, cost = _sweep(sight, greys[index], [greys[other] for other in neighbours[index]], view.width)
+        planes = _planes(sight, view, layer)
+        swept, cost = _sweep(sight.grid, planes, greys[index], [greys[other] for other in neighbours[index]], view)
         good = _settled(sight.grid, swept, cost < MAX_COST, step)
         known = np.concatenate([sight.pixels, sight.grid[good]]), np.concatenate([sight.depths, swept[good]])
-        depth = np.where(good, swept, _interpolated(*known, sight.grid))
-        rays_cam = np.concatenate([sight.grid, np.ones((len(depth), 1))], 1) @ np.linalg.inv(view.matrix).T
+        lowest = planes[0] if layer else (np.array([0.0, 0.0, -1.0]), 1.0)
+        relative = _interpolated(known[0], known[1] / _plane_depth(lowest, view, known[0]), sight.grid)
+        depth = np.where(good, swept, np.minimum(relative * _plane_depth(lowest, view, sight.grid), FARTHEST * sight.depths.max()))
+        rays_cam = _rays(view, sight.grid)
         found.append((rays_cam * depth[:, None] - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3])
         columns, rows = sight.grid.astype(int).T
         colors.append(data.image(index)[rows, columns])
@@ -84,21 +115,43 @@ def _sight(data: TrainingData, index: int, step: float) -> _Sight | None:
     return _Sight(pixels[usable], depths[usable], grid) if len(grid) else None
 
 
-def _sweep(sight: _Sight, own: tuple[torch.Tensor, View], others: list[tuple[torch.Tensor, View]], width: int) -> tuple[np.ndarray, np.ndarray]:
-    """(G,) depth whose fronto-parallel patches agree best with the two best of the other views; (G,) that mean 1 - NCC, 2 = none."""
-    pixels = torch.from_numpy((sight.grid * (own[1].width / width)).astype(np.int64))
+def _planes(sight: _Sight, view: View, layer: _Layer | None) -> list[tuple[np.ndarray, float]]:
+    """Planes to try: NUM_DEPTHS fronto-parallel ones around the sparse depths, and as many horizontal ones through the layer, lowest first."""
     nearest, farthest = np.quantile(sight.depths, [0.01, 0.99]) * [0.6, 1.15]
-    normals = torch.tensor([0.0, 0.0, -1.0]).repeat(len(pixels), 1)
-    best_cost, best_depth = np.full(len(pixels), 2.0), np.full(len(pixels), np.median(sight.depths))
-    for depth in 1 / np.linspace(1 / nearest, 1 / farthest, NUM_DEPTHS):
+    planes = [(np.array([0.0, 0.0, -1.0]), depth) for depth in 1 / np.linspace(1 / farthest, 1 / nearest, NUM_DEPTHS)]
+    if layer is None:
+        return planes
+    height = view.centre @ layer.up
+    below = 1 / np.linspace(1 / (height - layer.low), 1 / (height - layer.high), NUM_DEPTHS)
+    return [layer.plane(view, height - distance) for distance in below] + planes
+
+
+def _plane_depth(plane: tuple[np.ndarray, float], view: View, pixels: np.ndarray) -> np.ndarray:
+    """(G,) depth at which the rays of (G, 2) pixels meet a plane; very large where they do not."""
+    return plane[1] / np.maximum(-_rays(view, pixels) @ plane[0], 1e-6)
+
+
+def _rays(view: View, pixels: np.ndarray) -> np.ndarray:
+    """(G, 3) rays of (G, 2) pixels with z = 1, camera frame."""
+    return np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ np.linalg.inv(view.matrix).T
+
+
+def _sweep(
+    grid: np.ndarray, planes: list[tuple[np.ndarray, float]], own: tuple[torch.Tensor, View], others: list[tuple[torch.Tensor, View]], view: View
+) -> tuple[np.ndarray, np.ndarray]:
+    """(G,) depth of the plane whose patches agree best with the two best of the other views; (G,) that mean 1 - NCC, 2 = none."""
+    pixels = torch.from_numpy((grid * (own[1].width / view.width)).astype(np.int64))
+    best_cost, best_depth = np.full(len(pixels), 2.0), np.ones(len(pixels))
+    for plane in planes:
+        normals = torch.from_numpy(plane[0].astype(np.float32)).expand(len(pixels), 3).contiguous()
         costs = []
         for other in others:
-            cost, inside = losses.patch_dissimilarity((normals, torch.full((len(pixels),), float(depth))), pixels, own, other)
+            cost, inside = losses.patch_dissimilarity((normals, torch.full((len(pixels),), plane[1])), pixels, own, other)
             costs.append(torch.where(inside, cost, 2.0))
         if costs:
             cost = torch.stack(costs).sort(0).values[:2].mean(0).numpy()
             better = cost < best_cost
-            best_cost[better], best_depth[better] = cost[better], depth
+            best_cost[better], best_depth[better] = cost[better], _plane_depth(plane, view, grid)[better]
     return best_depth, best_cost
 
 
@@ -111,10 +164,13 @@ def _settled(grid: np.ndarray, depth: np.ndarray, good: np.ndarray, step: float)
     return good & (alike.sum(1) >= 2)
 
 
-def _interpolated(pixels: np.ndarray, depths: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """(G,) third quartile of the depths of the 8 nearest known pixels: what no patch matches is more often the ground beside a roof than the roof."""
+def _interpolated(pixels: np.ndarray, relative: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """(G,) third quartile of the depths of the 8 nearest known pixels: what no patch matches is more often the ground beside a roof than the roof.
+
+    relative: depths relative to the lowest plane's, which continues the ground to where nothing is known
+    """
     near = cKDTree(pixels).query(grid, k=MIN_SPARSE)[1]
-    return np.quantile(depths[near], 0.75, axis=1)
+    return np.quantile(relative[near], 0.75, axis=1)
 
 
 def _thinned(points: np.ndarray, colors: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
