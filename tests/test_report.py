@@ -19,7 +19,7 @@ from sc3d.geometry.cameras import View, look_at
 from sc3d.geometry.raycast import Surface, first_surface, surface_points
 from sc3d.io import write_geometry, write_image, write_json
 from sc3d.report import write_report
-from sc3d.report.charts import flight_map, histogram, paired_bars
+from sc3d.report.charts import flight_map, histogram, paired_bars, reliability_curve
 from sc3d.report.images import comparison, ground_picture
 from sc3d.report.material import gather
 from sc3d.report.sections import certainty_section, class_section, headline, processing_section, quality_section, summary_line
@@ -132,7 +132,8 @@ def toy(tmp_path_factory) -> Scene:
     write_geometry(scene.labelled, make_cloud(mesh))
     figures = {"oa": 0.93125, "miou": 0.871, "iou": {"grass": 0.95, EVIL: 0.792}, "coverage": 0.9876, "confusion": [[0, 900, 50], [10, 60, 700]]}
     masks = figures | {"oa": 0.81, "miou": 0.7, "iou": {"grass": 0.8, EVIL: float("nan")}}
-    write_json(scene.metrics, {"photos": [view.name for view in views], "classes": ["grass", EVIL], "labels": figures, "masks": masks})
+    believed = {"ece": 0.0321, "confidence": [None] * 7 + [0.75, 0.85, 0.97], "accuracy": [None] * 7 + [0.5, 0.9, 1.0], "share": [0.0] * 7 + [0.2, 0.2, 0.6]}
+    write_json(scene.metrics, {"photos": [view.name for view in views], "classes": ["grass", EVIL], "labels": figures, "masks": masks, "reliability": believed})
     record = {"stage": "label", "settings": {"method": EVIL, "consensus": 0.8}, "versions": {"open3d": "0.20.0"}, "seconds": 12.34,
               "peak_memory_mb": 2345, "summary": {"points": 8000, "note": EVIL}, "inputs": {"masks": "abc123"}}
     for name in ("seeds.ply.json", "votes.npz.json"):
@@ -165,7 +166,7 @@ def test_text_from_files_is_escaped(page):
 def test_all_sections_and_figures_are_there(page):
     assert re.findall(r'<section id="(\w+)"', page) == ["cloud", "quality", "photos", "classes", "certainty", "flight", "processing"]
     text = " ".join(Page(page).text)
-    for figure in ("93.1%", "given masks 81.0%", "0.871", "98.8%", "8,000 points", "4 photos", "0.950", "0.792", "12.3", "2,345", "abc123", "0.20.0"):
+    for figure in ("93.1%", "given masks 81.0%", "0.871", "98.8%", "8,000 points", "4 photos", "0.950", "0.792", "12.3", "2,345", "abc123", "0.20.0", "error 0.032"):
         assert figure in text, figure
     assert "nan" not in text.lower().replace("alert", "")
 
@@ -211,6 +212,20 @@ def test_missing_parts_are_left_out(tmp_path):
     assert "%" not in " ".join(Page(page).text).split("looks.")[1]
 
 
+def test_training_sheet_is_shown(tmp_path):
+    sheet = np.random.default_rng(0).integers(0, 255, (60, 160, 3)).astype(np.uint8)
+    write_image(tmp_path / "train.jpg", cv2.blur(sheet, (9, 9)))
+    write_report(Scene(tmp_path), tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    Page(page)
+    assert re.findall(r'<section id="(\w+)"', page) == ["training"]
+    data, text = re.search(r'<img src="data:image/jpeg;base64,([^"]+)" alt="([^"]+)"', page).groups()
+    assert np.abs(decode(data).astype(int) - cv2.imread(str(tmp_path / "train.jpg"))).mean() < 5 and "depth and normals" in text
+    (tmp_path / "train.jpg").write_bytes(b"nonsense")
+    with pytest.raises(InputError, match="train.jpg"):
+        write_report(Scene(tmp_path), tmp_path / "report.html")
+
+
 def test_labels_without_truth_give_no_accuracy(toy, tmp_path):
     scene = Scene(tmp_path)
     for path in (toy.labelled, toy.classes):
@@ -239,6 +254,7 @@ def test_broken_metrics_are_an_input_error(tmp_path, content):
 @pytest.mark.parametrize("metrics", [
     {}, {"labels": None}, {"labels": {"oa": "high", "iou": [1], "confusion": "x"}}, {"photos": 3, "labels": {"oa": True}},
     {"labels": {"iou": {"a": None}, "confusion": [[1], [2, 3]]}, "per_photo": [1]},
+    {"reliability": {"confidence": [1, 2], "accuracy": [3], "share": []}}, {"reliability": {"confidence": ["x"], "accuracy": [None], "share": [EVIL]}},
 ])
 def test_odd_metrics_do_not_fail(tmp_path, metrics):
     write_json(tmp_path / "metrics.json", metrics)
@@ -259,6 +275,15 @@ def test_bars_are_as_long_as_their_values():
 def test_histogram_counts_every_value_once():
     chart = histogram(np.array([0.0, 0.05, 0.95, 1.0, np.nan]), np.zeros((10, 3), np.uint8))
     assert re.findall(r": ([\d.]+)%</title>", chart) == ["60.0", *["0.0"] * 8, "40.0"]
+
+
+def test_reliability_curve_has_its_dots_where_the_figures_say():
+    chart = reliability_curve([(None, None, 0.0), (0.4, 0.25, 0.1), (0.6, 0.5, 0.3), (0.9, 1.0, 0.6)])
+    places = np.array(re.findall(r'cx="([\d.]+)%" cy="([\d.]+)"', chart), float)
+    assert np.allclose(places[:, 0], [40, 60, 90]) and np.allclose(1 - places[:, 1] / 190, [0.25, 0.5, 1.0], atol=1e-3)
+    bars = np.array(re.findall(r'class="track" x="([\d.]+)%"[^>]*height="([\d.]+)"', chart), float)
+    assert np.allclose(bars[:, 1] / bars[-1, 1], [1 / 6, 0.5, 1], atol=0.01) and (np.diff(bars[:, 0]) == 25).all()
+    assert reliability_curve([(None, None, None)]).count("circle") == 0
 
 
 def test_flight_map_has_north_up_and_east_right():

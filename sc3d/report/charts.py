@@ -64,6 +64,31 @@ def histogram(values: np.ndarray, colors: np.ndarray) -> str:
     return _svg("".join(parts), height + 20, "Confidence of the points")
 
 
+def reliability_curve(bins: Sequence[tuple[float | None, float | None, float | None]]) -> str:
+    """Accuracy over confidence, both from 0 to 1, with the diagonal of perfect calibration and a bar for the share of each bin.
+
+    bins: mean confidence, accuracy and share of the judged pixels of each bin, in order; None in bins without pixels
+    """
+    height, width = 190, 100 / len(bins)
+    filled = [(*entry, position) for position, entry in enumerate(bins) if None not in entry]
+    largest = max([share for _, _, share, _ in filled], default=0) or 1
+    parts = [f'<line class="axis" x1="0" x2="100%" y1="{y:g}" y2="{y:g}"/>' for y in (0.5, height / 2, height)]
+    for _, _, share, position in filled:
+        bar = 0.45 * height * share / largest
+        parts.append(f'<rect class="track" x="{position * width + 0.1 * width:.2f}%" y="{height - bar:.1f}" width="{0.8 * width:.2f}%" height="{bar:.1f}"/>')
+    parts.append(f'<line class="ideal" x1="0" y1="{height}" x2="100%" y2="0"/>')
+    spots = [(100 * confidence, height * (1 - accuracy)) for confidence, accuracy, _, _ in filled]
+    parts += [f'<line class="curve" x1="{x:.2f}%" y1="{y:.1f}" x2="{end_x:.2f}%" y2="{end_y:.1f}"/>' for (x, y), (end_x, end_y) in zip(spots, spots[1:])]
+    for (x, y), (confidence, accuracy, share, _) in zip(spots, filled, strict=True):
+        text = f"confidence {confidence:.2f}: {accuracy:.1%} right, {share:.1%} of the pixels"
+        parts.append(f'<circle class="spot" cx="{x:.2f}%" cy="{y:.1f}" r="4.5"><title>{text}</title></circle>')
+    for value, y in ((1, 13), (0.5, height / 2 - 4)):
+        parts.append(f'<text class="soft" x="0" y="{y:g}">{value:.0%} right</text>')
+    for place, anchor in ((0, "start"), (0.5, "middle"), (1, "end")):
+        parts.append(f'<text class="soft" x="{100 * place}%" y="{height + 16}" text-anchor="{anchor}">{place:g}</text>')
+    return _svg("".join(parts), height + 20, "Reliability of the confidence")
+
+
 def stacked_bar(rows: Sequence[tuple[str, Color, float]]) -> str:
     """One bar divided by shares. rows: name, colour, share from 0 to 1."""
     parts, start = [], 0.0

@@ -66,6 +66,11 @@ class Material:
         folder = used.get("truth") if isinstance(used, dict) else None
         return Path(folder) if isinstance(folder, str) and Path(folder).is_dir() else self.scene.truth
 
+    @property
+    def training_sheet(self) -> Path:
+        """The contact sheet that training writes; may not exist."""
+        return self.scene.path / "train.jpg"
+
     def figures(self, source: str) -> dict:
         """Figures of "labels" or "masks" in metrics.json; empty if there are none."""
         found = self.metrics.get(source)

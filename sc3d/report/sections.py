@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.report.charts import css_color, flight_map, formatted, histogram, number, paired_bars, stacked_bar
-from sc3d.report.images import cloud_pictures, comparison, ground_picture
+from sc3d.io import read_image
+from sc3d.report.certainty import certainty_section
+from sc3d.report.charts import css_color, flight_map, formatted, number, paired_bars
+from sc3d.report.images import cloud_pictures, comparison, ground_picture, jpeg
 from sc3d.report.material import Material
 from sc3d.report.processing import processing_section
 from sc3d.labelled import LabelledSurface
 from sc3d.view import color_points
-from sc3d.view.colors import STATES, confidence_colors, legend_entries
+from sc3d.view.colors import confidence_colors, legend_entries
 
 _NUM_PHOTOS = 4
 _COLOURING_NAMES = {"label": "Classes", "photo": "Photo colours", "confidence": "Confidence", "state": "Origin of the label", "mesh": "Mesh"}
@@ -28,6 +30,7 @@ def sections(material: Material) -> Iterator[tuple[str, str, str]]:
     yield "classes", "Classes", class_section(material)
     yield "certainty", "Certainty", certainty_section(material)
     yield "flight", "Flight", flight_section(material)
+    yield "training", "Gaussians", training_section(material)
     yield "processing", "Processing", processing_section(material)
 
 
@@ -139,22 +142,6 @@ def class_section(material: Material) -> str:
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
 
 
-def certainty_section(material: Material) -> str:
-    """Confidence of the points, and how their labels came about."""
-    confidence, states, parts = material.values("confidence"), material.values("state"), []
-    if confidence is not None:
-        colors = confidence_colors((np.arange(20) + 0.5) / 20)
-        parts.append(f'<div><h3>Confidence</h3><p class="note">Share of the points by confidence; median {np.nanmedian(confidence):.2f}.</p>'
-                     f"{histogram(confidence, colors)}</div>")
-    if states is not None and len(states):
-        shares = np.bincount(states.astype(np.uint8), minlength=256)[: len(STATES)] / len(states)
-        rows = [(state.name, state.color, float(share)) for state, share in zip(STATES, shares, strict=True)]
-        items = "".join(f'<li><i style="background:{css_color(color)}"></i>{escape(name)} <b>{share:.1%}</b></li>' for name, color, share in rows)
-        parts.append(f'<div><h3>Origin of the labels</h3><p class="note">Seeds come from the photos, propagated labels from their neighbours; '
-                     f'locked points were contradictory.</p>{stacked_bar(rows)}<ul class="legend">{items}</ul></div>')
-    return f'<div class="columns">{"".join(parts)}</div>' if parts else ""
-
-
 def flight_section(material: Material) -> str:
     """Camera positions over the ground."""
     if not material.views:
@@ -167,6 +154,15 @@ def flight_section(material: Material) -> str:
     lowest, highest = centres[:, 2].min(), centres[:, 2].max()
     note = f"{_count(len(centres), 'camera')} at heights (z) of {lowest:,.1f} to {highest:,.1f} m. The line shows where each looks."
     return f'<p class="note">{note}</p>{flight_map(centres[:, :2], headings, [view.name for view in material.views], ground)}'
+
+
+def training_section(material: Material) -> str:
+    """The contact sheet of the training."""
+    if not material.training_sheet.exists():
+        return ""
+    text = "Photos of the flight, and the Gaussians seen by the same cameras: rendering, depth and normals"
+    return (f'<p class="note">{text}. Where a rendering is blurred, or its depth stands out from its surroundings, too few photos overlap.</p>'
+            f'<figure><img src="{jpeg(read_image(material.training_sheet))}" alt="{text}"></figure>')
 
 
 def _choose_views(material: Material) -> list:

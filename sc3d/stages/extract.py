@@ -8,13 +8,13 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import local_origin, project, resample, undistorted
+from sc3d.geometry.cameras import project, resample, undistorted
 from sc3d.io import read_image, write_geometry
 from sc3d.scene import Scene, check_photos
 from sc3d.settings import Extract
 from sc3d.splatting.extraction import DepthViews, centre_cloud, extract_surface
-from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.neighbours import neighbour_views
+from sc3d.splatting.pictures import load_gaussians
 
 
 def inputs(scene: Scene, settings: Extract) -> list[Path]:
@@ -26,11 +26,8 @@ def outputs(scene: Scene, settings: Extract) -> list[Path]:
 
 
 def run(scene: Scene, settings: Extract) -> dict[str, object]:
-    scene.require(scene.gaussians, hint="run `sc3d train SCENE` first")
-    gaussians, comments = Gaussians.load(scene.gaussians)
-    model, origin = scene.model, local_origin(scene.model.views)
-    if any(line.startswith("sc3d origin") for line in comments) and f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}" not in comments:
-        raise InputError(f"{scene.gaussians} was trained with other cameras than those in {scene.sparse}: run `sc3d train SCENE --overwrite`")
+    gaussians, origin = load_gaussians(scene)
+    model = scene.model
     centres = np.array([view.centre for view in model.views])
     if settings.method == "centres":
         cloud = centre_cloud(gaussians, centres - origin, settings.min_opacity)

@@ -1,4 +1,4 @@
-"""Photos + cameras + sparse points -> gaussians.ply and the training log."""
+"""Photos + cameras + sparse points -> gaussians.ply, the training log and a contact sheet."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from sc3d.geometry.cameras import local_origin, resample, undistorted
 from sc3d.io import digest, read_image
 from sc3d.scene import Scene, check_photos
 from sc3d.settings import Train
+from sc3d.splatting.device import pick_device
 from sc3d.splatting.train import TrainingData, train, write_log
+from sc3d.view.sheet import write_training_sheet
 
 CACHED_PIXELS = 500_000_000  # undistorted photos kept in memory: 1.5 GB
 
@@ -27,8 +29,7 @@ def outputs(scene: Scene, settings: Train) -> list[Path]:
 
 
 def run(scene: Scene, settings: Train) -> dict[str, object]:
-    if settings.device == "cuda":
-        raise InputError("there is no CUDA renderer yet: use --device cpu (or auto)")
+    pick_device(settings.device)  # complain before the work begins
     model = scene.model
     check_photos(scene, [view.name for view in model.views])
     if len(model.points) < 10:
@@ -45,6 +46,7 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
     result = train(data, settings, checkpoint if settings.checkpoint_every else None)
     result.gaussians.save(scene.gaussians, [f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}"])
     write_log(result.log, scene.path / "train.csv")
+    write_training_sheet(scene.path / "train.jpg", result, data, settings)
     checkpoint.unlink(missing_ok=True)
     last = result.log[-1] if result.log else {}
     held_out = {f"held_out_{name}": round(value, 3) for name, value in result.metrics.items()}

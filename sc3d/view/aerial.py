@@ -34,6 +34,13 @@ def aerial_view(points: np.ndarray, size: tuple[int, int], from_above: bool = Fa
     return pinhole_view("above" if from_above else "oblique", size, calibration, look_at(centre, centre - backward))
 
 
+def fitted(view: View, size: tuple[int, int], even: bool = False) -> View:
+    """The undistorted view of a photo, as large as fits into `size` (width, height) px but not enlarged; even: both sides divisible by 2."""
+    pinhole = undistorted(view)
+    scale, step = min(1.0, size[0] / pinhole.width, size[1] / pinhole.height), 2 if even else 1
+    return pinhole.resized(*(max(step, step * int(scale * side / step + 1e-6)) for side in (pinhole.width, pinhole.height)))
+
+
 def frusta(views: Sequence[View], depth: float) -> np.ndarray:
     """(8 M, 2, 3) float64 line ends, world, of camera pyramids whose base lies `depth` (world units) before the centre."""
     lines = np.empty((len(views), 8, 2, 3))

@@ -7,7 +7,7 @@ import numpy as np
 from sc3d.classes import ClassTable
 from sc3d.view.colors import Colouring, confidence_colors, legend_entries
 
-_PAPER, _INK = (255, 255, 255), (32, 34, 38)
+PAPER, INK = (255, 255, 255), (32, 34, 38)
 
 
 def add_legend(image: np.ndarray, by: Colouring, class_table: ClassTable | None, present: set[int] | None = None) -> np.ndarray:
@@ -29,7 +29,7 @@ def add_legend(image: np.ndarray, by: Colouring, class_table: ClassTable | None,
 def _swatches(entries: list[tuple[str, tuple[int, int, int]]], width: int) -> np.ndarray:
     from PIL import Image, ImageDraw
 
-    font, size = _font(width)
+    font, size = caption_font(width)
     line, gap = round(1.9 * size), size
     places, x, y = [], gap, gap // 2
     for name, _ in entries:
@@ -38,32 +38,33 @@ def _swatches(entries: list[tuple[str, tuple[int, int, int]]], width: int) -> np
             x, y = gap, y + line
         places.append((x, y))
         x += length + round(1.5 * gap)
-    strip = Image.new("RGB", (width, y + line + gap // 2), _PAPER)
+    strip = Image.new("RGB", (width, y + line + gap // 2), PAPER)
     draw = ImageDraw.Draw(strip)
     for (name, color), (left, top) in zip(entries, places, strict=True):
         middle = top + line // 2
         draw.rectangle((left, middle - size // 2, left + size, middle + size // 2), fill=tuple(color), outline=(120, 120, 120))
-        draw.text((left + 1.6 * size, middle), name, font=font, fill=_INK, anchor="lm")
+        draw.text((left + 1.6 * size, middle), name, font=font, fill=INK, anchor="lm")
     return np.asarray(strip)
 
 
 def _color_bar(width: int) -> np.ndarray:
     from PIL import Image, ImageDraw
 
-    font, size = _font(width)
+    font, size = caption_font(width)
     height, length = 3 * size, min(width - 2 * size, 18 * size)
-    strip = Image.new("RGB", (width, height), _PAPER)
+    strip = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(strip)
     start = size + round(font.getlength("confidence 0 ")) + size // 2
     length = max(2, min(length, width - start - 3 * size))
     bar = np.repeat(confidence_colors(np.linspace(0, 1, length))[None], size, axis=0)
-    draw.text((size, height / 2), "confidence 0", font=font, fill=_INK, anchor="lm")
+    draw.text((size, height / 2), "confidence 0", font=font, fill=INK, anchor="lm")
     strip.paste(Image.fromarray(bar), (start, (height - size) // 2))
-    draw.text((start + length + size // 2, height / 2), "1", font=font, fill=_INK, anchor="lm")
+    draw.text((start + length + size // 2, height / 2), "1", font=font, fill=INK, anchor="lm")
     return np.asarray(strip)
 
 
-def _font(width: int) -> tuple:
+def caption_font(width: int) -> tuple:
+    """A Pillow font that suits a picture of `width` px, and its size, px."""
     from PIL import ImageFont
 
     size = int(np.clip(width // 70, 11, 28))

@@ -1,0 +1,42 @@
+"""The part of a report on how certain the labels are, and how true that is."""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+
+from sc3d.report.charts import css_color, histogram, number, reliability_curve, stacked_bar
+from sc3d.report.material import Material
+from sc3d.view.colors import STATES, confidence_colors
+
+
+def certainty_section(material: Material) -> str:
+    """Confidence of the points, whether it can be believed, and how their labels came about."""
+    confidence, states, parts = material.values("confidence"), material.values("state"), []
+    if confidence is not None:
+        colors = confidence_colors((np.arange(20) + 0.5) / 20)
+        parts.append(f'<div><h3>Confidence</h3><p class="note">Share of the points by confidence; median {np.nanmedian(confidence):.2f}.</p>'
+                     f"{histogram(confidence, colors)}</div>")
+    parts += _reliability(material)
+    if states is not None and len(states):
+        shares = np.bincount(states.astype(np.uint8), minlength=256)[: len(STATES)] / len(states)
+        rows = [(state.name, state.color, float(share)) for state, share in zip(STATES, shares, strict=True)]
+        items = "".join(f'<li><i style="background:{css_color(color)}"></i>{escape(name)} <b>{share:.1%}</b></li>' for name, color, share in rows)
+        parts.append(f'<div><h3>Origin of the labels</h3><p class="note">Seeds come from the photos, propagated labels from their neighbours; '
+                     f'locked points were contradictory.</p>{stacked_bar(rows)}<ul class="legend">{items}</ul></div>')
+    return f'<div class="columns">{"".join(parts)}</div>' if parts else ""
+
+
+def _reliability(material: Material) -> list[str]:
+    """The reliability curve as a list of one block; empty without truth."""
+    figures = material.figures("reliability")
+    columns = [figures.get(key) for key in ("confidence", "accuracy", "share")]
+    if not all(isinstance(column, list) for column in columns) or not len(columns[0]) == len(columns[1]) == len(columns[2]) > 0:
+        return []
+    bins = [tuple(number(value) for value in values) for values in zip(*columns, strict=True)]
+    error = number(figures.get("ece"))
+    note = "Share of right pixels (dots) against the confidence of their label; on the line, confidence is exactly that share. Bars: share of the pixels."
+    if error is not None:
+        note += f" Expected calibration error {error:.3f}."
+    return [f'<div><h3>Reliability</h3><p class="note">{note}</p>{reliability_curve(bins)}</div>']
