@@ -15,7 +15,7 @@ from PIL import Image
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.io import atomic_path, write_image, write_json
+from sc3d.io import atomic_path, write_geometry, write_image, write_json
 from sc3d.synthetic.cloud import find_tracks, truth_cloud
 from sc3d.synthetic.exif import drone_exif, geodetic
 from sc3d.synthetic.flight import camera_in_model, fly
@@ -41,7 +41,7 @@ NUM_SPARSE = 16_000  # candidates for sparse points; those seen by three views a
 def synthesize(scene_path: Path, settings: SynthesizeSettings, progress: Callable[[float, str], None] | None = None) -> dict:
     """Write a complete scene folder.
 
-    Writes images/, depth/<stem>.npy (float32 z, m), truth/, masks/, confidence/, sparse/0, truth.ply and classes.json.
+    Writes images/, depth/<stem>.npy (float32 z, m), truth/, masks/, confidence/, sparse/0, truth.ply, truth_mesh.ply and classes.json.
     progress: called with the finished share (0..1) and what is being done; None = silent
     returns: summary: num_views, num_triangles, num_buildings, mask_accuracy (over pixels with truth != 0), num_sparse_points, seconds_per_view
     """
@@ -65,6 +65,7 @@ def synthesize(scene_path: Path, settings: SynthesizeSettings, progress: Callabl
     cloud = truth_cloud(world, settings.num_points, np.random.default_rng([settings.seed, 5]))
     with atomic_path(scene_path / "truth.ply") as temporary:
         o3d.t.io.write_point_cloud(str(temporary), cloud)
+    write_geometry(scene_path / "truth_mesh.ply", _mesh(world))
     write_json(scene_path / "classes.json", CLASSES)
     report(1.0, "done")
     summary = {"num_views": len(views), "num_triangles": len(world.corners), "num_buildings": len(world.buildings),
@@ -96,6 +97,12 @@ def _write_view(scene_path: Path, name: Path, photo: Photo, segmented: tuple[np.
         np.save(temporary, photo.depth)
     for folder, image in (("truth", photo.label), ("masks", segmented[0]), ("confidence", segmented[1])):
         write_image(scene_path / folder / f"{name.stem}.png", image)
+
+
+def _mesh(world: World) -> o3d.t.geometry.TriangleMesh:
+    """All triangles of the world, also those outside the site."""
+    corners = world.corners.reshape(-1, 3)
+    return o3d.t.geometry.TriangleMesh(o3d.core.Tensor(corners), o3d.core.Tensor(np.arange(len(corners), dtype=np.int32).reshape(-1, 3)))
 
 
 def _write_sparse(path: Path, world: World, views: list[View], settings: SynthesizeSettings) -> int:
