@@ -51,8 +51,8 @@ def test_plane_comes_out_flat_closed_and_upwards():
 
 def test_completion_covers_what_only_one_view_sees():
     lonely = replace(data(), neighbours=[np.array([4]), np.array([4]), np.array([4]), np.array([4]), np.array([0])])
-    without = extract_surface(flat_square(8.0, 0.0), lonely, Extract(voxel_size=0.15, complete="no"))
-    completed = extract_surface(flat_square(8.0, 0.0), lonely, Extract(voxel_size=0.15))
+    without = extract_surface(flat_square(8.0, 0.0), lonely, Extract(voxel_size=0.15, coverage=0.0))
+    completed = extract_surface(flat_square(8.0, 0.0), lonely, Extract(voxel_size=0.15, coverage=1.0))
     assert completed.coverage > without.coverage + 0.02
     assert np.abs(completed.cloud.point.positions.numpy()[:, 2]).max() < 0.1
 

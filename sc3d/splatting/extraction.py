@@ -16,7 +16,7 @@ from tqdm import tqdm
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.neighbors import orient_normals
-from sc3d.geometry.raycast import Surface, first_surface
+from sc3d.geometry.raycast import FirstSurface, Surface, first_surface
 from sc3d.geometry.surface import DepthFusion, Part, drop_small_parts, near_mesh, pixel_squares
 from sc3d.settings import Extract
 from sc3d.splatting.consistency import blocking, consistent, pixel_rays
@@ -75,13 +75,13 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
             raise Sc3dError("the views' depths do not agree anywhere: train longer, or lower --min-views")
         parts = [_part(fusion)]
         maps.trust(parts[0][0])
-        for turn in range(ROUNDS if settings.complete != "no" else 0):
-            rows = range(turn, len(data.views), ROUNDS)
-            parts.append(_complete(maps, _joined(parts)[0], voxel_size, rows, settings.complete == "careful"))
+        for accept in (_agreed, _unopposed, _plausible):
+            if _coverage(_joined(parts)[0], data.views) >= settings.coverage:
+                break
+            for turn in range(ROUNDS):
+                parts.append(_complete(maps, _joined(parts)[0], voxel_size, range(turn, len(data.views), ROUNDS), accept))
     mesh, cloud = _joined(parts)
-    surface = _surface(mesh)
-    hit = sum(int(np.isfinite(first_surface(surface, view).range).sum()) for view in data.views)
-    return Surfaces(mesh, cloud, voxel_size, confirmed / pixels, hit / pixels)
+    return Surfaces(mesh, cloud, voxel_size, confirmed / pixels, _coverage(mesh, data.views))
 
 
 def _part(fusion: DepthFusion) -> Part:
@@ -92,8 +92,14 @@ def _part(fusion: DepthFusion) -> Part:
     return mesh, cloud.select_by_mask(o3d.core.Tensor(near_mesh(cloud.point.positions.numpy(), mesh, 0.5 * fusion.voxel_size)))
 
 
-def _complete(maps: _DepthMaps, mesh: o3d.t.geometry.TriangleMesh, voxel_size: float, rows: range, careful: bool) -> Part:
-    """Surface from the plausible depth of pixels that look through the holes of `mesh`, of some views.
+def _coverage(mesh: o3d.t.geometry.TriangleMesh, views: list[View]) -> float:
+    """Share of the views' pixels whose ray hits the mesh."""
+    surface = _surface(mesh)
+    return float(np.mean([np.isfinite(first_surface(surface, view).range).mean() for view in views]))
+
+
+def _complete(maps: _DepthMaps, mesh: o3d.t.geometry.TriangleMesh, voxel_size: float, rows: range, accept: Callable[..., np.ndarray]) -> Part:
+    """Surface from the accepted depth of pixels that look through the holes of `mesh`, of some views.
 
     Each view's own: where views disagree, as in tree crowns, their average would be no surface at all.
     """
@@ -101,15 +107,25 @@ def _complete(maps: _DepthMaps, mesh: o3d.t.geometry.TriangleMesh, voxel_size: f
     for row in tqdm(rows, desc="completing", unit="view", disable=None):
         view = data.views[row]
         first, depth = first_surface(surface, view), maps.read(row).numpy()
-        agreeing, blocked = maps.counts(row, LOOSE), maps.blocks(row)
         before = depth < (1 - MARGIN) * first.range * first.ray_z  # where nothing is hit, or only something far behind
-        if careful:
-            wanted = before & maps.usual(row) & ((agreeing > blocked) | ((blocked == 0) & ~np.isfinite(first.range)))
-        else:
-            wanted = before & ((agreeing >= 1) | (blocked <= 1))
-        squares, centres = pixel_squares(view, depth, data.image(row), wanted)
+        squares, centres = pixel_squares(view, depth, data.image(row), before & accept(maps, row, first))
         parts.append((squares, centres.voxel_down_sample(voxel_size) if len(centres.point.positions) else centres))
     return _joined(parts)
+
+
+def _agreed(maps: _DepthMaps, row: int, first: FirstSurface) -> np.ndarray:
+    """(H, W) bool: as high as the surroundings, and more neighbours agree than look through it."""
+    return maps.usual(row) & (maps.counts(row, LOOSE) > maps.blocks(row))
+
+
+def _unopposed(maps: _DepthMaps, row: int, first: FirstSurface) -> np.ndarray:
+    """(H, W) bool: as high as the surroundings, nothing known behind it, and no neighbour looks through it: what only one view sees."""
+    return maps.usual(row) & (maps.blocks(row) == 0) & ~np.isfinite(first.range)
+
+
+def _plausible(maps: _DepthMaps, row: int, first: FirstSurface) -> np.ndarray:
+    """(H, W) bool: some neighbour agrees, or at most one looks through it; crowns in the wind, but also floaters."""
+    return (maps.counts(row, LOOSE) >= 1) | (maps.blocks(row) <= 1)
 
 
 def _joined(parts: list[Part]) -> Part:

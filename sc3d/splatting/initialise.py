@@ -18,8 +18,10 @@ from sc3d.splatting.data import TrainingData
 
 SWEEP_SIZE = 250  # px, longest side of the images compared: 7x7 patches must hold some texture
 NUM_DEPTHS = 64
-MAX_COST = 0.4  # mean 1 - NCC of the two best neighbours
+MAX_COST = 0.5  # mean 1 - NCC of the two best neighbours
+AROUND = 5  # grid points whose costs are averaged
 MIN_SPARSE = 8
+TALLEST = 0.4  # of the flying height: nothing stands higher, unless sparse points say so
 FARTHEST = 3.0  # in depths of the farthest sparse points: what lies behind is backdrop
 
 
@@ -48,10 +50,11 @@ class _Layer:
         """The layer of the sparse points, across the mean viewing direction; None if a camera is not above it: then it is no flight."""
         up = -np.sum([view.cam_from_world[2, :3] for view in views], axis=0)
         up = up / np.maximum(np.linalg.norm(up), 1e-12)
-        low, high = np.quantile(points @ up, [0.005, 0.995])
-        margin = 0.1 * (high - low)
-        above = all(view.centre @ up > high + 2 * margin for view in views)
-        return cls(up, low - margin, high + margin) if above else None
+        low, high = np.quantile(points @ up, [0.02, 0.995])
+        altitude = min(view.centre @ up for view in views) - low
+        # crowns have few sparse points, so the highest of those is no limit
+        high = max(high + 0.1 * (high - low), low + TALLEST * altitude)
+        return cls(up, low - 0.02 * altitude, high) if high < low + 0.8 * altitude else None
 
     def plane(self, view: View, height: float) -> tuple[np.ndarray, float]:
         """Normal (camera frame, towards the camera) and distance of the horizontal plane at a height."""
@@ -116,14 +119,12 @@ def _sight(data: TrainingData, index: int, step: float) -> _Sight | None:
 
 
 def _planes(sight: _Sight, view: View, layer: _Layer | None) -> list[tuple[np.ndarray, float]]:
-    """Planes to try: NUM_DEPTHS fronto-parallel ones around the sparse depths, and as many horizontal ones through the layer, lowest first."""
-    nearest, farthest = np.quantile(sight.depths, [0.01, 0.99]) * [0.6, 1.15]
-    planes = [(np.array([0.0, 0.0, -1.0]), depth) for depth in 1 / np.linspace(1 / farthest, 1 / nearest, NUM_DEPTHS)]
+    """NUM_DEPTHS planes to try, farthest first: horizontal ones through the layer, else fronto-parallel ones around the sparse depths."""
     if layer is None:
-        return planes
+        nearest, farthest = np.quantile(sight.depths, [0.01, 0.99]) * [0.6, 1.15]
+        return [(np.array([0.0, 0.0, -1.0]), depth) for depth in 1 / np.linspace(1 / farthest, 1 / nearest, NUM_DEPTHS)]
     height = view.centre @ layer.up
-    below = 1 / np.linspace(1 / (height - layer.low), 1 / (height - layer.high), NUM_DEPTHS)
-    return [layer.plane(view, height - distance) for distance in below] + planes
+    return [layer.plane(view, height - below) for below in 1 / np.linspace(1 / (height - layer.low), 1 / (height - layer.high), NUM_DEPTHS)]
 
 
 def _plane_depth(plane: tuple[np.ndarray, float], view: View, pixels: np.ndarray) -> np.ndarray:
@@ -141,17 +142,18 @@ def _sweep(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(G,) depth of the plane whose patches agree best with the two best of the other views; (G,) that mean 1 - NCC, 2 = none."""
     pixels = torch.from_numpy((grid * (own[1].width / view.width)).astype(np.int64))
+    around = cKDTree(grid).query(grid, k=min(AROUND, len(grid)))[1].reshape(len(grid), -1)
     best_cost, best_depth = np.full(len(pixels), 2.0), np.ones(len(pixels))
-    for plane in planes:
+    for plane in planes if others else []:
         normals = torch.from_numpy(plane[0].astype(np.float32)).expand(len(pixels), 3).contiguous()
         costs = []
         for other in others:
             cost, inside = losses.patch_dissimilarity((normals, torch.full((len(pixels),), plane[1])), pixels, own, other)
             costs.append(torch.where(inside, cost, 2.0))
-        if costs:
-            cost = torch.stack(costs).sort(0).values[:2].mean(0).numpy()
-            better = cost < best_cost
-            best_cost[better], best_depth[better] = cost[better], _plane_depth(plane, view, grid)[better]
+        cost = torch.stack(costs).sort(0).values[:2].mean(0).numpy()
+        cost = cost[around].mean(axis=1)  # leaves in the wind: one patch says little
+        better = cost < best_cost
+        best_cost[better], best_depth[better] = cost[better], _plane_depth(plane, view, grid)[better]
     return best_depth, best_cost
 
 
