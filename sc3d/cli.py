@@ -28,7 +28,10 @@ STAGES: dict[str, type] = {
     "report": options.Report,
 }
 # commands with arguments of their own
-COMMANDS: dict[str, type] = {"reconstruct": options.ReconstructCommand, "run": options.Run, "view": options.View, "doctor": options.Doctor}
+COMMANDS: dict[str, type] = {
+    "reconstruct": options.ReconstructCommand, "run": options.Run, "view": options.View, "doctor": options.Doctor, "benchmark": options.Benchmark,
+}
+DESCRIPTIONS = {options.Benchmark: "Measure sc3d on this machine."}  # of commands with subcommands: a union of records has no docstring of its own
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -59,14 +62,14 @@ def main(arguments: list[str] | None = None) -> None:
 def usage() -> str:
     """The list of commands."""
     lines = ["usage: sc3d COMMAND ...   (sc3d COMMAND --help shows the options)", ""]
-    lines += [f"  {name:12s}{(record.__doc__ or '').strip().splitlines()[0]}" for name, record in ({"reconstruct": COMMANDS["reconstruct"]} | STAGES | COMMANDS).items()]
+    lines += [f"  {name:12s}{_describe(record).splitlines()[0]}" for name, record in ({"reconstruct": COMMANDS["reconstruct"]} | STAGES | COMMANDS).items()]
     return "\n".join(lines) + "\n"
 
 
 def parse(name: str, arguments: list[str]) -> object:
     """Arguments to the settings record of a command; exits with status 2 on a usage error."""
     record = COMMANDS.get(name) or scene_command(STAGES[name])
-    return tyro.cli(record, args=arguments, prog=f"sc3d {name}", description=(record.__doc__ or "").strip())
+    return tyro.cli(record, args=arguments, prog=f"sc3d {name}", description=_describe(record))
 
 
 def scene_command(record: type) -> type:
@@ -82,6 +85,10 @@ def scene_command(record: type) -> type:
     )
     command.__doc__ = record.__doc__
     return command
+
+
+def _describe(record: type) -> str:
+    return DESCRIPTIONS.get(record) or (record.__doc__ or "").strip()
 
 
 def _dispatch(name: str, command: object) -> None:

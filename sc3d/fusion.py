@@ -5,9 +5,9 @@ One vote per view and voxel side; votes are fixed-point integers, so the result 
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import cv2
 import numba
@@ -15,28 +15,36 @@ import numpy as np
 from tqdm import tqdm
 
 from sc3d.geometry.cameras import View
-from sc3d.geometry.raycast import FirstSurface, Sighting, Surface, first_surface, see_points
-from sc3d.geometry.voxels import VoxelField, normal_sides
+from sc3d.geometry.raycast import Surface, depth_edge_distance, first_surface
+from sc3d.geometry.voxels import VoxelField
 from sc3d.settings import Label
+from sc3d.voting import Ballot, open_ballot
+from sc3d.voting_kernels import SCALE, Picture, Rules
 
-logger = logging.getLogger(__name__)
+
 
 UNSEEN, SEED, LOCKED, PROPAGATED, UNLOCKED = range(5)  # `state` of a point
+DISTANCE_STEPS = 16  # of a pixel
 STATE_NAMES = ("unseen", "seed", "locked", "propagated", "unlocked")
-SCALE = 4096  # one full vote in fixed point
-MIN_WEIGHT = 0.05
-GRAZING = np.cos(np.deg2rad(75.0))
-STRICT_EXCESS = 0.5  # reprojection halves the depth tolerance
+
+AS_PRINTED = {  # the paper's own choices, whatever the defaults are
+    "consensus": 1.0, "edge_width": 3.0, "depth_edge_width": 0.0, "depth_excess": True, "incidence": True, "range": True, "verify": "lock", "reproject": True,
+}
 
 Mask = tuple[np.ndarray, np.ndarray | None]  # (h, w) uint8 labels; (h, w) uint8 confidence or None
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """What is to be labelled. points: (N, 3) float64 world; normals: (N, 3) float32 unit, towards the outside, or None."""
+    """What is to be labelled.
+
+    points: (N, 3) float64 world; normals: (N, 3) float32 unit, towards the outside, or None
+    density: (N,) float32 how much matter there is, for the points' weights inside a voxel, or None = all weigh the same
+    """
 
     points: np.ndarray
     normals: np.ndarray | None
+    density: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -65,45 +73,70 @@ def fuse(cloud: Cloud, views: list[View], read_mask: Callable[[View], Mask], sur
     surface: what blocks the view; None (or settings.depth_filter off) = labels penetrate
     num_ids: largest class id + 1; settings.voxel_size must be set
     """
-    field = VoxelField.around(cloud.points, settings.voxel_size, num_ids)
-    sides = None if cloud.normals is None else normal_sides(cloud.points, cloud.normals, field.origin, settings.voxel_size)
-    cells = field.find(cloud.points, sides)
-    reference_depth = float(np.median([np.linalg.norm(view.centre - np.median(cloud.points, axis=0)) for view in views]))
-    overlay = np.zeros(len(cloud.points), np.uint8)
-    ballot = _Ballot(field.votes, np.zeros_like(field.votes))
-    for view in tqdm(sorted(views, key=lambda view: view.name), desc="voting", unit="view", disable=None):
+    if settings.method == "paper":
+        settings = replace(settings, **AS_PRINTED)
+    ballot, field = open_ballot(cloud.points, cloud.normals, cloud.density, settings.voxel_size, num_ids)
+    rules = _rules(cloud.points, views, settings)
+    pictures = _pictures(views, read_mask, surface if settings.depth_filter else None, settings)
+    for view, picture in tqdm(pictures, desc="voting", unit="view", total=len(views), disable=None):
+        ballot.cast(view, picture, rules)
+    labels = _decide(ballot, settings)
+    field.votes[ballot.field_cells] = ballot.votes
+    return Fusion(labels, field, ballot.to_points(ballot.field_cells))
+
+
+def _rules(points: np.ndarray, views: list[View], settings: Label) -> Rules:
+    middle = np.median(points, axis=0)
+    reference_depth = float(np.median([np.linalg.norm(view.centre - middle) for view in views])) if views else 1.0
+    equal = settings.method in ("direct", "majority")
+    return Rules(settings.voxel_size, reference_depth, settings.depth_excess, settings.incidence, settings.range, equal, settings.reproject)
+
+
+def _pictures(views: list[View], read_mask: Callable[[View], Mask], surface: Surface | None, settings: Label) -> Iterator[tuple[View, Picture]]:
+    """Views in the order of their names, at the size of their masks, with what they say; the next mask is read meanwhile."""
+    ordered = sorted(views, key=lambda view: view.name)
+
+    def prepare(view: View) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
         mask, confidence = read_mask(view)
-        view = view.resized(mask.shape[1], mask.shape[0])
-        first = first_surface(surface, view) if surface is not None and settings.depth_filter else None
-        seen = see_points(view, cloud.points, cloud.normals, first, settings.voxel_size)
-        labels = mask[seen.rows, seen.columns]
-        overlay[seen.points[labels > 0]] = labels[labels > 0]
-        edge = edge_distance(mask)[seen.rows, seen.columns]
-        weights = vote_weights(seen, first, edge, confidence, reference_depth, settings)
-        strict = (seen.excess <= STRICT_EXCESS) & (edge >= settings.edge_width) & (seen.incidence >= GRAZING)
-        ballot.cast(cells[seen.points], labels, weights, strict)
-    return Fusion(_decide(ballot, cells, overlay, settings), field, cells)
+        return mask, confidence if settings.use_confidence else None, edge_distance(mask)
+
+    with ThreadPoolExecutor(1) as reader:
+        pending = [reader.submit(prepare, view) for view in ordered[:1]]
+        for row, view in enumerate(ordered):
+            mask, confidence, edge = pending.pop().result()
+            pending += [reader.submit(prepare, following) for following in ordered[row + 1 : row + 2]]
+            sized = view.resized(mask.shape[1], mask.shape[0])
+            ranges = np.empty((0, 0), np.float32) if surface is None else first_surface(surface, sized).range
+            yield sized, picture_of(mask, confidence, edge, ranges, settings)
 
 
-def vote_weights(
-    seen: Sighting, first: FirstSurface | None, edge: np.ndarray, confidence: np.ndarray | None, reference_depth: float, settings: Label
-) -> np.ndarray:
-    """(K,) weight of each sighting in [MIN_WEIGHT, 1]: mask confidence x mask edge x depth excess x incidence x range.
+def picture_of(mask: np.ndarray, confidence: np.ndarray | None, edge: np.ndarray, ranges: np.ndarray, settings: Label) -> Picture:
+    """Weight of each mask pixel: confidence x distance to the mask's edges x distance to depth edges.
 
-    1 for the direct and majority baselines.
+    mask: (H, W) uint8; confidence: (H, W) uint8 or None; edge: (H, W) float32 px; ranges: (H, W) float32 or (0, 0)
     """
-    if settings.method in ("direct", "majority"):
-        return np.ones(len(seen.points), np.float32)
-    weights = np.exp(-seen.excess) if first is not None else np.ones(len(seen.points), np.float32)
-    if settings.use_confidence and confidence is not None:
-        weights = weights * confidence[seen.rows, seen.columns] / np.float32(255)
+    weights = np.ones(mask.shape, np.float32) if confidence is None else confidence * np.float32(1 / 255)
     if settings.edge_width > 0:
-        weights = weights * (1 - np.exp(-edge / settings.edge_width))
-    if settings.incidence:
-        weights = weights * seen.incidence
-    if settings.range:
-        weights = weights * np.minimum(reference_depth / seen.depth, 1)
-    return np.clip(weights, MIN_WEIGHT, 1).astype(np.float32)
+        weigh_distance(edge, distance_weights(settings.edge_width), weights)
+    if settings.depth_edge_width > 0 and ranges.size:
+        weigh_distance(depth_edge_distance(ranges), distance_weights(settings.depth_edge_width), weights)
+    return Picture(mask, weights, edge >= settings.edge_width, ranges)
+
+
+def distance_weights(width: float) -> np.ndarray:
+    """(T,) float32 table of 1 - exp(-distance / width), distance in steps of 1 / DISTANCE_STEPS px; the last entry, 1, holds from there on."""
+    table = -np.expm1(-np.arange(int(12 * width * DISTANCE_STEPS) + 2) / (width * DISTANCE_STEPS)).astype(np.float32)
+    table[-1] = 1
+    return table
+
+
+@numba.njit(parallel=True, cache=True)
+def weigh_distance(distance, table, weights):  # noqa: ANN001, ANN201 - numba kernel
+    """Multiply weights (H, W) float32 by the table's entry for each distance (H, W) float32, px; exponentials of all pixels would cost 5 times as much."""
+    for row in numba.prange(distance.shape[0]):
+        for column in range(distance.shape[1]):
+            step = int(min(distance[row, column] * DISTANCE_STEPS + np.float32(0.5), np.float32(len(table) - 1)))
+            weights[row, column] *= table[step]
 
 
 def edge_distance(mask: np.ndarray) -> np.ndarray:
@@ -119,65 +152,32 @@ def edge_distance(mask: np.ndarray) -> np.ndarray:
     return cv2.distanceTransform((~differs).astype(np.uint8), cv2.DIST_L2, 5) + np.float32(0.5)
 
 
-@dataclass
-class _Ballot:
-    """Votes of all views; channel 0 counts the views, because label 0 never votes.
-
-    votes, strict: (cells, num_ids) int32, the second without mask edges, grazing views and doubtful depth
-    """
-
-    votes: np.ndarray
-    strict: np.ndarray
-
-    def __post_init__(self) -> None:
-        self._sums = np.zeros(self.votes.shape, np.int64)
-        self._counts = np.zeros(len(self.votes), np.int32)
-
-    def cast(self, cells: np.ndarray, labels: np.ndarray, weights: np.ndarray, strict: np.ndarray) -> None:
-        """Add one view: each cell gets the mean of its sightings. Arrays (K,)."""
-        fixed = np.round(weights * SCALE).astype(np.int64)
-        _cast(cells, labels, fixed, self._sums, self._counts, self.votes)
-        _cast(cells[strict], labels[strict], fixed[strict], self._sums, self._counts, self.strict)
-
-
-@numba.njit(cache=True)
-def _cast(cells, labels, weights, sums, counts, votes):  # noqa: ANN001, ANN202 - numba kernel, arrays as in _Ballot.cast
-    touched = np.empty(len(cells), np.int64)
-    num_touched = 0
-    for k in range(len(cells)):
-        cell, label = cells[k], labels[k]
-        if label == 0 or cell < 0:
-            continue
-        if counts[cell] == 0:
-            touched[num_touched] = cell
-            num_touched += 1
-        counts[cell] += 1
-        sums[cell, label] += weights[k]
-    for k in range(num_touched):
-        cell = touched[k]
-        for label in range(1, sums.shape[1]):
-            votes[cell, label] += sums[cell, label] // counts[cell]
-            sums[cell, label] = 0
-        votes[cell, 0] += 1
-        counts[cell] = 0
-
-
-def _decide(ballot: _Ballot, cells: np.ndarray, overlay: np.ndarray, settings: Label) -> Labels:
-    num_views = ballot.votes[cells, 0]
-    winner, share = _winner(ballot.votes)
+def _decide(ballot: Ballot, settings: Label) -> Labels:
+    """Winner, conflict, reset, lock and unlock per cell, once all views have voted; then per point."""
+    num_views = ballot.to_points(ballot.votes[:, 0])
     if settings.method == "direct":
+        overlay = np.empty_like(ballot.overlay)
+        overlay[ballot.order] = ballot.overlay
         seen = overlay > 0
         return Labels(overlay, seen.astype(np.float32), np.where(seen, SEED, UNSEEN).astype(np.uint8), num_views)
+    winner, share = _winner(ballot.votes)
+    doubted = np.zeros(len(winner), bool)
+    if settings.verify != "no" and settings.method != "majority":
+        votes, passed = ballot.verified(winner)
+        doubted = ~passed
+        if settings.verify == "weigh":
+            ballot.votes[:] = votes
+            winner, share = _winner(votes)
     state = np.where(winner > 0, SEED, UNSEEN).astype(np.uint8)
     if settings.method != "majority":
-        consensus = 1.0 if settings.method == "paper" else settings.consensus
-        locked = (ballot.votes[:, 0] >= 2) & (share < consensus - 1e-6)
+        locked = (ballot.votes[:, 0] >= 2) & ((share < settings.consensus - 1e-6) | doubted)
         state[locked], winner[locked] = LOCKED, 0
         if settings.reproject:
             again, agreed = _winner(ballot.strict)
-            unlocked = locked & (again > 0) & (agreed >= consensus - 1e-6)
+            unlocked = locked & (ballot.strict[:, 0] >= 2) & (agreed >= settings.consensus - 1e-6)
             state[unlocked], winner[unlocked], share[unlocked] = UNLOCKED, again[unlocked], agreed[unlocked]
-    return Labels(winner[cells], np.where(winner > 0, share, 0).astype(np.float32)[cells], state[cells], num_views)
+    share = np.where(winner > 0, share, np.float32(0))
+    return Labels(ballot.to_points(winner), ballot.to_points(share), ballot.to_points(state), num_views)
 
 
 def _winner(votes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

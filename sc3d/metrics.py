@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sc3d.calibration import Reliability, reliability
 from sc3d.classes import ClassTable
 
 
@@ -72,6 +73,45 @@ class Confusion:
 def total(parts: Iterable[Confusion], num_ids: int) -> Confusion:
     """Sum of confusion matrices; empty sum = zeros."""
     return sum(parts, Confusion(np.zeros((num_ids, num_ids), np.int64)))
+
+
+@dataclass(frozen=True)
+class JudgedPixels:
+    """The P pixels that have truth, and the cloud point that each of them shows: found once, then every labelling of the cloud is judged by a look-up.
+
+    truth: (P,) uint8 ids, never 0; rows: (P,) int32 row of the cloud, -1 = no point there; band: (P,) bool near a depth edge
+    """
+
+    truth: np.ndarray
+    rows: np.ndarray
+    band: np.ndarray
+
+    @classmethod
+    def of(cls, truth: np.ndarray, rows: np.ndarray, band: np.ndarray) -> JudgedPixels:
+        """One photo. truth: (H, W) uint8, 0 = not judged; rows: (H, W) int32 as `nearest_points` returns them; band: (H, W) bool."""
+        judged = truth > 0
+        return cls(truth[judged], rows[judged].astype(np.int32), band[judged])
+
+    @classmethod
+    def joined(cls, parts: list[JudgedPixels]) -> JudgedPixels:
+        """All pixels of several photos, in order."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("truth", "rows", "band")))
+
+    def look_up(self, values: np.ndarray) -> np.ndarray:
+        """(P,) value of the point that each pixel shows, 0 where there is none. values: (N,) per point of the cloud."""
+        return np.append(values, values.dtype.type(0))[self.rows]
+
+    def confusions(self, predicted: np.ndarray, num_ids: int) -> tuple[Confusion, Confusion]:
+        """Confusion of (P,) uint8 predictions inside and outside the band; their sum is that of all pixels."""
+        flat = (self.band.astype(np.int64) * num_ids + self.truth) * num_ids + predicted
+        inside, outside = np.bincount(flat, minlength=2 * num_ids**2).reshape(2, num_ids, num_ids)[::-1]
+        return Confusion(inside), Confusion(outside)
+
+    def reliability(self, label: np.ndarray, confidence: np.ndarray) -> Reliability:
+        """Confidence of the label at each pixel that has one, against being right. label: (N,) uint8, confidence: (N,) float32 per point of the cloud."""
+        predicted = self.look_up(label)
+        labelled = predicted > 0
+        return reliability(self.look_up(confidence)[labelled], (predicted == self.truth)[labelled])
 
 
 def depth_edge_band(depth: np.ndarray, width: float) -> np.ndarray:

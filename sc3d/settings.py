@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, arg, subcommand
 
 from sc3d.splatting.settings import TrainSettings as Train
 from sc3d.synthetic.settings import SynthesizeSettings as Synthesize
@@ -43,11 +43,11 @@ class Extract:
     """Longest side of the depth maps, px."""
     voxel_size: float = 0.0
     """TSDF voxel, world units; 0 = 1.5 times the median ground sampling distance, at least box / 2048."""
-    min_views: int = 2
+    min_views: int = 1
     """Neighbour views that must confirm a depth (within 1 px)."""
-    complete: Literal["full", "careful", "no"] = "full"
-    """Where the confirmed surface has holes, take the depth of the views that look into them. full: nearly every pixel gets a surface, best for
-    labels, but oblique flights leave floaters; careful: only what is as high as its surroundings and what no other view contradicts; no: leave holes."""
+    coverage: float = 0.97
+    """Holes of the confirmed surface are filled with the depth of single views, the surer first, until this share of all pixels hits a surface: labels
+    need one. 0 = leave holes, 1 = fill whatever can be filled; oblique flights then get floaters."""
     min_opacity: float = 0.3
     """Smallest opacity of a Gaussian whose centre becomes a point (centres)."""
 
@@ -85,22 +85,32 @@ class Label:
     """Fuse masks into the voxel label field and the cloud."""
 
     method: Literal["direct", "majority", "conflict-lock", "paper"] = "conflict-lock"
-    """direct: last photo wins; majority: most votes win; conflict-lock: disagreeing voxels are reset and locked; paper: the same with any disagreement."""
+    """direct: last photo wins; majority: most votes win; conflict-lock: disagreeing voxels are reset and locked; paper: the same with any
+    disagreement and the paper's weights, whatever the other options say."""
     depth_filter: bool = True
     """Only the first surface along each ray is labelled; --no-depth-filter lets labels penetrate."""
-    consensus: float = 0.8
+    consensus: float = 0.66
     """Share of the votes that the winning class needs, else the voxel is locked (conflict-lock)."""
     voxel_size: float = 0.0
     """Label voxel, world units; 0 = 2 times the median point spacing, at least 1.5 times the median mask pixel on the ground."""
     use_confidence: bool = True
     """Weigh mask pixels by the confidence maps, where there are any."""
-    edge_width: float = 3.0
+    edge_width: float = 1.5
     """Mask pixels closer than this to a label boundary count less, px; 0 = off."""
-    incidence: bool = True
+    depth_edge_width: float = 6.0
+    """Pixels closer than this to a depth discontinuity count less, px, because masks bleed over silhouettes; 0 = off."""
+    depth_excess: bool = True
+    """Weigh votes less, the farther a point lies behind the first surface (within the tolerance)."""
+    incidence: bool = False
     """Weigh votes by the cosine of the incidence angle."""
     range: bool = True
     """Weigh votes by the inverse distance, so that near photos count more."""
-    reproject: bool = True
+    verify: Literal["no", "lock", "weigh"] = "weigh"
+    """Hold the fused labels against each view's masks, place by place. lock: labels that rest on views which contradict them nearby are locked;
+    weigh: such views count less as well."""
+    density: bool = False
+    """Inside a voxel, weigh points by the density of the Gaussians around them (gaussians.ply), or by their distance to the points' mean without it."""
+    reproject: bool = False
     """Vote once more on locked voxels with half the depth tolerance and without mask edges and grazing views."""
     cloud: Path | None = None
     """Cloud to label; SCENE/cloud.ply otherwise."""
@@ -118,8 +128,16 @@ class Propagate:
     """Neighbours per point in the graph."""
     fill: bool = False
     """Label also the points that no edge connects to a seed, from the nearest labelled point."""
-    smoothness: float = 5.0
+    smoothness: float = 3.0
     """Weight of the pairwise term (map)."""
+    color: bool = True
+    """Edges between unlike colours weigh less (geometry, map); not in the paper."""
+    appearance: bool = True
+    """Learn colour and relief of the classes from agreed points, and let them vote too: the only cure for errors that all views share (map)."""
+    rounds: int = 2
+    """Times that is learned: first from agreed points, then from the result (map)."""
+    verify_seeds: bool = True
+    """Drop seeds that look like another class before the labels spread (knn, geometry); not in the paper."""
     seeds: Path | None = None
     """Cloud written by label; SCENE/seeds.ply otherwise."""
     output: Path | None = None
@@ -170,12 +188,16 @@ class View:
     """Cloud or mesh to show; the labelled cloud, or else cloud.ply, otherwise."""
     photo: str | None = None
     """Look through the camera of this photo."""
+    splats: bool = False
+    """Render the Gaussians instead of the cloud; with --photo, beside the photo (with --screenshot)."""
     from_above: bool = False
     """Straight down instead of oblique (with --screenshot)."""
     cameras: bool = True
     """Draw the cameras."""
     screenshot: Path | None = None
-    """Write a PNG instead of opening a window."""
+    """Write a picture (PNG, JPEG) instead of opening a window."""
+    flight: Path | None = None
+    """Write a video (MP4) of the Gaussians along the flight instead of opening a window."""
     size: tuple[int, int] = (1600, 1000)
     """Width and height of the picture, px."""
 
@@ -186,6 +208,82 @@ class Doctor:
 
     model_dir: Path | None = None
     """Folder with downloaded model weights."""
+
+
+@dataclass(frozen=True)
+class BenchmarkSpeed:
+    """Time training stage by stage: CPU and wall time, fragments per pixel, fraction of the arithmetic limit, memory; OpenSplat beside it."""
+
+    scene: Path | None = None
+    """COLMAP scene folder whose sparse points say where the ground is; a synthetic ground otherwise."""
+    gaussians: tuple[int, ...] = (50_000, 200_000)
+    """Numbers of Gaussians; each is combined with each size."""
+    sizes: tuple[int, ...] = (496, 993)
+    """Longest sides of the view, px."""
+    repeats: int = 7
+    """Times every measurement is repeated; medians are reported."""
+    surface: bool = True
+    """Also time whole training steps with and without the surface terms."""
+    opensplat: Path | None = None
+    """OpenSplat's program, to run on the same Gaussians and photos in turn with sc3d."""
+    output: Path | None = None
+    """JSON file for the figures; a Markdown table is written beside it."""
+
+
+@dataclass(frozen=True)
+class BenchmarkTables:
+    """The paper's tables and an ablation: every method and switch on synthetic scenes and on scenes with truth, judged on the same pixels."""
+
+    workdir: Annotated[Positional[Path], arg(help="Folder for the synthetic scenes and finished rows; the same command goes on where it stopped.")]
+    scenes: tuple[Path, ...] = ()
+    """Scene folders to add; each needs cloud.ply, masks/ and truth/."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Synthetic scenes, in WORKDIR/seed<n>."""
+    noises: tuple[float, ...] = (0.5, 1.0, 1.5)
+    """Strengths of the mask errors, for every seed."""
+    views: int = 40
+    """Photos of a synthetic scene."""
+    points: int = 1_000_000
+    """Points of a synthetic scene."""
+    width: int = 800
+    """Width of the synthetic photos, px."""
+    every: int = 4
+    """Judge every nth photo with truth."""
+    output: Path | None = None
+    """Folder for tables.md and tables.json; WORKDIR otherwise."""
+
+
+@dataclass(frozen=True)
+class BenchmarkFusionSpeed:
+    """Time label and propagate against bare ray casting, a numpy z-buffer voter, one nearest-neighbour pass and scikit-learn; growth and memory."""
+
+    scene: Annotated[Positional[Path], arg(help="Scene folder with cloud.ply, mesh.ply and masks/, such as one that `benchmark tables` made.")]
+    points: tuple[int, ...] = (1_000_000, 3_000_000, 10_000_000)
+    """Numbers of points, drawn from cloud.ply, beyond its size copied along the surface; the rivals run at the first."""
+    views: tuple[int, ...] = (20, 40, 80)
+    """Numbers of views, at the first number of points; a scene with fewer repeats its views."""
+    repeats: int = 3
+    """Times the comparison with the rivals is repeated, in turn; medians are reported."""
+    output: Path | None = None
+    """JSON file for the figures; a Markdown table is written beside it."""
+
+
+@dataclass(frozen=True)
+class BenchmarkSurface:
+    """Compare gaussians.ply and mesh.ply of a scene with the exact depth and surface of the synthetic scene that its photos come from."""
+
+    scene: Annotated[Positional[Path], arg(help="Reconstructed scene folder, with the true cameras.")]
+    truth: Annotated[Positional[Path], arg(help="Synthetic scene folder: depth/, truth/, truth.ply, truth_mesh.ply.")]
+    voxel_size: float = 0.0
+    """Voxel of the mesh, world units; 0 = as in mesh.ply.json."""
+    output: Path | None = None
+    """JSON file for the figures; a Markdown table is written beside it."""
+
+
+Benchmark = (
+    Annotated[BenchmarkSpeed, subcommand("speed")] | Annotated[BenchmarkTables, subcommand("tables")]
+    | Annotated[BenchmarkFusionSpeed, subcommand("fusion-speed")] | Annotated[BenchmarkSurface, subcommand("surface")]
+)
 
 
 @dataclass(frozen=True)

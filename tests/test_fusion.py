@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sc3d.fusion import LOCKED, SEED, UNLOCKED, UNSEEN, Cloud, edge_distance, fuse
+from sc3d.fusion import LOCKED, SEED, UNLOCKED, UNSEEN, Cloud, edge_distance, fuse, picture_of
 from sc3d.geometry.cameras import look_at, pinhole_view
-from sc3d.geometry.raycast import Surface
+from sc3d.geometry.raycast import Surface, depth_edge_distance
 from sc3d.settings import Label
 
-PLAIN = Label(voxel_size=0.2, edge_width=0, incidence=False, range=False, use_confidence=False)
+PLAIN = Label(voxel_size=0.2, edge_width=0, depth_edge_width=0, depth_excess=False, incidence=False, range=False, use_confidence=False, verify="no")
 
 
 def plane(height: float = 0.0, half: float = 3.0, step: float = 0.1) -> np.ndarray:
@@ -34,7 +34,7 @@ def constant(labels: dict[str, int], size: int = 120):
 
 def test_agreement_is_a_seed_everywhere():
     cloud, views = cloud_of(plane()), cameras_above(5)
-    labels = fuse(cloud, views, constant({view.name: 3 for view in views}), Surface.from_cloud(*vars(cloud).values(), np.zeros(3)), 5, PLAIN).labels
+    labels = fuse(cloud, views, constant({view.name: 3 for view in views}), Surface.from_cloud(cloud.points, cloud.normals, np.zeros(3)), 5, PLAIN).labels
     assert (labels.label == 3).all() and (labels.state == SEED).all()
     assert (labels.confidence == 1).all() and (labels.num_views == 5).all()
 
@@ -129,10 +129,32 @@ def test_reprojection_unlocks_what_only_mask_edges_disputed():
     rng = np.random.default_rng(0)
     locked = fuse(cloud, straight, read, None, 5, replace(PLAIN, consensus=0.95, reproject=False)).labels
     rng = np.random.default_rng(0)
-    again = fuse(cloud, straight, read, None, 5, replace(PLAIN, consensus=0.95, edge_width=0.9)).labels
+    again = fuse(cloud, straight, read, None, 5, replace(PLAIN, consensus=0.95, edge_width=0.9, reproject=True)).labels
     assert (locked.state == LOCKED).sum() > 0
     assert (again.state == UNLOCKED).sum() > 0
     assert (again.label[again.state == UNLOCKED] > 0).all()
+
+
+def test_pixel_weights_follow_the_distances_to_mask_and_depth_edges():
+    mask = np.ones((40, 60), np.uint8)
+    mask[:, 30:] = 2
+    ranges = np.full((40, 60), 50.0, np.float32)
+    ranges[20:] = 60.0
+    confidence = np.full((40, 60), 204, np.uint8)
+    edge, depth_edge = edge_distance(mask), depth_edge_distance(ranges)
+    picture = picture_of(mask, confidence, edge, ranges, Label(edge_width=1.5, depth_edge_width=6.0))
+    np.testing.assert_allclose(picture.weights, 0.8 * (1 - np.exp(-edge / 1.5)) * (1 - np.exp(-depth_edge / 6)), atol=0.01)
+    assert (picture.strict == (edge >= 1.5)).all()
+    assert depth_edge[19, 5] == depth_edge[20, 5] == 0.5 and depth_edge[10, 5] == pytest.approx(9.5, abs=0.2)
+    assert (picture_of(mask, None, edge, ranges, Label(edge_width=0, depth_edge_width=0)).weights == 1).all()
+
+
+def test_a_second_vote_of_a_single_view_unlocks_nothing():
+    cloud, views = cloud_of(plane()), cameras_above(3)
+    tilted = np.full((120, 120), 1, np.uint8)
+    masks = {view.name: (tilted * (2 - (row == 0)), None) for row, view in enumerate(views)}
+    labels = fuse(cloud, views, lambda view: masks[view.name], None, 5, replace(PLAIN, consensus=1.0, reproject=True)).labels
+    assert (labels.state == LOCKED).all()
 
 
 def test_edge_distance():

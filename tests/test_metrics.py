@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sc3d.metrics import Confusion, depth_edge_band, total
+from sc3d.metrics import Confusion, JudgedPixels, depth_edge_band, total
 
 
 def test_hand_made_matrix():
@@ -48,3 +48,22 @@ def test_band_follows_a_depth_step():
     band = depth_edge_band(depth, 5)
     assert band[:, 26:34].all() and not band[:, :23].any() and not band[:, 37:].any()
     assert not depth_edge_band(np.full((9, 9), 3.0), 5).any()
+
+
+def test_judged_pixels_equal_the_confusion_of_images():
+    rng = np.random.default_rng(0)
+    label = rng.integers(0, 4, 50).astype(np.uint8)
+    photos = []
+    for shape in ((12, 9), (7, 11)):
+        photos.append((rng.integers(0, 4, shape).astype(np.uint8), rng.integers(-1, 50, shape).astype(np.int32), rng.uniform(size=shape) < 0.3))
+    pixels = JudgedPixels.joined([JudgedPixels.of(*photo) for photo in photos])
+    near, elsewhere = pixels.confusions(pixels.look_up(label), 4)
+    images = [(truth, np.where(rows >= 0, label[rows], 0).astype(np.uint8), band) for truth, rows, band in photos]
+    for confusion, inside in ((near, True), (elsewhere, False)):
+        expected = total((Confusion.of(np.where(band == inside, truth, 0), predicted, 4) for truth, predicted, band in images), 4)
+        np.testing.assert_array_equal(confusion.counts, expected.counts)
+    values = pixels.look_up(np.linspace(0.5, 1, 50, dtype=np.float32))
+    assert (values[pixels.rows < 0] == 0).all() and (values[pixels.rows >= 0] >= 0.5).all() and values.dtype == np.float32
+    believed = pixels.reliability(label, np.full(50, 0.75, np.float32))
+    right, labelled = int(np.trace((near + elsewhere).counts)), int((near + elsewhere).counts[:, 1:].sum())
+    assert believed.count[7] == labelled and believed.accuracy[7] == pytest.approx(right / labelled)

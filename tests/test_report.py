@@ -132,7 +132,7 @@ def toy(tmp_path_factory) -> Scene:
     write_geometry(scene.labelled, make_cloud(mesh))
     figures = {"oa": 0.93125, "miou": 0.871, "iou": {"grass": 0.95, EVIL: 0.792}, "coverage": 0.9876, "confusion": [[0, 900, 50], [10, 60, 700]]}
     masks = figures | {"oa": 0.81, "miou": 0.7, "iou": {"grass": 0.8, EVIL: float("nan")}}
-    believed = {"ece": 0.0321, "confidence": [None] * 7 + [0.75, 0.85, 0.97], "accuracy": [None] * 7 + [0.5, 0.9, 1.0], "share": [0.0] * 7 + [0.2, 0.2, 0.6]}
+    believed = {"ece": 0.0321, "bins": [None] * 7 + [[0.75, 0.5, 200], [0.85, 0.9, 200], [0.97, 1.0, 600]]}
     write_json(scene.metrics, {"photos": [view.name for view in views], "classes": ["grass", EVIL], "labels": figures, "masks": masks, "reliability": believed})
     record = {"stage": "label", "settings": {"method": EVIL, "consensus": 0.8}, "versions": {"open3d": "0.20.0"}, "seconds": 12.34,
               "peak_memory_mb": 2345, "summary": {"points": 8000, "note": EVIL}, "inputs": {"masks": "abc123"}}
@@ -254,7 +254,7 @@ def test_broken_metrics_are_an_input_error(tmp_path, content):
 @pytest.mark.parametrize("metrics", [
     {}, {"labels": None}, {"labels": {"oa": "high", "iou": [1], "confusion": "x"}}, {"photos": 3, "labels": {"oa": True}},
     {"labels": {"iou": {"a": None}, "confusion": [[1], [2, 3]]}, "per_photo": [1]},
-    {"reliability": {"confidence": [1, 2], "accuracy": [3], "share": []}}, {"reliability": {"confidence": ["x"], "accuracy": [None], "share": [EVIL]}},
+    {"reliability": {"bins": [[1, 2], None]}}, {"reliability": {"ece": EVIL, "bins": [["x", None, EVIL]]}}, {"reliability": {"bins": [None]}},
 ])
 def test_odd_metrics_do_not_fail(tmp_path, metrics):
     write_json(tmp_path / "metrics.json", metrics)

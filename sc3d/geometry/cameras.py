@@ -7,7 +7,7 @@ Poses and rays are float64, so positions of UTM size keep their millimetres.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -57,12 +57,30 @@ class View:
 
         Polynomial distortion folds points from far outside the field of view back into the image; nothing beyond this cone is seen.
         """
+        return float(self._border_rays[:, 2].min())
+
+    @cached_property
+    def frustum(self) -> np.ndarray:
+        """(4, 3) unit normals, camera frame, of planes through the centre; everything in the image lies on their negative side.
+
+        All zero where the field of view is too wide for planes.
+        """
+        rays_cam = self._border_rays
+        if not rays_cam[:, 2].min() > 0.05:
+            return np.zeros((4, 3))
+        slopes = rays_cam[:, :2] / rays_cam[:, 2:]
+        (left, top), (right, bottom) = slopes.min(axis=0), slopes.max(axis=0)
+        planes = np.array([[-1, 0, left], [1, 0, -right], [0, -1, top], [0, 1, -bottom]])
+        return planes / np.linalg.norm(planes, axis=1, keepdims=True)
+
+    @cached_property
+    def _border_rays(self) -> np.ndarray:
         columns, rows = np.arange(0, self.width + 1), np.arange(0, self.height + 1)
         border = np.concatenate([
             np.stack([columns, np.zeros_like(columns)], 1), np.stack([columns, np.full_like(columns, self.height)], 1),
             np.stack([np.zeros_like(rows), rows], 1), np.stack([np.full_like(rows, self.width), rows], 1),
         ])
-        return float(_unit_rays(self.camera, border.astype(np.float64))[:, 2].min())
+        return _unit_rays(self.camera, border.astype(np.float64))
 
     def shifted(self, origin: np.ndarray) -> View:
         """The same view in a world whose origin is moved to `origin` (3,): points there are `points - origin`."""
@@ -115,6 +133,24 @@ def rays(view: View, pixels: np.ndarray | None = None) -> tuple[np.ndarray, np.n
     pixels = pixel_centres(view.width, view.height) if pixels is None else np.asarray(pixels, np.float64)
     directions_cam = _unit_rays(view.camera, pixels)
     return directions_cam @ view.cam_from_world[:3, :3], directions_cam[:, 2]
+
+
+def camera_rays(camera: pycolmap.Camera) -> np.ndarray:
+    """(height * width, 3) float32 unit directions of all pixel centres row by row, camera frame; NaN where the model has no ray.
+
+    Kept for the last few cameras, because photos share cameras and differ by their pose only. Read-only.
+    """
+    return _camera_rays(camera.model_name, camera.width, camera.height, tuple(camera.params))
+
+
+def opencv_parameters(camera: pycolmap.Camera) -> np.ndarray | None:
+    """(8,) fx, fy, cx, cy, k1, k2, p1, p2 of the models that OPENCV contains; None for any other model."""
+    params, model = list(camera.params), camera.model_name
+    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):  # f, cx, cy, k1, k2
+        params = [params[0], *params, 0.0, 0.0]
+    elif model not in ("PINHOLE", "OPENCV"):
+        return None
+    return np.array((params + 4 * [0.0])[:8])
 
 
 def project(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -173,6 +209,18 @@ def resample(image: np.ndarray, view: View, target: View, labels: bool = False) 
 def local_origin(views: list[View]) -> np.ndarray:
     """(3,) whole-number world position near the cameras; subtract it before float32 work."""
     return np.round(np.median([view.centre for view in views], axis=0))
+
+
+@lru_cache(maxsize=2)
+def _camera_rays(model: str, width: int, height: int, params: tuple[float, ...]) -> np.ndarray:
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=list(params))
+    directions = np.empty((height, width, 3), np.float32)
+    step = max(1, 500_000 // width)  # pixels in float64 at a time
+    for row in range(0, height, step):
+        pixels = pixel_centres(width, min(step, height - row)) + [0, row]
+        directions[row : row + step] = _unit_rays(camera, pixels).reshape(-1, width, 3)
+    directions.setflags(write=False)
+    return directions.reshape(-1, 3)
 
 
 def _unit_rays(camera: pycolmap.Camera, pixels: np.ndarray) -> np.ndarray:

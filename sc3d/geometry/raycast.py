@@ -7,14 +7,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
+import numba
 import numpy as np
 import open3d as o3d
 
-from sc3d.geometry.cameras import View, in_image, project, rays
+from sc3d.geometry.cameras import View, camera_rays, in_image, project, rays
 from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, point_spacing
 
+RAYS = 1 << 19  # cast at a time: bounds memory, not results
+DEPTH_STEP = 0.02  # of the range between neighbouring pixels: a discontinuity
 SURFEL_NEIGHBORS = 8
 FLAT, SCATTERED = 0.8, 0.38  # half width of a surfel, in distances to the farthest neighbour
+RANGE_TOLERANCE, MIN_COSINE = 0.005, 0.2  # depth tolerance: share of the range, and the cosine of incidence below which it grows no more
 MAX_ROUGHNESS = 0.12  # mean distance of flat neighbours from the tangent plane, in the same unit
 MIN_SUPPORT = 4  # points around a surfel, itself not counted; fewer: a floater, which blocks nothing
 
@@ -59,15 +64,50 @@ class FirstSurface:
 
 def first_surface(surface: Surface, view: View) -> FirstSurface:
     """Cast the rays of all pixel centres of `view`, by the camera's own model."""
-    directions, ray_z = rays(view)
-    shape = (view.height, view.width)
-    origin = view.centre - surface.origin
-    bundle = np.empty((len(directions), 6), np.float32)
-    bundle[:, :3], bundle[:, 3:] = origin, np.nan_to_num(directions)
-    hit = surface.scene.cast_rays(o3d.core.Tensor(bundle))
-    incidence = np.abs(np.einsum("ij,ij->i", hit["primitive_normals"].numpy(), bundle[:, 3:]))
-    distance = np.where(np.isfinite(ray_z), hit["t_hit"].numpy(), np.float32(np.inf))
-    return FirstSurface(distance.reshape(shape), incidence.reshape(shape), ray_z.astype(np.float32).reshape(shape))
+    directions = camera_rays(view.camera)
+    count, shape = len(directions), (view.height, view.width)
+    distance, incidence = np.empty(count, np.float32), np.empty(count, np.float32)
+    origin = (view.centre - surface.origin).astype(np.float32)
+    bundle = np.empty((min(count, RAYS), 6), np.float32)
+    for start in range(0, count, RAYS):
+        part = slice(start, min(start + RAYS, count))
+        _aim(directions[part], view.cam_from_world, origin, bundle)
+        hit = surface.scene.cast_rays(o3d.core.Tensor.from_numpy(bundle[: part.stop - start]))
+        _measure(directions[part], bundle, hit["t_hit"].numpy(), hit["primitive_normals"].numpy(), distance[part], incidence[part])
+    return FirstSurface(distance.reshape(shape), incidence.reshape(shape), directions[:, 2].reshape(shape))
+
+
+@numba.njit(parallel=True, cache=True)
+def _aim(directions, cam_from_world, origin, bundle):  # noqa: ANN001, ANN202 - numba kernel
+    """Rays (K, 6) from `origin` (3,) along directions (K, 3) turned from the camera into the world; those without direction point nowhere."""
+    for k in numba.prange(len(directions)):
+        x, y, z = np.float64(directions[k, 0]), np.float64(directions[k, 1]), np.float64(directions[k, 2])
+        lost = not np.isfinite(x + y + z)
+        for axis in range(3):
+            bundle[k, axis] = origin[axis]
+            bundle[k, 3 + axis] = 0.0 if lost else x * cam_from_world[0, axis] + y * cam_from_world[1, axis] + z * cam_from_world[2, axis]
+
+
+@numba.njit(parallel=True, cache=True)
+def _measure(directions, bundle, t_hit, normals, distance, incidence):  # noqa: ANN001, ANN202 - numba kernel
+    """Range (K,), infinite without a ray or a hit, and |cosine| (K,) between ray and surface normal."""
+    for k in numba.prange(len(directions)):
+        distance[k] = t_hit[k] if np.isfinite(directions[k, 2]) else np.float32(np.inf)
+        incidence[k] = abs(normals[k, 0] * bundle[k, 3] + normals[k, 1] * bundle[k, 4] + normals[k, 2] * bundle[k, 5])
+
+
+def depth_edge_distance(ranges: np.ndarray) -> np.ndarray:
+    """(H, W) float32 distance of each pixel to the nearest depth discontinuity (a step of more than DEPTH_STEP, or the end of the surface), px.
+
+    ranges: (H, W) float32, inf = nothing hit. Pixels at the step have 0.5; large where there is none.
+    """
+    known = np.where(np.isfinite(ranges), ranges, np.float32(0))
+    kernel = np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(known, kernel), cv2.dilate(known, kernel)
+    smooth = low >= (1 - DEPTH_STEP) * high
+    if smooth.all():
+        return np.full(ranges.shape, np.float32(sum(ranges.shape)))
+    return cv2.distanceTransform(smooth.view(np.uint8), cv2.DIST_L2, 5) + np.float32(0.5)
 
 
 def surface_points(first: FirstSurface, view: View, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -125,7 +165,7 @@ def see_points(view: View, points: np.ndarray, normals: np.ndarray | None, first
     excess = np.zeros(len(inside))
     keep = np.ones(len(inside), bool)
     if first is not None:
-        tolerance = np.maximum(voxel_size, 0.005 * distance) / np.maximum(np.abs(cosine), 0.2)
+        tolerance = np.maximum(voxel_size, RANGE_TOLERANCE * distance) / np.maximum(np.abs(cosine), MIN_COSINE)
         excess = np.maximum(distance - first.range[rows, columns], 0) / tolerance
         keep = (excess <= 1) & (cosine > 0)
     seen = inside[keep]

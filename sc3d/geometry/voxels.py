@@ -7,13 +7,20 @@ Counts are integers: sums of integers do not depend on the order of views, point
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
+import numba
 import numpy as np
 import open3d as o3d
 
 BLOCK = 8
 SIDES = 2
+VOXELS = BLOCK**3  # of a block
+AXIS_BITS = 18  # of a block's position along one axis; three of them and a voxel's 9 bits make one int64
+ORIGIN_SHIFT = 0.381966  # of a voxel, below the smallest coordinate: irrational, so that points on a regular grid do not lie on voxel faces
+FLAT = 0.75  # share of the main axis in the squared normals of a voxel's points; below it they scatter (leaves, corners) and have no two sides
+FIXED = 1 << 20  # products of unit normals as integers
 
 
 class VoxelField:
@@ -29,11 +36,18 @@ class VoxelField:
     @classmethod
     def around(cls, points: np.ndarray, voxel_size: float, num_channels: int) -> VoxelField:
         """An empty field with all blocks that hold one of the (N, 3) points."""
-        origin = np.round(points.min(axis=0)) - 1.0
-        blocks = np.unique(_voxel_keys(points, origin, voxel_size) // BLOCK, axis=0)
-        grid = o3d.t.geometry.VoxelBlockGrid(("votes",), (o3d.core.int32,), ((SIDES * num_channels,),), voxel_size, BLOCK, max(len(blocks), 1))
-        grid.hashmap().activate(o3d.core.Tensor(blocks.astype(np.int32)))
-        return cls(grid, voxel_size, origin, num_channels)
+        return cls.over(sort_by_voxel(points, voxel_size), num_channels)
+
+    @classmethod
+    def over(cls, sorting: VoxelOrder, num_channels: int) -> VoxelField:
+        """An empty field with all blocks of points that are sorted already."""
+        keys = sorting.keys // VOXELS
+        blocks = _unpack(keys[np.flatnonzero(np.diff(keys, prepend=-1))])
+        grid = o3d.t.geometry.VoxelBlockGrid(
+            ("votes",), (o3d.core.int32,), ((SIDES * num_channels,),), sorting.voxel_size, BLOCK, max(len(blocks), 1)
+        )
+        grid.hashmap().activate(o3d.core.Tensor(blocks))
+        return cls(grid, sorting.voxel_size, sorting.origin, num_channels)
 
     @property
     def votes(self) -> np.ndarray:
@@ -42,15 +56,16 @@ class VoxelField:
 
     def find(self, points: np.ndarray, sides: np.ndarray | None = None) -> np.ndarray:
         """(N,) int64 cell of each (N, 3) point; -1 where there is no block. sides: (N,) 0 or 1; None = side 0."""
-        keys = _voxel_keys(points, self.origin, self.voxel_size)
-        blocks, block_of_point = np.unique(keys // BLOCK, axis=0, return_inverse=True)
-        slots, found = self.grid.hashmap().find(o3d.core.Tensor(blocks.astype(np.int32)))
-        slots = np.where(found.numpy(), slots.numpy().astype(np.int64), -1)[block_of_point.ravel()]
-        inside = keys % BLOCK  # the grid's own order in memory: z outermost, x innermost
-        cells = (slots * BLOCK**3 + (inside[:, 2] * BLOCK + inside[:, 1]) * BLOCK + inside[:, 0]) * SIDES
-        if sides is not None:
-            cells = cells + sides
-        return np.where(slots >= 0, cells, -1)
+        keys = voxel_keys(points, self.origin, self.voxel_size)
+        cells = self.find_keys(np.maximum(keys, 0))
+        return np.where((keys >= 0) & (cells >= 0), cells if sides is None else cells + sides, -1)
+
+    def find_keys(self, keys: np.ndarray) -> np.ndarray:
+        """(N,) int64 cell, side 0, of each voxel key (`voxel_keys`); -1 where there is no block."""
+        blocks, block_of_key = np.unique(keys // VOXELS, return_inverse=True)
+        slots, found = self.grid.hashmap().find(o3d.core.Tensor(_unpack(blocks)))
+        slots = np.where(found.numpy(), slots.numpy().astype(np.int64), -1)[block_of_key.ravel()]
+        return np.where(slots >= 0, (slots * VOXELS + keys % VOXELS) * SIDES, -1)
 
     def merge(self, other: VoxelField) -> None:
         """Add the counts of another field of the same origin, voxel size and channels."""
@@ -67,21 +82,120 @@ class VoxelField:
         self.grid.save(str(path))
 
 
-def normal_sides(points: np.ndarray, normals: np.ndarray, origin: np.ndarray, voxel_size: float) -> np.ndarray:
-    """(N,) uint8 side of each point in its voxel: 0 where its normal points along the voxel's main normal axis, else 1.
+@dataclass(frozen=True)
+class VoxelOrder:
+    """N points sorted by block and voxel, so that the V voxels that hold points are contiguous.
 
+    origin: (3,) world position of the grid's zero; voxel_size: world units
+    order: (N,) int64 rows of the points; starts: (V + 1,) int64, voxel v holds order[starts[v] : starts[v + 1]]
+    keys: (V,) int64 voxel keys, rising
+    """
+
+    origin: np.ndarray
+    voxel_size: float
+    order: np.ndarray
+    starts: np.ndarray
+    keys: np.ndarray
+
+
+def sort_by_voxel(points: np.ndarray, voxel_size: float, origin: np.ndarray | None = None) -> VoxelOrder:
+    """Sort (N, 3) world points by voxel. origin: (3,), None = a little below the points, so that moved or scaled worlds fall into the same voxels."""
+    if origin is None:
+        origin = points.min(axis=0) - ORIGIN_SHIFT * voxel_size
+    keys = voxel_keys(points, origin, voxel_size)
+    if len(keys) and keys.min() < 0:
+        raise ValueError(f"voxels of {voxel_size} are too small for the extent of the points: more than {BLOCK << AXIS_BITS} along an axis")
+    order = np.argsort(keys)
+    keys = keys[order]
+    first = np.flatnonzero(np.diff(keys, prepend=-1))
+    return VoxelOrder(np.asarray(origin, np.float64), voxel_size, order, np.append(first, len(keys)), keys[first])
+
+
+def voxel_keys(points: np.ndarray, origin: np.ndarray, voxel_size: float) -> np.ndarray:
+    """(N,) int64 block and voxel of each (N, 3) world point in one number; -1 beyond the grid.
+
+    The voxels of a block follow one another in the grid's own order in memory: z outermost, x innermost.
+    """
+    return _pack(np.ascontiguousarray(points, np.float64), np.asarray(origin, np.float64), voxel_size)
+
+
+def normal_sides(normals: np.ndarray, sorting: VoxelOrder) -> tuple[np.ndarray, np.ndarray]:
+    """Which face of its voxel each point lies on.
+
+    normals: (N, 3) float32 unit, in the points' own order
+    returns: (N,) uint8, 0 where the normal points along the voxel's main normal axis, else 1; (V,) bool voxels whose normals keep to an axis.
     The axis is the largest eigenvector of sum n n^T of the voxel's points, its sign fixed by its largest component.
     """
-    _, voxel_of_point = np.unique(_voxel_keys(points, origin, voxel_size), axis=0, return_inverse=True)
-    voxel_of_point = voxel_of_point.ravel()
-    order = np.lexsort((normals[:, 2], normals[:, 1], normals[:, 0], voxel_of_point))  # fixed order of summation
-    outer = np.einsum("ni,nj->nij", normals[order].astype(np.float64), normals[order]).reshape(-1, 9)
-    starts = np.flatnonzero(np.diff(voxel_of_point[order], prepend=-1))
-    axes = np.linalg.eigh(np.add.reduceat(outer, starts).reshape(-1, 3, 3))[1][:, :, 2]
-    largest = np.take_along_axis(axes, np.abs(axes).argmax(axis=1)[:, None], axis=1)
-    axes = axes * np.sign(largest)
-    return (np.einsum("ij,ij->i", normals, axes[voxel_of_point]) < -0.1).astype(np.uint8)
+    sides, flat = np.empty(len(normals), np.uint8), np.empty(len(sorting.keys), np.bool_)
+    _split_sides(normals, sorting.order, sorting.starts, sides, flat)
+    return sides, flat
 
 
-def _voxel_keys(points: np.ndarray, origin: np.ndarray, voxel_size: float) -> np.ndarray:
-    return np.floor((np.asarray(points, np.float64) - origin) / voxel_size).astype(np.int64)
+@numba.njit(parallel=True, cache=True)
+def _pack(points, origin, voxel_size):  # noqa: ANN001, ANN202 - numba kernel, arrays as in voxel_keys
+    keys = np.empty(len(points), np.int64)
+    for row in numba.prange(len(points)):
+        x = np.int64(np.floor((points[row, 0] - origin[0]) / voxel_size))
+        y = np.int64(np.floor((points[row, 1] - origin[1]) / voxel_size))
+        z = np.int64(np.floor((points[row, 2] - origin[2]) / voxel_size))
+        limit = BLOCK << AXIS_BITS
+        if min(x, y, z) < 0 or max(x, y, z) >= limit:
+            keys[row] = -1
+            continue
+        block = (((x // BLOCK) << AXIS_BITS | y // BLOCK) << AXIS_BITS) | z // BLOCK
+        keys[row] = block * VOXELS + ((z % BLOCK) * BLOCK + y % BLOCK) * BLOCK + x % BLOCK
+    return keys
+
+
+def _unpack(blocks: np.ndarray) -> np.ndarray:
+    """(B, 3) int32 block positions of packed ones (B,)."""
+    mask = (1 << AXIS_BITS) - 1
+    return np.stack([blocks >> 2 * AXIS_BITS, blocks >> AXIS_BITS & mask, blocks & mask], axis=1).astype(np.int32)
+
+
+@numba.njit(parallel=True, cache=True)
+def _split_sides(normals, order, starts, sides, flat):  # noqa: ANN001, ANN202 - numba kernel, arrays as in normal_sides
+    for voxel in numba.prange(len(starts) - 1):
+        xx = xy = xz = yy = yz = zz = 0  # integers: the sums do not depend on the order of the points
+        for k in range(starts[voxel], starts[voxel + 1]):
+            x, y, z = np.float64(normals[order[k], 0]), np.float64(normals[order[k], 1]), np.float64(normals[order[k], 2])
+            xx += np.int64(x * x * FIXED)
+            xy += np.int64(x * y * FIXED)
+            xz += np.int64(x * z * FIXED)
+            yy += np.int64(y * y * FIXED)
+            yz += np.int64(y * z * FIXED)
+            zz += np.int64(z * z * FIXED)
+        x, y, z = main_axis(np.float64(xx), np.float64(xy), np.float64(xz), np.float64(yy), np.float64(yz), np.float64(zz))
+        along = xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
+        flat[voxel] = along >= FLAT * (xx + yy + zz)
+        for k in range(starts[voxel], starts[voxel + 1]):
+            row = order[k]
+            sides[row] = flat[voxel] and normals[row, 0] * x + normals[row, 1] * y + normals[row, 2] * z < -0.1
+
+
+@numba.njit(cache=True)
+def main_axis(xx, xy, xz, yy, yz, zz):  # noqa: ANN001, ANN201 - numba kernel, scalars
+    """Largest eigenvector of a symmetric positive 3 x 3 matrix, given by its upper half; its largest component is positive.
+
+    Squared 6 times, the matrix is the projector on it up to the 64th power of the eigenvalues' ratio.
+    """
+    for _ in range(6):
+        trace = max(xx + yy + zz, 1e-300)
+        xx, xy, xz, yy, yz, zz = xx / trace, xy / trace, xz / trace, yy / trace, yz / trace, zz / trace
+        xx, xy, xz, yy, yz, zz = (
+            xx * xx + xy * xy + xz * xz, xx * xy + xy * yy + xz * yz, xx * xz + xy * yz + xz * zz,
+            xy * xy + yy * yy + yz * yz, xy * xz + yy * yz + yz * zz, xz * xz + yz * yz + zz * zz,
+        )
+    x, y, z = xx, xy, xz  # the column with the largest diagonal
+    if yy > xx and yy >= zz:
+        x, y, z = xy, yy, yz
+    elif zz > xx:
+        x, y, z = xz, yz, zz
+    length = max(np.sqrt(x * x + y * y + z * z), 1e-300)
+    largest = x
+    if abs(y) > abs(largest):
+        largest = y
+    if abs(z) > abs(largest):
+        largest = z
+    length = -length if largest < 0 else length
+    return x / length, y / length, z / length

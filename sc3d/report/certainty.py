@@ -31,10 +31,14 @@ def certainty_section(material: Material) -> str:
 def _reliability(material: Material) -> list[str]:
     """The reliability curve as a list of one block; empty without truth."""
     figures = material.figures("reliability")
-    columns = [figures.get(key) for key in ("confidence", "accuracy", "share")]
-    if not all(isinstance(column, list) for column in columns) or not len(columns[0]) == len(columns[1]) == len(columns[2]) > 0:
+    rows = figures.get("bins")
+    if not isinstance(rows, list) or not any(rows) or not all(row is None or isinstance(row, list) and len(row) == 3 for row in rows):
         return []
-    bins = [tuple(number(value) for value in values) for values in zip(*columns, strict=True)]
+    bins = [(None, None, None) if row is None else tuple(number(value) for value in row) for row in rows]
+    if any(None in row and any(value is not None for value in row) for row in bins):
+        return []
+    pixels = sum(count or 0 for _, _, count in bins)
+    bins = [(confidence, accuracy, count and count / max(pixels, 1)) for confidence, accuracy, count in bins]
     error = number(figures.get("ece"))
     note = "Share of right pixels (dots) against the confidence of their label; on the line, confidence is exactly that share. Bars: share of the pixels."
     if error is not None:

@@ -83,7 +83,7 @@ def reliability_curve(bins: Sequence[tuple[float | None, float | None, float | N
         text = f"confidence {confidence:.2f}: {accuracy:.1%} right, {share:.1%} of the pixels"
         parts.append(f'<circle class="spot" cx="{x:.2f}%" cy="{y:.1f}" r="4.5"><title>{text}</title></circle>')
     for value, y in ((1, 13), (0.5, height / 2 - 4)):
-        parts.append(f'<text class="soft" x="0" y="{y:g}">{value:.0%} right</text>')
+        parts.append(f'<text class="soft" x="0" y="{y:g}">{value:.0%}</text>')
     for place, anchor in ((0, "start"), (0.5, "middle"), (1, "end")):
         parts.append(f'<text class="soft" x="{100 * place}%" y="{height + 16}" text-anchor="{anchor}">{place:g}</text>')
     return _svg("".join(parts), height + 20, "Reliability of the confidence")

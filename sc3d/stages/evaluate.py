@@ -8,11 +8,16 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
+from sc3d.geometry.cameras import View
+from sc3d.geometry.raycast import first_surface, nearest_points
 from sc3d.io import read_index_image, write_json
 from sc3d.labelled import LabelledSurface, read_labelled
-from sc3d.metrics import Confusion, depth_edge_band, total
+from sc3d.metrics import Confusion, JudgedPixels, depth_edge_band, total
 from sc3d.scene import Scene
 from sc3d.settings import Evaluate
+
+SOURCES = ("labels", "masks", "labels_near_edges", "labels_elsewhere")  # order of the figures
+
 
 def inputs(scene: Scene, settings: Evaluate) -> list[Path]:
     return [scene.sparse, scene.classes, scene.masks, scene.mesh, settings.truth or scene.truth, settings.labelled or scene.labelled]
@@ -27,26 +32,40 @@ def run(scene: Scene, settings: Evaluate) -> dict[str, object]:
     scene.require(settings.truth or scene.truth, hint="pass --truth FOLDER with manual masks")
     truth_files = scene.mask_files(settings.truth or scene.truth, class_table)
     mask_files = scene.mask_files(scene.masks, class_table) if scene.masks.is_dir() else {}
-    cloud, _ = read_labelled(settings.labelled or scene.labelled, "propagate")
-    labelled = LabelledSurface.build(cloud, scene.model.views, scene.mesh)
+    cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
+    surface = LabelledSurface.build(cloud, scene.model.views, scene.mesh)
     views = [view for view in scene.model.views if view.name in truth_files]
-    parts: dict[str, list[Confusion]] = {"labels": [], "masks": [], "labels_near_edges": [], "labels_elsewhere": []}
-    per_photo = {}
+    per_photo, pixels = {}, []
     for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
         truth = read_index_image(truth_files[view.name])
-        predicted, first = labelled.see(view, truth.shape[::-1], wanted=truth > 0)
-        band = depth_edge_band(first.range, settings.band)
-        parts["labels"].append(Confusion.of(truth, predicted, class_table.num_ids))
-        parts["labels_near_edges"].append(Confusion.of(np.where(band, truth, 0), predicted, class_table.num_ids))
-        parts["labels_elsewhere"].append(Confusion.of(np.where(band, 0, truth), predicted, class_table.num_ids))
-        if view.name in mask_files:
-            mask = cv2.resize(read_index_image(mask_files[view.name]), truth.shape[::-1], interpolation=cv2.INTER_NEAREST)
-            parts["masks"].append(Confusion.of(truth, mask, class_table.num_ids))
-        per_photo[view.name] = {key: confusions[-1].summary(class_table) for key, confusions in parts.items() if confusions}
-    totals = {key: total(confusions, class_table.num_ids).summary(class_table) for key, confusions in parts.items() if confusions}
-    metrics = {"photos": [view.name for view in views], "classes": [entry.name for entry in class_table]} | totals | {"per_photo": per_photo}
-    write_json(settings.output or scene.metrics, metrics)
-    return _summary(totals)
+        mask = read_index_image(mask_files[view.name]) if view.name in mask_files else None
+        pixels.append(_judged(surface, view, truth, settings.band))
+        per_photo[view.name] = _confusions(pixels[-1], labels.label, class_table.num_ids) | _masks(truth, mask, class_table.num_ids)
+    parts = {key: total((photo[key] for photo in per_photo.values() if key in photo), class_table.num_ids) for key in SOURCES}
+    totals = {key: confusion.summary(class_table) for key, confusion in parts.items() if key != "masks" or mask_files}
+    photos = {name: {key: confusion.summary(class_table) for key, confusion in confusions.items()} for name, confusions in per_photo.items()}
+    believed = JudgedPixels.joined(pixels).reliability(labels.label, labels.confidence).summary() if pixels else {}
+    metrics = {"photos": [view.name for view in views], "classes": [entry.name for entry in class_table]} | totals
+    write_json(settings.output or scene.metrics, metrics | {"reliability": believed, "per_photo": photos})
+    return _summary(totals) | ({"calibration_error": round(believed["ece"], 4)} if believed else {})
+
+
+def _judged(surface: LabelledSurface, view: View, truth: np.ndarray, band: float) -> JudgedPixels:
+    """The pixels of a photo that have truth, and the cloud point that each shows."""
+    sized = view.resized(*truth.shape[::-1])
+    first = first_surface(surface.surface, sized)
+    return JudgedPixels.of(truth, nearest_points(first, sized, surface.index, surface.reach, truth > 0), depth_edge_band(first.range, band))
+
+
+def _confusions(pixels: JudgedPixels, label: np.ndarray, num_ids: int) -> dict[str, Confusion]:
+    near, elsewhere = pixels.confusions(pixels.look_up(label), num_ids)
+    return {"labels": near + elsewhere, "labels_near_edges": near, "labels_elsewhere": elsewhere}
+
+
+def _masks(truth: np.ndarray, mask: np.ndarray | None, num_ids: int) -> dict[str, Confusion]:
+    if mask is None:
+        return {}
+    return {"masks": Confusion.of(truth, cv2.resize(mask, truth.shape[::-1], interpolation=cv2.INTER_NEAREST), num_ids)}
 
 
 def _summary(totals: dict) -> dict[str, object]:

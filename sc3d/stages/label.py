@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sc3d.density import GaussianField, gaussian_density, kernel_density
 from sc3d.errors import InputError
 from sc3d.fusion import SCALE, STATE_NAMES, Cloud, Labels, Mask, fuse
 from sc3d.geometry.cameras import View, local_origin
@@ -20,11 +21,11 @@ logger = logging.getLogger(__name__)
 
 
 def inputs(scene: Scene, settings: Label) -> list[Path]:
-    return [scene.sparse, scene.classes, scene.masks, scene.confidence, scene.mesh, settings.cloud or scene.cloud]
+    return [scene.sparse, scene.classes, scene.masks, scene.confidence, scene.mesh, settings.cloud or scene.cloud, *([scene.gaussians] if settings.density else [])]
 
 
 def outputs(scene: Scene, settings: Label) -> list[Path]:
-    return [settings.output or scene.seeds, scene.votes]
+    return [settings.output or scene.seeds, _votes_file(scene, settings)]
 
 
 def run(scene: Scene, settings: Label) -> dict[str, object]:
@@ -39,12 +40,18 @@ def run(scene: Scene, settings: Label) -> dict[str, object]:
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=_default_voxel_size(points, views, masks))
     surface = read_surface(scene.mesh, points, normals, local_origin(views)) if settings.depth_filter else None
-    fusion = fuse(Cloud(points, normals), views, read_mask, surface, num_ids, settings)
-    with atomic_path(scene.votes) as temporary:
+    density = _density(scene, points, settings.voxel_size) if settings.density else None
+    fusion = fuse(Cloud(points, normals, density), views, read_mask, surface, num_ids, settings)
+    with atomic_path(_votes_file(scene, settings)) as temporary:
         fusion.field.save(temporary)
     votes = fusion.field.votes[fusion.cells].astype(np.float32) / SCALE
     write_geometry(settings.output or scene.seeds, with_labels(cloud, normals, fusion.labels, votes))
     return _summary(fusion.labels, settings.voxel_size, len(views))
+
+
+def _votes_file(scene: Scene, settings: Label) -> Path:
+    """votes.npz, or a name of its own beside --output."""
+    return scene.votes if settings.output is None else settings.output.with_suffix(".votes.npz")
 
 
 def _read(scene: Scene, settings: Label) -> tuple:
@@ -63,6 +70,17 @@ def _read(scene: Scene, settings: Label) -> tuple:
     if not source.exists():
         raise InputError(f"{scene.path} has neither cloud.ply nor mesh.ply: run `sc3d extract SCENE`, or pass --cloud FILE")
     return read_cloud(source), masks, confidences, class_table.num_ids
+
+
+def _density(scene: Scene, points: np.ndarray, voxel_size: float) -> np.ndarray:
+    """(N,) density of the Gaussians at the points, or of the points themselves where there are none."""
+    if not scene.gaussians.exists():
+        return kernel_density(points, voxel_size)
+    from sc3d.splatting.pictures import load_gaussians  # loads torch
+
+    gaussians, origin = load_gaussians(scene)
+    rotations, scales, opacities = (values.numpy() for values in (gaussians.rotations, gaussians.scales, gaussians.opacities))
+    return gaussian_density(points, GaussianField(gaussians.means.numpy().astype(np.float64) + origin, rotations, scales, opacities), voxel_size)
 
 
 def _default_voxel_size(points: np.ndarray, views: list[View], masks: dict[str, Path]) -> float:

@@ -10,7 +10,7 @@ from sc3d.settings import Report
 
 
 def inputs(scene: Scene, settings: Report) -> list[Path]:
-    return [scene.labelled, scene.metrics, scene.sparse, scene.masks, scene.classes, scene.mesh, scene.images]
+    return [scene.labelled, scene.metrics, scene.sparse, scene.masks, scene.classes, scene.mesh, scene.images, scene.path / "train.jpg"]
 
 
 def outputs(scene: Scene, settings: Report) -> list[Path]:

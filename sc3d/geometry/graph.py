@@ -1,0 +1,221 @@
+"""Neighbour graph of a cloud with the joint similarity of eq. 7 as edge weights, in a canonical order of the points.
+
+The points are sorted along a Morton curve first: neighbours are then near in memory, and everything computed on the graph (nearest neighbours of
+equal distance, sums of floats) is the same whatever the order in which the points came.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import scipy.sparse
+
+from sc3d.geometry.neighbors import NeighborIndex, estimate_normals
+
+ALPHA, BETA, GAMMA = 0.6, 0.4, 1.0  # eq. 7
+RADIUS = 3.0  # edges reach this many local point spacings
+SPACING_NEIGHBOR = 4  # the local spacing is the distance to this neighbour
+COLOR_WIDTH = 0.1  # standard deviation of colours on one surface, of 1
+MORTON_BITS = 10
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Symmetric graph of N points. All arrays but `order` are in canonical order.
+
+    order: (N,) int64 row of the cloud of each point of the graph
+    starts, neighbors, weights: CSR arrays (N + 1,) int64, (E,) int32, (E,) float32; every undirected edge is there twice
+    spacing: median local point spacing, world units
+    normals: (N, 3) float32 unit
+    curvature: (N,) float32 of eq. 6; roughness: (N,) float32 mean distance of the neighbours from the tangent plane, over that to the farthest
+    """
+
+    order: np.ndarray
+    starts: np.ndarray
+    neighbors: np.ndarray
+    weights: np.ndarray
+    spacing: float
+    normals: np.ndarray
+    curvature: np.ndarray
+    roughness: np.ndarray
+
+    def sparse(self) -> scipy.sparse.csr_matrix:
+        """(N, N) CSR matrix of the weights, canonical order."""
+        return scipy.sparse.csr_matrix((self.weights, self.neighbors, self.starts), shape=(len(self.order),) * 2)
+
+
+def build_graph(
+    points: np.ndarray, normals: np.ndarray | None, num_neighbors: int, colors: np.ndarray | None = None, ties: tuple[np.ndarray, ...] = ()
+) -> Graph:
+    """Neighbour graph with the joint similarity of eq. 7, times that of colours where given.
+
+    points: (N, 3) world; normals: (N, 3) unit, oriented, or None = estimated and compared up to sign; colors: (N, 3) uint8 or None
+    ties: arrays (N,) that order points of equal position
+    Edges join points closer than RADIUS x the local spacing; a wider gap has no edge. Curvature is over the same neighbours.
+    """
+    local = normalised(points)
+    order = canonical_order(local, ties)
+    local, oriented = local[order], normals is not None
+    neighbors, distances = _others(*NeighborIndex(local).nearest(local, num_neighbors + 1))
+    if oriented:
+        normals = np.ascontiguousarray(normals[order], np.float32)
+    else:
+        normals = estimate_normals(local, neighbors) if neighbors.shape[1] > 2 else np.tile(np.float32([0, 0, 1]), (len(points), 1))
+    bend, roughness = _shape(local, normals, neighbors, distances)
+    shades = np.zeros((len(points), 0), np.float32) if colors is None else colors[order].astype(np.float32) / np.float32(255)
+    reach = RADIUS * np.maximum(distances[:, min(SPACING_NEIGHBOR, distances.shape[1]) - 1], 1e-12) if distances.shape[1] else np.ones(len(points))
+    starts, columns, weights = _link(neighbors, distances, reach.astype(np.float32), normals, bend, shades, oriented)
+    scale = float(np.ptp(points, axis=0).max()) or 1.0
+    return Graph(order, starts, columns, weights, float(np.median(reach)) / RADIUS * scale, normals, bend, roughness)
+
+
+def normalised(points: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 positions in the unit cube: the same for a world in other units or with an offset."""
+    points = np.asarray(points, np.float64)
+    low = points.min(axis=0)
+    return ((points - low) / (float((points.max(axis=0) - low).max()) or 1.0)).astype(np.float32)
+
+
+def canonical_order(points: np.ndarray, ties: tuple[np.ndarray, ...] = ()) -> np.ndarray:
+    """(N,) int64 rows along a Morton curve; within a cell by x, y, z, then by `ties`. points: (N, 3) float32 in the unit cube."""
+    code = _morton((points * np.float32((1 << MORTON_BITS) - 1)).astype(np.int64))
+    keys = (points[:, 2], points[:, 1], points[:, 0], code)
+    order = np.lexsort(keys)
+    moved = points[order]
+    if len(ties) and (moved[1:] == moved[:-1]).all(axis=1).any():
+        order = np.lexsort((*ties, *keys))
+    return order
+
+
+def similarity(normals: np.ndarray, bend: np.ndarray, rows: np.ndarray, columns: np.ndarray, oriented: bool = True) -> np.ndarray:
+    """(E,) float32 weights of eq. 7 for the edges rows-columns: alpha (1 - angle / pi) + beta exp(-gamma |difference of curvature|).
+
+    Without orientation the angle is that of the lines, scaled to the same range.
+    """
+    return _similarities(np.asarray(normals, np.float32), np.asarray(bend, np.float32), rows, columns, oriented)
+
+
+def _morton(cells: np.ndarray) -> np.ndarray:
+    """(N,) interleaved bits of (N, 3) integers of at most 21 bits."""
+    code = np.zeros(len(cells), np.int64)
+    for bit in range(MORTON_BITS):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return code
+
+
+def _others(neighbors: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Neighbours (N, K - 1) and distances without the point itself, which need not come first among coinciding points."""
+    kept = np.empty((len(neighbors), neighbors.shape[1] - 1), np.int32)
+    lengths = np.empty(kept.shape, np.float32)
+    _drop_self(neighbors, distances, kept, lengths)
+    return kept, lengths
+
+
+@numba.njit(cache=True, parallel=True)
+def _drop_self(neighbors, distances, kept, lengths):  # noqa: ANN001, ANN202 - numba kernel, see _others
+    for i in numba.prange(len(neighbors)):
+        position = 0
+        for k in range(neighbors.shape[1]):
+            if neighbors[i, k] != i and position < kept.shape[1]:
+                kept[i, position], lengths[i, position] = neighbors[i, k], distances[i, k]
+                position += 1
+
+
+@numba.njit(cache=True, parallel=True)
+def _shape(points, normals, neighbors, distances):  # noqa: ANN001, ANN202
+    """Curvature (eq. 6, signs aligned as in `neighbors.curvature`) and roughness of each point."""
+    count = neighbors.shape[1]
+    bend, roughness = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
+    for i in numba.prange(len(points)):
+        x, y, z, away = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+        for k in range(count):
+            j = neighbors[i, k]
+            cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
+            sign = np.float32(-1) if cosine < 0 else np.float32(1)
+            x, y, z = x + sign * normals[j, 0], y + sign * normals[j, 1], z + sign * normals[j, 2]
+            away += abs(
+                normals[i, 0] * (points[j, 0] - points[i, 0])
+                + normals[i, 1] * (points[j, 1] - points[i, 1])
+                + normals[i, 2] * (points[j, 2] - points[i, 2])
+            )
+        if count:
+            x, y, z = normals[i, 0] - x / count, normals[i, 1] - y / count, normals[i, 2] - z / count
+            bend[i] = np.sqrt(x * x + y * y + z * z)
+            roughness[i] = away / count / max(distances[i, count - 1], np.float32(1e-12))
+    return bend, roughness
+
+
+@numba.njit(cache=True)
+def _edge(normals, bend, i, j, oriented):  # noqa: ANN001, ANN202 - eq. 7
+    cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
+    cosine = min(max(cosine, np.float32(-1)), np.float32(1))
+    angle = np.arccos(cosine) if oriented else 2 * np.arccos(abs(cosine))
+    return ALPHA * (1 - angle / np.pi) + BETA * np.exp(-GAMMA * abs(bend[i] - bend[j]))
+
+
+@numba.njit(cache=True)
+def _similarities(normals, bend, rows, columns, oriented):  # noqa: ANN001, ANN202
+    result = np.empty(len(rows), np.float32)
+    for edge in range(len(rows)):
+        result[edge] = _edge(normals, bend, rows[edge], columns[edge], oriented)
+    return result
+
+
+@numba.njit(cache=True)
+def _one_way(neighbors, distances, reach, i, k):  # noqa: ANN001, ANN202 - does the other end lack this edge?
+    j = neighbors[i, k]
+    for m in range(neighbors.shape[1]):
+        if neighbors[j, m] == i:
+            return distances[j, m] > reach[j]
+    return True
+
+
+@numba.njit(cache=True)
+def _count_edges(neighbors, distances, reach):  # noqa: ANN001, ANN202
+    starts = np.zeros(len(neighbors) + 1, np.int64)
+    for i in range(len(neighbors)):
+        for k in range(neighbors.shape[1]):
+            if distances[i, k] <= reach[i]:
+                starts[i + 1] += 1
+                if _one_way(neighbors, distances, reach, i, k):
+                    starts[neighbors[i, k] + 1] += 1
+    return np.cumsum(starts)
+
+
+@numba.njit(cache=True)
+def _join(neighbors, distances, reach, starts, columns):  # noqa: ANN001, ANN202
+    filled = starts[:-1].copy()
+    for i in range(len(neighbors)):
+        for k in range(neighbors.shape[1]):
+            if distances[i, k] <= reach[i]:
+                j = neighbors[i, k]
+                columns[filled[i]] = j
+                filled[i] += 1
+                if _one_way(neighbors, distances, reach, i, k):
+                    columns[filled[j]] = i
+                    filled[j] += 1
+
+
+@numba.njit(cache=True, parallel=True)
+def _weigh(starts, columns, normals, bend, shades, oriented, weights):  # noqa: ANN001, ANN202
+    for i in numba.prange(len(starts) - 1):
+        for edge in range(starts[i], starts[i + 1]):
+            j, squared = columns[edge], 0.0
+            for channel in range(shades.shape[1]):
+                squared += (shades[i, channel] - shades[j, channel]) ** 2
+            weights[edge] = _edge(normals, bend, i, j, oriented) * np.exp(-squared / (2 * COLOR_WIDTH**2))
+
+
+def _link(
+    neighbors: np.ndarray, distances: np.ndarray, reach: np.ndarray, normals: np.ndarray, bend: np.ndarray, shades: np.ndarray, oriented: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """CSR arrays of the union of both directions of the edges. Eq. 7 is symmetric to the bit, so each end computes the same weight."""
+    starts = _count_edges(neighbors, distances, reach)
+    columns = np.empty(starts[-1], np.int32)
+    _join(neighbors, distances, reach, starts, columns)
+    weights = np.empty(starts[-1], np.float32)
+    _weigh(starts, columns, normals, bend, shades, oriented, weights)
+    return starts, columns, weights
