@@ -45,9 +45,9 @@ class Extract:
     """TSDF voxel, world units; 0 = 1.5 times the median ground sampling distance, at least box / 2048."""
     min_views: int = 1
     """Neighbour views that must confirm a depth (within 1 px)."""
-    coverage: float = 0.97
+    coverage: float | None = None
     """Holes of the confirmed surface are filled with the depth of single views, the surer first, until this share of all pixels hits a surface: labels
-    need one. 0 = leave holes, 1 = fill whatever can be filled; oblique flights then get floaters."""
+    need one. 0 = leave holes; None = 1 where all photos look the same way (straight down), 0.97 otherwise, as oblique photos see the floaters that it costs."""
     min_opacity: float = 0.3
     """Smallest opacity of a Gaussian whose centre becomes a point (centres)."""
 

@@ -9,7 +9,7 @@ import torch
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.settings import Extract
-from sc3d.splatting.extraction import DepthViews, centre_cloud, extract_surface
+from sc3d.splatting.extraction import DepthViews, centre_cloud, extract_surface, wanted_coverage
 from sc3d.splatting.gaussians import Gaussians
 
 STEP = 0.1
@@ -85,3 +85,10 @@ def test_a_point_before_a_surface_that_others_see_is_blocked():
     assert on_plane.max() == 0
     assert (floating[40:80, 60:100] == 2).all()
     assert blocking(0.8 * flat[0], view, [(torch.zeros_like(flat[1]), others[0])], 0.03).numpy().max() == 0
+
+
+def test_only_flights_that_look_one_way_are_filled_without_limit():
+    ahead, aside = np.array([0.0, 0.0, 12.0]), np.array([9.0, 0.0, 12.0])
+    down = [pinhole_view(f"{row}.jpg", (160, 120), (150, 150, 80, 60), look_at(centre, centre * [1, 1, 0])) for row, centre in enumerate((ahead, aside))]
+    oblique = pinhole_view("o.jpg", (160, 120), (150, 150, 80, 60), look_at(aside, np.zeros(3)))
+    assert wanted_coverage(down) == 1 and wanted_coverage([*down, oblique]) < 1

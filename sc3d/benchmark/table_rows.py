@@ -45,7 +45,7 @@ class Row:
 
 def tables() -> dict[str, list[Row]]:
     """The rows of each table by its title; rows of equal settings are computed once."""
-    ours, default, as_printed = Row(OURS, Label(), GEOMETRY), Row(DEFAULT, Label(), Propagate()), Propagate(method="geometry", verify_seeds=False)
+    ours, default, as_printed = Row(OURS, Label(), GEOMETRY), Row(DEFAULT, Label(), Propagate()), Propagate(method="geometry", verify_seeds=False, color=False)
     return {
         "Table 1: semantic accuracy": [
             Row("direct overlay, no filter", replace(NO_FILTER, method="direct"), None), Row("direct overlay", Label(method="direct"), None),

@@ -29,6 +29,8 @@ MIN_PART = 100  # triangles; smaller components are floaters
 ROUNDS = 4  # of completion, each with every fourth view
 MARGIN = 0.03  # share of the depth by which a surface must lie behind to be another one
 CELLS, AROUND = 64, 6  # cells along the map, and how many of them on each side are around a point
+NADIR_SPREAD = 20.0  # degrees
+OBLIQUE_COVERAGE = 0.97
 LOOSE = 4.0  # px; how far two views may disagree where nothing better is known
 
 
@@ -75,8 +77,9 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
             raise Sc3dError("the views' depths do not agree anywhere: train longer, or lower --min-views")
         parts = [_part(fusion)]
         maps.trust(parts[0][0])
+        wanted = wanted_coverage(data.views) if settings.coverage is None else settings.coverage
         for accept in (_agreed, _unopposed, _plausible):
-            if _coverage(_joined(parts)[0], data.views) >= settings.coverage:
+            if _coverage(_joined(parts)[0], data.views) >= wanted:
                 break
             for turn in range(ROUNDS):
                 parts.append(_complete(maps, _joined(parts)[0], voxel_size, range(turn, len(data.views), ROUNDS), accept))
@@ -90,6 +93,14 @@ def _part(fusion: DepthFusion) -> Part:
     if not len(mesh.triangle.indices):
         return mesh, cloud.select_by_index(o3d.core.Tensor(np.empty(0, np.int64)))
     return mesh, cloud.select_by_mask(o3d.core.Tensor(near_mesh(cloud.point.positions.numpy(), mesh, 0.5 * fusion.voxel_size)))
+
+
+def wanted_coverage(views: list[View]) -> float:
+    """1 where all views look the same way: a wrong depth then moves a point along everybody's line of sight. Else OBLIQUE_COVERAGE."""
+    forward = np.stack([view.cam_from_world[2, :3] for view in views])
+    middle = forward.mean(axis=0)
+    same = (forward @ (middle / np.maximum(np.linalg.norm(middle), 1e-12)) > np.cos(np.deg2rad(NADIR_SPREAD))).all()
+    return 1.0 if same else OBLIQUE_COVERAGE
 
 
 def _coverage(mesh: o3d.t.geometry.TriangleMesh, views: list[View]) -> float:
