@@ -1,14 +1,14 @@
 """Training on scenes made of a few planes and spheres: the depth that comes out is the depth that went in."""
 
-import numba
 import numpy as np
 import pytest
-import torch
 
 from sc3d.geometry.cameras import look_at, pinhole_view, rays
 from sc3d.splatting.evaluation import depth_map
 from sc3d.splatting.settings import TrainSettings
 from sc3d.splatting.train import TrainingData, train
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 SIZE = (96, 64)
 
@@ -75,17 +75,6 @@ def depth_errors(data, depths, **options):
 def valley():
     """z = 0.3 |x|, so that the space above both planes is convex."""
     return [plane([-0.3, 0, 1], 0.0), plane([0.3, 0, 1], 0.0)]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Threads cost more than they give on photos this small."""
-    before = torch.get_num_threads(), numba.get_num_threads()
-    torch.set_num_threads(1)
-    numba.set_num_threads(1)
-    yield
-    torch.set_num_threads(before[0])
-    numba.set_num_threads(before[1])
 
 
 def test_two_planes_have_their_depth():

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import numba
 import numpy as np
 import pytest
 import torch
@@ -21,6 +20,8 @@ from sc3d.splatting.settings import TrainSettings
 from sc3d.splatting.train import TrainingData, TrainResult
 from sc3d.view.flight import flight_path
 from sc3d.view.sheet import contact_sheet, depth_colors, depth_range, half_of, normal_colors, side_by_side, write_training_sheet
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 RED_POINT = np.array([1.3, 0.8, 0.3])  # a lone red Gaussian above the ground; local frame
 GREEN, RED, UP = (60, 140, 50), (230, 20, 20), (128, 128, 255)
@@ -51,17 +52,6 @@ def centre_of_red(image: np.ndarray) -> np.ndarray:
     weight = np.maximum(image[..., 0].astype(float) - 1.2 * image[..., 1] - 60, 0)
     rows, columns = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
     return np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Threads cost more than they give on pictures this small, above all on a busy machine."""
-    before = torch.get_num_threads(), numba.get_num_threads()
-    torch.set_num_threads(1)
-    numba.set_num_threads(1)
-    yield
-    torch.set_num_threads(before[0])
-    numba.set_num_threads(before[1])
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -14,6 +13,8 @@ from sc3d.splatting.initialise import fill_points
 from sc3d.splatting.neighbours import neighbour_views
 from sc3d.splatting.settings import TrainSettings
 from sc3d.splatting.train import TrainingData, train, write_log
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 WIDTH, HEIGHT = 96, 64
 SHORT = TrainSettings(iterations=60, sh_degree=0, max_gaussians=2000, coarse_until=0.2)
@@ -51,17 +52,6 @@ def scene() -> tuple[TrainingData, list[np.ndarray]]:
     points[:, 2] = 0.3 * np.abs(points[:, 0])
     colors = (surface_colour(points) * 255).astype(np.uint8)
     return TrainingData(views, list(photos), points + random.normal(0, 0.05, points.shape), colors), list(depths)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Threads cost more than they give on photos this small, above all on a busy machine."""
-    before = torch.get_num_threads(), numba.get_num_threads()
-    torch.set_num_threads(1)
-    numba.set_num_threads(1)
-    yield
-    torch.set_num_threads(before[0])
-    numba.set_num_threads(before[1])
 
 
 @pytest.mark.parametrize(("plain", "tolerance"), [(True, 0.015), (False, 0.008)])
