@@ -21,8 +21,6 @@ from sc3d.settings import Label
 from sc3d.voting import Ballot, open_ballot
 from sc3d.voting_kernels import SCALE, Picture, Rules
 
-
-
 UNSEEN, SEED, LOCKED, PROPAGATED, UNLOCKED = range(5)  # `state` of a point
 DISTANCE_STEPS = 16  # of a pixel
 STATE_NAMES = ("unseen", "seed", "locked", "propagated", "unlocked")

@@ -141,9 +141,9 @@ def judge_masks(place: Place, masks: Masks) -> tuple[Confusion, Confusion]:
 
 def default_voxel_size(place: Place, masks: Masks) -> float:
     """As `sc3d label` chooses it."""
-    return label_stage._default_voxel_size(place.cloud.points, masks.views, masks.files)
+    return label_stage.default_voxel_size(place.cloud.points, masks.views, masks.files)
 
 
 def with_density(place: Place, voxel_size: float) -> Cloud:
     """The cloud with the density of matter that `sc3d label --density` uses."""
-    return replace(place.cloud, density=label_stage._density(place.scene, place.cloud.points, voxel_size))
+    return replace(place.cloud, density=label_stage.point_density(place.scene, place.cloud.points, voxel_size))

@@ -38,9 +38,9 @@ def run(scene: Scene, settings: Label) -> dict[str, object]:
 
     points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
     if not settings.voxel_size:
-        settings = replace(settings, voxel_size=_default_voxel_size(points, views, masks))
+        settings = replace(settings, voxel_size=default_voxel_size(points, views, masks))
     surface = read_surface(scene.mesh, points, normals, local_origin(views)) if settings.depth_filter else None
-    density = _density(scene, points, settings.voxel_size) if settings.density else None
+    density = point_density(scene, points, settings.voxel_size) if settings.density else None
     fusion = fuse(Cloud(points, normals, density), views, read_mask, surface, num_ids, settings)
     with atomic_path(_votes_file(scene, settings)) as temporary:
         fusion.field.save(temporary)
@@ -72,7 +72,7 @@ def _read(scene: Scene, settings: Label) -> tuple:
     return read_cloud(source), masks, confidences, class_table.num_ids
 
 
-def _density(scene: Scene, points: np.ndarray, voxel_size: float) -> np.ndarray:
+def point_density(scene: Scene, points: np.ndarray, voxel_size: float) -> np.ndarray:
     """(N,) density of the Gaussians at the points, or of the points themselves where there are none."""
     if not scene.gaussians.exists():
         return kernel_density(points, voxel_size)
@@ -83,7 +83,7 @@ def _density(scene: Scene, points: np.ndarray, voxel_size: float) -> np.ndarray:
     return gaussian_density(points, GaussianField(gaussians.means.numpy().astype(np.float64) + origin, rotations, scales, opacities), voxel_size)
 
 
-def _default_voxel_size(points: np.ndarray, views: list[View], masks: dict[str, Path]) -> float:
+def default_voxel_size(points: np.ndarray, views: list[View], masks: dict[str, Path]) -> float:
     """2 point spacings, at least 1.5 times the median size of a mask pixel on the cloud."""
     sample = points[:: max(1, len(points) // 1000)]
     footprints = []
