@@ -25,6 +25,7 @@ STAGES: dict[str, type] = {
     "label": options.Label,
     "propagate": options.Propagate,
     "evaluate": options.Evaluate,
+    "export": options.Export,
     "report": options.Report,
 }
 # commands with arguments of their own

@@ -116,7 +116,11 @@ class LabelledSurface:
         size: (width, height) of the result, px; wanted: (H, W) bool pixels to label, None = all
         returns: (H, W) uint8 ids, 0 = unlabelled or nothing hit; the first surface
         """
+        rows, first = self.rows(view, size, wanted)
+        return np.where(rows >= 0, self.label[rows], 0).astype(np.uint8), first
+
+    def rows(self, view: View, size: tuple[int, int], wanted: np.ndarray | None = None) -> tuple[np.ndarray, FirstSurface]:
+        """The same, as rows of the cloud: (H, W) int, -1 = nothing hit."""
         sized = view.resized(*size)
         first = first_surface(self.surface, sized)
-        rows = nearest_points(first, sized, self.index, self.reach, wanted)
-        return np.where(rows >= 0, self.label[rows], 0).astype(np.uint8), first
+        return nearest_points(first, sized, self.index, self.reach, wanted), first

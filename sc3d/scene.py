@@ -52,6 +52,18 @@ class Scene:
         return self.path / "confidence"
 
     @property
+    def strokes(self) -> Path:
+        return self.path / "strokes"
+
+    @property
+    def instances(self) -> Path:
+        return self.path / "instances"
+
+    @property
+    def export(self) -> Path:
+        return self.path / "export"
+
+    @property
     def truth(self) -> Path:
         return self.path / "truth"
 

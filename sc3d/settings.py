@@ -56,26 +56,40 @@ class Extract:
 class Segment:
     """2D masks for all photos."""
 
-    backend: Literal["files", "grounded-sam"] = "files"
-    """Where masks come from: a folder of index PNGs (--masks), or text prompts with Grounding DINO and SAM."""
+    backend: Literal["files", "strokes", "grounded-sam", "sam3"] = "files"
+    """Where masks come from: files (--masks), a few strokes that you drew (--strokes, no model), or text prompts with Grounding DINO and SAM 2 or with SAM 3."""
     masks: Path | None = None
-    """Folder of masks <photo stem>.png (files)."""
+    """Masks made elsewhere: a folder of PNGs <photo stem>.png, a folder of LabelMe JSONs, a COCO JSON, or a CVAT XML (files)."""
+    format: Literal["auto", "index", "color", "labelme", "coco", "cvat"] = "auto"
+    """Format of --masks (files): index = PNG with one id per pixel, color = PNG in the colours of the class table; auto looks at the files."""
+    mapping: Path | None = None
+    """JSON object of the ids, names or colours in --masks and the classes that they stand for, such as {"wall": "building", "7": "road"} (files)."""
     confidence: Path | None = None
     """Folder of confidence maps <photo stem>.png (files); optional."""
+    strokes: Path | None = None
+    """Folder of strokes and polygons per class, LabelMe JSON or PNG in the colours of the class table; SCENE/strokes otherwise (strokes)."""
     prompts: tuple[str, ...] = ()
-    """Texts per class, each as NAME=text,text (grounded-sam); they replace those of classes.json."""
+    """Texts per class, each as NAME=text,text (grounded-sam, sam3); they replace those of classes.json."""
     model_dir: Path | None = None
     """Folder with downloaded model weights; the hub's cache otherwise."""
     download: bool = False
     """Download weights that are not on this machine."""
     detector: str = "IDEA-Research/grounding-dino-tiny"
-    """Grounding DINO model that finds boxes."""
+    """Grounding DINO model that finds boxes (grounded-sam)."""
     segmenter: str = "facebook/sam2.1-hiera-small"
-    """SAM 2 or SAM 1 model that outlines them."""
+    """SAM 2 or SAM 1 model that outlines them (grounded-sam)."""
+    concept_model: str = "facebook/sam3"
+    """SAM 3 model (sam3)."""
     box_threshold: float = 0.3
-    """Smallest score of a detected box."""
+    """Smallest score of a detected box or concept."""
     text_threshold: float = 0.25
-    """Smallest score of a phrase."""
+    """Smallest score of a phrase (grounded-sam)."""
+    tile: int = 1600
+    """Photos larger than this are also looked at in overlapping tiles of this size, px, so that small things are found; 0 = never (grounded-sam, sam3)."""
+    overlap: float = 0.2
+    """Share of a tile that it has in common with the next."""
+    half: bool = False
+    """Compute in half precision, on a GPU (grounded-sam, sam3)."""
     device: str = "auto"
     """torch device: auto, cpu, cuda."""
 
@@ -156,6 +170,21 @@ class Evaluate:
     """Half width of the band around depth edges that is also reported apart, px."""
     output: Path | None = None
     """Metrics file; SCENE/metrics.json otherwise."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Results for other programs, in SCENE/export."""
+
+    format: tuple[Literal["masks", "laz", "clouds", "splats", "spz", "orthophoto", "objects"], ...] = ("laz",)
+    """What to write. masks: the fused labels as each photo sees them; laz: LAZ 1.4 with ASPRS classes; clouds: one PLY per class; splats, spz: Gaussians
+    with labels; orthophoto: GeoTIFFs of colour, class and height; objects: footprints of buildings and crowns of trees as GeoJSON."""
+    classes: tuple[str, ...] = ()
+    """Names of the classes to write; all otherwise (laz, clouds, splats, spz)."""
+    labelled: Path | None = None
+    """Labelled cloud; SCENE/labelled.ply otherwise."""
+    max_size: int = 0
+    """Longest side of the masks, px; 0 = as the photo (masks)."""
 
 
 @dataclass(frozen=True)

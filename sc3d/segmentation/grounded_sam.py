@@ -14,6 +14,7 @@ from sc3d.classes import ClassTable
 from sc3d.errors import InputError, MissingPackageError
 from sc3d.segmentation.merge import Instance, merge_instances
 from sc3d.segmentation.prompts import Caption, build_captions, list_prompts, match_classes
+from sc3d.segmentation.run import Segmentation
 from sc3d.segmentation.weights import find_weights, model_type
 
 if TYPE_CHECKING:
@@ -70,14 +71,14 @@ class GroundedSam:
             if model_type(path) not in known:
                 raise InputError(f"{path} holds a model of type {model_type(path)!r}; possible here: {', '.join(known)}")
 
-    def segment(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def segment(self, image: np.ndarray) -> Segmentation:
         """Segment a photo.
 
         image: (H, W, 3) uint8 RGB
         returns: (H, W) uint8 class id, 0 = unlabelled; (H, W) uint8 confidence, box score x mask score, 255 = sure, 0 where unlabelled
         """
         boxes, class_ids, box_scores = self.detect(image)
-        return merge_instances(self._outline(image, boxes, class_ids, box_scores), image.shape[:2])
+        return Segmentation(*merge_instances(self._outline(image, boxes, class_ids, box_scores), image.shape[:2]))
 
     def detect(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find boxes of all classes.

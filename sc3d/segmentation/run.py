@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -13,11 +13,18 @@ from sc3d.io import image_size, read_image, write_image
 from sc3d.scene import check_mask_aspect
 
 
+class Segmentation(NamedTuple):
+    """What a backend says of a photo: (H, W) uint8 class id, 0 = unlabelled; (H, W) uint8 confidence, 255 = sure."""
+
+    labels: np.ndarray
+    confidence: np.ndarray
+
+
 class Segmenter(Protocol):
     """What a backend offers."""
 
-    def segment(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Segment an (H, W, 3) uint8 RGB photo: (H, W) uint8 class id, 0 = unlabelled; (H, W) uint8 confidence, 255 = sure."""
+    def segment(self, image: np.ndarray) -> Segmentation:
+        """Segment an (H, W, 3) uint8 RGB photo."""
         ...
 
 

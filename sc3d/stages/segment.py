@@ -14,8 +14,10 @@ from sc3d.settings import Segment
 
 
 def inputs(scene: Scene, settings: Segment) -> list[Path]:
-    given = [path for path in (settings.masks, settings.confidence) if path is not None]
-    return [scene.classes, *(given if settings.backend == "files" else [scene.images])]
+    given = [path for path in (settings.masks, settings.confidence, settings.mapping) if path is not None]
+    if settings.backend == "files":
+        return [scene.classes, *given]
+    return [scene.classes, scene.images, *([settings.strokes or scene.strokes] if settings.backend == "strokes" else [])]
 
 
 def outputs(scene: Scene, settings: Segment) -> list[Path]:
@@ -26,12 +28,10 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
     class_table = scene.class_table()
     if settings.backend == "files":
         return _import(scene, settings, class_table)
-    from sc3d.segmentation.grounded_sam import GroundedSam, GroundedSamSettings
     from sc3d.segmentation.run import segment_photos
 
-    names = GroundedSamSettings.__dataclass_fields__.keys() & Segment.__dataclass_fields__.keys()
     class_table = with_prompts(class_table, settings.prompts)
-    segmenter = GroundedSam(GroundedSamSettings(**{name: getattr(settings, name) for name in names}), class_table)
+    segmenter = _segmenter(scene, settings, class_table)
     # Masks of an interrupted run are gone on with if they were made with the same settings; others are the user's to remove.
     marker, state = scene.path / "segment.unfinished.json", json.loads(json.dumps([repr(settings), class_table.as_json()]))
     if scene.masks.exists() and not (marker.exists() and read_json(marker) == state):
@@ -41,6 +41,21 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
     marker.unlink()
     pixels = {class_table.name(label): int(count) for label, count in enumerate(summary.num_pixels) if count}
     return {"segmented": len(summary.segmented), "already_there": len(summary.skipped)} | {f"pixels_{name}": count for name, count in pixels.items()}
+
+
+def _segmenter(scene: Scene, settings: Segment, class_table: ClassTable):  # noqa: ANN202 - a sc3d.segmentation.run.Segmenter; packages load late
+    if settings.backend == "strokes":
+        from sc3d.segmentation.strokes import Strokes
+
+        return Strokes.learn(settings.strokes or scene.strokes, scene.images, class_table)
+    if settings.backend == "sam3":
+        from sc3d.segmentation.sam3 import Sam3
+
+        return Sam3(settings, class_table)
+    from sc3d.segmentation.grounded_sam import GroundedSam, GroundedSamSettings
+
+    names = GroundedSamSettings.__dataclass_fields__.keys() & Segment.__dataclass_fields__.keys()
+    return GroundedSam(GroundedSamSettings(**{name: getattr(settings, name) for name in names}), class_table)
 
 
 def with_prompts(class_table: ClassTable, prompts: tuple[str, ...]) -> ClassTable:
