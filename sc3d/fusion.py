@@ -91,21 +91,23 @@ def _rules(points: np.ndarray, views: list[View], settings: Label) -> Rules:
 
 
 def _pictures(views: list[View], read_mask: Callable[[View], Mask], surface: Surface | None, settings: Label) -> Iterator[tuple[View, Picture]]:
-    """Views in the order of their names, at the size of their masks, with what they say; the next mask is read meanwhile."""
+    """Views in the order of their names, at the size of their masks, with what they say; the next one is prepared meanwhile."""
     ordered = sorted(views, key=lambda view: view.name)
 
-    def prepare(view: View) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    def prepare(view: View) -> tuple[View, Picture]:
         mask, confidence = read_mask(view)
-        return mask, confidence if settings.use_confidence else None, edge_distance(mask)
+        sized = view.resized(mask.shape[1], mask.shape[0])
+        ranges = np.empty((0, 0), np.float32) if surface is None else first_surface(surface, sized).range
+        return sized, picture_of(mask, confidence if settings.use_confidence else None, edge_distance(mask), ranges, settings)
 
-    with ThreadPoolExecutor(1) as reader:
-        pending = [reader.submit(prepare, view) for view in ordered[:1]]
-        for row, view in enumerate(ordered):
-            mask, confidence, edge = pending.pop().result()
-            pending += [reader.submit(prepare, following) for following in ordered[row + 1 : row + 2]]
-            sized = view.resized(mask.shape[1], mask.shape[0])
-            ranges = np.empty((0, 0), np.float32) if surface is None else first_surface(surface, sized).range
-            yield sized, picture_of(mask, confidence, edge, ranges, settings)
+    with ThreadPoolExecutor(1) as worker:  # what runs on one core only overlaps with the votes of the view before
+        pending = [worker.submit(prepare, view) for view in ordered[:1]]
+        for following in [*ordered[1:], None]:
+            ready = pending.pop().result() if pending else None
+            if following is not None:
+                pending.append(worker.submit(prepare, following))
+            if ready is not None:
+                yield ready
 
 
 def picture_of(mask: np.ndarray, confidence: np.ndarray | None, edge: np.ndarray, ranges: np.ndarray, settings: Label) -> Picture:

@@ -19,6 +19,7 @@ RADIUS = 3.0  # edges reach this many local point spacings
 SPACING_NEIGHBOR = 4  # the local spacing is the distance to this neighbour
 COLOR_WIDTH = 0.1  # standard deviation of colours on one surface, of 1
 MORTON_BITS = 10
+CHUNK = 200_000  # points whose neighbours are held twice at a time
 
 
 @dataclass(frozen=True)
@@ -58,15 +59,20 @@ def build_graph(
     local = normalised(points)
     order = canonical_order(local, ties)
     local, oriented = local[order], normals is not None
-    neighbors, distances = _others(*NeighborIndex(local).nearest(local, num_neighbors + 1))
+    neighbors, distances = _others(local, num_neighbors)
     if oriented:
         normals = np.ascontiguousarray(normals[order], np.float32)
     else:
         normals = estimate_normals(local, neighbors) if neighbors.shape[1] > 2 else np.tile(np.float32([0, 0, 1]), (len(points), 1))
     bend, roughness = _shape(local, normals, neighbors, distances)
-    shades = np.zeros((len(points), 0), np.float32) if colors is None else colors[order].astype(np.float32) / np.float32(255)
     reach = RADIUS * np.maximum(distances[:, min(SPACING_NEIGHBOR, distances.shape[1]) - 1], 1e-12) if distances.shape[1] else np.ones(len(points))
-    starts, columns, weights = _link(neighbors, distances, reach.astype(np.float32), normals, bend, shades, oriented)
+    _cut(neighbors, distances, reach.astype(np.float32))
+    del distances  # as large as all the edges
+    shades = np.zeros((len(points), 0), np.float32) if colors is None else colors[order].astype(np.float32) / np.float32(255)
+    starts, columns = _link(neighbors)
+    del neighbors
+    weights = np.empty(starts[-1], np.float32)
+    _weigh(starts, columns, normals, bend, shades, oriented, weights)
     scale = float(np.ptp(points, axis=0).max()) or 1.0
     return Graph(order, starts, columns, weights, float(np.median(reach)) / RADIUS * scale, normals, bend, roughness)
 
@@ -106,20 +112,23 @@ def _morton(cells: np.ndarray) -> np.ndarray:
     return code
 
 
-def _others(neighbors: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Neighbours (N, K - 1) and distances without the point itself, which need not come first among coinciding points."""
-    kept = np.empty((len(neighbors), neighbors.shape[1] - 1), np.int32)
+def _others(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The `count` nearest others (N, K) int32 of each point and their distances (N, K) float32: a point need not come first among coinciding ones."""
+    index, count = NeighborIndex(points), min(count, len(points) - 1)
+    kept = np.empty((len(points), count), np.int32)
     lengths = np.empty(kept.shape, np.float32)
-    _drop_self(neighbors, distances, kept, lengths)
+    for start in range(0, len(points), CHUNK):
+        part = slice(start, start + CHUNK)
+        _drop_self(*index.nearest(points[part], count + 1), start, kept[part], lengths[part])
     return kept, lengths
 
 
 @numba.njit(cache=True, parallel=True)
-def _drop_self(neighbors, distances, kept, lengths):  # noqa: ANN001, ANN202 - numba kernel, see _others
+def _drop_self(neighbors, distances, first, kept, lengths):  # noqa: ANN001, ANN202 - numba kernel, see _others; rows are points from `first` on
     for i in numba.prange(len(neighbors)):
         position = 0
         for k in range(neighbors.shape[1]):
-            if neighbors[i, k] != i and position < kept.shape[1]:
+            if neighbors[i, k] != first + i and position < kept.shape[1]:
                 kept[i, position], lengths[i, position] = neighbors[i, k], distances[i, k]
                 position += 1
 
@@ -164,43 +173,48 @@ def _similarities(normals, bend, rows, columns, oriented):  # noqa: ANN001, ANN2
     return result
 
 
+@numba.njit(cache=True, parallel=True)
+def _cut(neighbors, distances, reach):  # noqa: ANN001, ANN202 - neighbours out of reach become -1
+    for i in numba.prange(len(neighbors)):
+        for k in range(neighbors.shape[1]):
+            if distances[i, k] > reach[i]:
+                neighbors[i, k] = -1
+
+
 @numba.njit(cache=True)
-def _one_way(neighbors, distances, reach, i, k):  # noqa: ANN001, ANN202 - does the other end lack this edge?
-    j = neighbors[i, k]
+def _one_way(neighbors, i, k):  # noqa: ANN001, ANN202 - does the other end lack this edge?
     for m in range(neighbors.shape[1]):
-        if neighbors[j, m] == i:
-            return distances[j, m] > reach[j]
+        if neighbors[neighbors[i, k], m] == i:
+            return False
     return True
 
 
 @numba.njit(cache=True)
-def _count_edges(neighbors, distances, reach):  # noqa: ANN001, ANN202
+def _link(neighbors):  # noqa: ANN001, ANN202
+    """CSR arrays of the union of both directions of the edges: starts (N + 1,) int64, columns (E,) int32."""
     starts = np.zeros(len(neighbors) + 1, np.int64)
     for i in range(len(neighbors)):
         for k in range(neighbors.shape[1]):
-            if distances[i, k] <= reach[i]:
+            if neighbors[i, k] >= 0:
                 starts[i + 1] += 1
-                if _one_way(neighbors, distances, reach, i, k):
+                if _one_way(neighbors, i, k):
                     starts[neighbors[i, k] + 1] += 1
-    return np.cumsum(starts)
-
-
-@numba.njit(cache=True)
-def _join(neighbors, distances, reach, starts, columns):  # noqa: ANN001, ANN202
-    filled = starts[:-1].copy()
+    starts = np.cumsum(starts)
+    columns, filled = np.empty(starts[-1], np.int32), starts[:-1].copy()
     for i in range(len(neighbors)):
         for k in range(neighbors.shape[1]):
-            if distances[i, k] <= reach[i]:
+            if neighbors[i, k] >= 0:
                 j = neighbors[i, k]
                 columns[filled[i]] = j
                 filled[i] += 1
-                if _one_way(neighbors, distances, reach, i, k):
+                if _one_way(neighbors, i, k):
                     columns[filled[j]] = i
                     filled[j] += 1
+    return starts, columns
 
 
 @numba.njit(cache=True, parallel=True)
-def _weigh(starts, columns, normals, bend, shades, oriented, weights):  # noqa: ANN001, ANN202
+def _weigh(starts, columns, normals, bend, shades, oriented, weights):  # noqa: ANN001, ANN202 - eq. 7 is symmetric to the bit: each end computes the same
     for i in numba.prange(len(starts) - 1):
         for edge in range(starts[i], starts[i + 1]):
             j, squared = columns[edge], 0.0
@@ -208,14 +222,3 @@ def _weigh(starts, columns, normals, bend, shades, oriented, weights):  # noqa: 
                 squared += (shades[i, channel] - shades[j, channel]) ** 2
             weights[edge] = _edge(normals, bend, i, j, oriented) * np.exp(-squared / (2 * COLOR_WIDTH**2))
 
-
-def _link(
-    neighbors: np.ndarray, distances: np.ndarray, reach: np.ndarray, normals: np.ndarray, bend: np.ndarray, shades: np.ndarray, oriented: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """CSR arrays of the union of both directions of the edges. Eq. 7 is symmetric to the bit, so each end computes the same weight."""
-    starts = _count_edges(neighbors, distances, reach)
-    columns = np.empty(starts[-1], np.int32)
-    _join(neighbors, distances, reach, starts, columns)
-    weights = np.empty(starts[-1], np.float32)
-    _weigh(starts, columns, normals, bend, shades, oriented, weights)
-    return starts, columns, weights

@@ -124,22 +124,26 @@ def _map(graph: Graph, known: Evidence, raters: Raters | None, settings: Propaga
             rating = raters.learn(label, examples, known.num_classes)
             if turn and rating is None:
                 break  # too little is sure; what was learned from agreed points stands
-            evidence = (TRUST * likelihood + rating).astype(np.float32)
-            evidence[:, ~offered] = -np.inf
+            rating += np.float32(TRUST) * likelihood
+            rating[:, ~offered], evidence = -np.inf, rating
             belief = mean_field(graph, evidence, settings.smoothness)  # afresh: a sure belief would not move
             label = (belief.argmax(axis=1) + 1).astype(np.uint8)
             examples = (belief.max(axis=1) > SURE) & (known.seeds.num_views > 0)
     label = (belief.argmax(axis=1) + 1).astype(np.uint8)
-    cautious = mean_field(graph, CAUTION * evidence, SUPPORT, belief, steps=1)
+    evidence *= np.float32(CAUTION)
+    cautious = mean_field(graph, evidence, SUPPORT, belief, steps=1)
     return np.where(reachable(graph, start), label, 0).astype(np.uint8), cautious[np.arange(len(label)), label.astype(np.int64) - 1]
 
 
 def vote_likelihood(votes: np.ndarray) -> np.ndarray:
     """(N, C) float32 log-likelihood of the classes 1..C from the votes (N, C + 1); 0 for points without votes."""
     total = votes[:, 1:].sum(axis=1, keepdims=True)
-    shares = (votes[:, 1:] + SMOOTHING) / (total + SMOOTHING * (votes.shape[1] - 1))
-    result = np.log(shares) * np.minimum(1 + total, MAX_EVIDENCE)
-    return (result - result.max(axis=1, keepdims=True)).astype(np.float32)
+    result = votes[:, 1:] + np.float32(SMOOTHING)
+    result /= total + np.float32(SMOOTHING * (votes.shape[1] - 1))
+    np.log(result, out=result)
+    result *= np.minimum(1 + total, np.float32(MAX_EVIDENCE))
+    result -= result.max(axis=1, keepdims=True)
+    return result.astype(np.float32, copy=False)
 
 
 def reachable(graph: Graph, start: np.ndarray) -> np.ndarray:

@@ -53,8 +53,10 @@ def free_energy(graph: Graph, log_likelihood: np.ndarray, belief: np.ndarray, sm
 
 def softmax(values: np.ndarray) -> np.ndarray:
     """(N, C) float32 probabilities of (N, C) logarithms."""
-    shifted = np.exp(values - values.max(axis=1, keepdims=True))
-    return (shifted / shifted.sum(axis=1, keepdims=True)).astype(np.float32)
+    result = values - values.max(axis=1, keepdims=True)
+    np.exp(result, out=result)
+    result /= result.sum(axis=1, keepdims=True)
+    return result.astype(np.float32, copy=False)
 
 
 @numba.njit(cache=True)

@@ -35,28 +35,31 @@ def relief_features(graph: Graph, points: np.ndarray) -> np.ndarray:
 
     points: (N, 3) world, canonical order. Up is the main direction of the normals, so no gravity has to be known.
     """
-    spread = np.einsum("ni,nj->ij", graph.normals.astype(np.float64), graph.normals.astype(np.float64))
+    spread = np.einsum("ni,nj->ij", graph.normals, graph.normals, dtype=np.float64)
     axes = np.linalg.eigh(spread)[1][:, ::-1]
     up = axes[:, 0]
-    leaning = graph.normals.astype(np.float64).sum(axis=0) @ up
+    leaning = graph.normals.sum(axis=0, dtype=np.float64) @ up
     up = up * np.sign(leaning if abs(leaning) > 1e-9 * len(points) else up[np.abs(up).argmax()])
     local = points - points.min(axis=0)
     height, flat = np.einsum("ni,i->n", local, up), np.einsum("ni,ij->nj", local, axes[:, 1:])
+    del local
     flat -= flat.min(axis=0)
-    cell = max(CELL * graph.spacing, float(flat.max()) / MAX_CELLS, 1e-12)
-    lowest = _raster(flat / cell, height)
-    features = [graph.roughness, np.einsum("ni,i->n", graph.normals, up.astype(np.float32))]
-    for window in WINDOWS:
+    flat /= max(CELL * graph.spacing, float(flat.max()) / MAX_CELLS, 1e-12)  # in cells from here on
+    lowest = _raster(flat, height)
+    flat -= 0.5
+    features = np.empty((len(points), 2 + len(WINDOWS)), np.float32)
+    features[:, 0], features[:, 1] = graph.roughness, np.einsum("ni,i->n", graph.normals, up.astype(np.float32))
+    for column, window in enumerate(WINDOWS, 2):
         ground = minimum_filter(lowest, window)
         ground = np.where(np.isfinite(ground), ground, height.min())
-        below = map_coordinates(ground, (flat / cell - 0.5).T, order=1, mode="nearest")  # bilinear: no steps on slopes
-        features.append((height - below) / max(graph.spacing, 1e-12))
-    return np.stack(features, axis=1).astype(np.float32)
+        below = map_coordinates(ground, flat.T, order=1, mode="nearest")  # bilinear: no steps on slopes
+        features[:, column] = (height - below) / max(graph.spacing, 1e-12)
+    return features
 
 
 def _raster(flat: np.ndarray, height: np.ndarray) -> np.ndarray:
-    cells = np.floor(flat).astype(np.int64)
-    shape = cells.max(axis=0) + 1
+    cells = flat.astype(np.int32)
+    shape = cells.max(axis=0).astype(np.int64) + 1
     lowest = np.full(int(shape.prod()), np.inf)
     np.minimum.at(lowest, cells[:, 0] * shape[1] + cells[:, 1], height)
     return lowest.reshape(shape)
@@ -64,7 +67,7 @@ def _raster(flat: np.ndarray, height: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Cells:
-    """The histogram cell of each point: cell (N,) int64, of prod(shape) cells; blur: standard deviation in bins."""
+    """The histogram cell of each point: cell (N,) int32, of prod(shape) cells; blur: standard deviation in bins."""
 
     cell: np.ndarray
     shape: tuple[int, ...]
@@ -74,14 +77,15 @@ class Cells:
     def of(cls, features: np.ndarray, bins: int, blur: float) -> Cells:
         """features: (N, F); bins are quantiles of all points, so that unit and scale do not matter."""
         shape = (bins,) * features.shape[1]
-        cell = np.zeros(len(features), np.int64)
+        cell = np.zeros(len(features), np.int32)
         for values in features.T:
-            cell = cell * bins + np.searchsorted(np.quantile(values, np.arange(1, bins) / bins), values, side="right")
+            cell *= bins
+            cell += np.searchsorted(np.quantile(values, np.arange(1, bins) / bins), values, side="right").astype(np.int32)
         return cls(cell, shape, blur)
 
     def rate(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> np.ndarray:
         """(cells, C) log of the class shares in each cell, learned from the rows `examples` of label (N,) in 1..C."""
-        counts = np.bincount(self.cell[examples] * num_classes + label[examples] - 1, minlength=int(np.prod(self.shape)) * num_classes)
+        counts = np.bincount(self.cell[examples] * num_classes + (label[examples] - 1), minlength=int(np.prod(self.shape)) * num_classes)
         counts = counts.reshape(-1, num_classes).T.reshape(num_classes, *self.shape).astype(np.float64)
         counts = np.stack([gaussian_filter(part, self.blur, mode="nearest", truncate=2.0) for part in counts]).reshape(num_classes, -1).T
         shares = np.bincount(label[examples], minlength=num_classes + 1)[1:] / len(examples)
@@ -115,13 +119,13 @@ class Raters:
         tables = [group.rate(label, rows, num_classes) for group in self.groups]
         result = np.zeros((len(label), num_classes), np.float32)
         for group, table in zip(self.groups, tables, strict=True):
-            result += table.astype(np.float32)[group.cell]
+            for column in range(num_classes):  # one by one: as a whole it would be copied, with millions of points
+                result[:, column] += table[:, column].astype(np.float32)[group.cell]
         result -= ((len(self.groups) - 1) * shares).astype(np.float32)
         result[:, ~known] = -np.inf
-        result -= result.max(axis=1, keepdims=True)
-        result -= np.log(np.exp(result).sum(axis=1, keepdims=True))
+        result -= np.logaddexp.reduce(result, axis=1, keepdims=True)
         result[:, ~known] = UNKNOWN
-        return np.maximum(result, np.float32(np.log(1e-4)))
+        return np.maximum(result, np.float32(np.log(1e-4)), out=result)
 
     def skill(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> float:
         """Share of the errors of the best constant answer that the raters avoid on blocks held out; 0 where they cannot learn. Canonical order."""
