@@ -63,6 +63,11 @@ class Fusion:
     field: VoxelField
     cells: np.ndarray
 
+    @property
+    def votes(self) -> np.ndarray:
+        """(N, num_ids) float32 votes of the points' cells, in views of full weight; column 0 counts views."""
+        return self.field.votes[self.cells].astype(np.float32) / SCALE
+
 
 def fuse(cloud: Cloud, views: list[View], read_mask: Callable[[View], Mask], surface: Surface | None, num_ids: int, settings: Label) -> Fusion:
     """Fuse the masks of all views into labels of the cloud.

@@ -15,7 +15,6 @@ import numpy as np
 from sc3d.benchmark import fusion_rivals as rivals
 from sc3d.benchmark.fusion_page import markdown
 from sc3d.benchmark.publish import check_output, publish
-from sc3d.benchmark.seeds import Seeds, complete
 from sc3d.benchmark.table_scenes import Masks
 from sc3d.errors import InputError
 from sc3d.fusion import Cloud, Fusion, Labels, Mask, fuse
@@ -23,6 +22,7 @@ from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.raycast import Surface
 from sc3d.io import read_cloud, read_mesh
 from sc3d.labelled import point_arrays, read_surface, spacing_of
+from sc3d.propagation import Evidence, complete
 from sc3d.scene import Scene
 from sc3d.settings import BenchmarkFusionSpeed, Label, Propagate
 from sc3d.stages import peak_memory_mb, reset_peak_memory, versions
@@ -101,7 +101,8 @@ def _label(workload: Workload) -> Fusion:
 
 
 def _propagate(workload: Workload, fusion: Fusion) -> Labels:
-    return complete(workload.cloud, workload.colors, Seeds.of(fusion), Propagate(method="map"))
+    evidence = Evidence(workload.cloud.points, fusion.labels, fusion.votes, workload.colors)
+    return complete(evidence, workload.cloud.normals, Propagate(method="map"))
 
 
 def _label_and_propagate(workload: Workload) -> Labels:

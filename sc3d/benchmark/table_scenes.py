@@ -27,6 +27,7 @@ logger = logging.getLogger(__name__)
 LINKS = {"sparse": "sparse", "truth": "truth", "classes.json": "classes.json", "images": "images", "truth.ply": "truth.ply", "cloud.ply": "truth.ply",
          "mesh.ply": "truth_mesh.ply"}
 BAND = 10.0  # px
+FEW = 8  # photos are judged in any case, if there are so many
 
 
 @dataclass(frozen=True)
@@ -107,14 +108,15 @@ def with_masks(scene: Scene, folder: Path, settings: SynthesizeSettings) -> Scen
 
 
 def load_place(scene: Scene, every: int) -> Place:
-    """Load cloud and surface of a scene and find the point that every judged pixel shows, in every `every`th photo that has truth."""
+    """Load cloud and surface of a scene and find the point that every judged pixel shows, in every `every`th photo that has truth (all if they are few)."""
     scene.require(scene.truth, scene.classes, scene.cloud, hint="the tables need a scene with cloud.ply, classes.json and truth masks")
     views, truth_files = scene.model.views, scene.mask_files(scene.truth, scene.class_table())
     cloud = read_cloud(scene.cloud)
     points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
     surface = read_surface(scene.mesh, points, normals, local_origin(views))
     index, reach = NeighborIndex(points), REACH * spacing_of(points)
-    photos = [view for view in views if view.name in truth_files][::every]
+    photos = [view for view in views if view.name in truth_files]
+    photos = photos[:: max(1, min(every, len(photos) // FEW))]
     parts = []
     for view in tqdm(photos, desc=f"judged pixels of {scene.path.name}", unit="photo", disable=None):
         truth = read_index_image(truth_files[view.name])

@@ -17,7 +17,6 @@ import numpy as np
 
 import sc3d
 from sc3d.benchmark.publish import publish
-from sc3d.benchmark.seeds import Seeds, complete
 from sc3d.benchmark.table_page import MASKS, markdown
 from sc3d.benchmark.table_rows import Row, tables
 from sc3d.benchmark.table_scenes import Masks, Place, default_voxel_size, judge_masks, load_place, synthetic_scene, with_density, with_masks
@@ -25,6 +24,7 @@ from sc3d.errors import InputError
 from sc3d.fusion import Cloud, Fusion, Labels, fuse
 from sc3d.io import digest, write_json
 from sc3d.metrics import Confusion
+from sc3d.propagation import Evidence, complete
 from sc3d.scene import Scene
 from sc3d.settings import BenchmarkTables, Label, Propagate, Synthesize
 from sc3d.stages import peak_memory_mb, require_writable, reset_peak_memory, versions
@@ -140,12 +140,12 @@ def _run_variant(place: Place | None, variant: Variant, command: BenchmarkTables
     return figures
 
 
-def _run_row(place: Place, given: tuple[Seeds, dict[str, float]], row: Row) -> dict[str, object]:
-    """given: seeds and what they cost"""
-    seeds, before = given
-    labels, cost = seeds.labels, dict.fromkeys(before, 0.0)
+def _run_row(place: Place, given: tuple[Evidence, dict[str, float]], row: Row) -> dict[str, object]:
+    """given: what fusion left, and what it cost"""
+    evidence, before = given
+    labels, cost = evidence.seeds, dict.fromkeys(before, 0.0)
     if row.propagate is not None:
-        labels, cost = _propagated(place, seeds, row.propagate)
+        labels, cost = _propagated(place, evidence, row.propagate)
     figures = judge(place, labels)
     seconds = {f"{name}_{clock}": spent[clock] for name, spent in (("label", before), ("propagate", cost)) for clock in ("cpu_seconds", "wall_seconds")}
     total = {clock: before[clock] + cost[clock] for clock in ("cpu_seconds", "wall_seconds")}
@@ -167,10 +167,10 @@ def _areas(confusions: tuple[Confusion, Confusion], table) -> dict[str, dict]:  
     return {name: confusion.summary(table) for name, confusion in parts.items()}
 
 
-def _seeds(place: Place, masks: Masks, label: Label) -> tuple[Seeds, dict[str, float]]:
+def _seeds(place: Place, masks: Masks, label: Label) -> tuple[Evidence, dict[str, float]]:
     with _measured() as cost:
         fusion = _fused(place, masks, label)
-    return Seeds.of(fusion), cost
+    return Evidence(place.cloud.points, fusion.labels, fusion.votes, place.colors), cost
 
 
 def _fused(place: Place, masks: Masks, label: Label) -> Fusion:
@@ -178,10 +178,10 @@ def _fused(place: Place, masks: Masks, label: Label) -> Fusion:
     return fuse(cloud, masks.views, masks.read, place.surface if label.depth_filter else None, place.num_ids, label)
 
 
-def _propagated(place: Place, seeds: Seeds, settings: Propagate) -> tuple[Labels, dict[str, float]]:
+def _propagated(place: Place, evidence: Evidence, settings: Propagate) -> tuple[Labels, dict[str, float]]:
     """As `sc3d propagate` does it."""
     with _measured() as cost:
-        labels = complete(place.cloud, place.colors, seeds, settings)
+        labels = complete(evidence, place.cloud.normals, settings)
     return labels, cost
 
 
@@ -190,8 +190,8 @@ def _warm_up(place: Place, masks: Masks) -> None:
     few = slice(None, None, max(1, len(place.cloud.points) // 2000))
     cloud = Cloud(place.cloud.points[few], None if place.cloud.normals is None else place.cloud.normals[few])
     small = replace(place, cloud=cloud, colors=None if place.colors is None else place.colors[few])
-    seeds, _ = _seeds(small, replace(masks, views=masks.views[:1]), Label(voxel_size=1.0))
-    _propagated(small, seeds, Propagate())
+    evidence, _ = _seeds(small, replace(masks, views=masks.views[:1]), Label(voxel_size=1.0))
+    _propagated(small, evidence, Propagate())
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 
 from sc3d.fusion import LOCKED, PROPAGATED, SEED, UNLOCKED, Labels
-from sc3d.geometry.graph import Graph
+from sc3d.geometry.graph import Graph, build_graph
 from sc3d.propagation.front import grow, vote_nearest
 from sc3d.propagation.potts import mean_field, softmax
 from sc3d.propagation.rater import MIN_SKILL, Raters, relief_features
@@ -61,6 +61,13 @@ def tie_breakers(evidence: Evidence, normals: np.ndarray | None) -> tuple[np.nda
     seeds = evidence.seeds
     tables = (part for part in (evidence.votes, evidence.colors, normals) if part is not None)
     return (seeds.label, seeds.state, seeds.num_views, seeds.confidence, *(column for table in tables for column in table.T))
+
+
+def complete(evidence: Evidence, normals: np.ndarray | None, settings: Propagate) -> Labels:
+    """Label the points that have none, on their own neighbour graph. normals: (N, 3) unit, oriented, or None = estimated."""
+    colors = evidence.colors if settings.color else None
+    graph = build_graph(evidence.points, normals, settings.num_neighbors, colors, tie_breakers(evidence, normals))
+    return propagate(graph, evidence, settings)
 
 
 def propagate(graph: Graph, evidence: Evidence, settings: Propagate) -> Labels:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sc3d.density import GaussianField, gaussian_density, kernel_density
 from sc3d.errors import InputError
-from sc3d.fusion import SCALE, STATE_NAMES, Cloud, Labels, Mask, fuse
+from sc3d.fusion import STATE_NAMES, Cloud, Labels, Mask, fuse
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.io import atomic_path, image_size, read_cloud, read_index_image, write_geometry
 from sc3d.labelled import point_arrays, read_surface, spacing_of, with_labels
@@ -44,8 +44,7 @@ def run(scene: Scene, settings: Label) -> dict[str, object]:
     fusion = fuse(Cloud(points, normals, density), views, read_mask, surface, num_ids, settings)
     with atomic_path(_votes_file(scene, settings)) as temporary:
         fusion.field.save(temporary)
-    votes = fusion.field.votes[fusion.cells].astype(np.float32) / SCALE
-    write_geometry(settings.output or scene.seeds, with_labels(cloud, normals, fusion.labels, votes))
+    write_geometry(settings.output or scene.seeds, with_labels(cloud, normals, fusion.labels, fusion.votes))
     return _summary(fusion.labels, settings.voxel_size, len(views))
 
 

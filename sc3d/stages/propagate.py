@@ -10,7 +10,7 @@ from sc3d.errors import InputError
 from sc3d.fusion import PROPAGATED
 from sc3d.io import write_geometry
 from sc3d.labelled import read_labelled, read_votes, with_labels
-from sc3d.propagation import Evidence, build_graph, propagate, tie_breakers
+from sc3d.propagation import Evidence, complete
 from sc3d.scene import Scene
 from sc3d.settings import Propagate
 
@@ -34,9 +34,7 @@ def run(scene: Scene, settings: Propagate) -> dict[str, object]:
     points = cloud.point.positions.numpy().astype(np.float64)
     normals = cloud.point.normals.numpy()
     evidence = Evidence(points, seeds, votes, cloud.point.colors.numpy() if "colors" in cloud.point else None)
-    colors = evidence.colors if settings.color else None
-    graph = build_graph(points, normals, settings.num_neighbors, colors, tie_breakers(evidence, normals))
-    labels = propagate(graph, evidence, settings)
+    labels = complete(evidence, normals, settings)
     write_geometry(settings.output or scene.labelled, with_labels(cloud, normals, labels))
     return {
         "points": len(labels.label),
