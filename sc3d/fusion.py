@@ -15,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from sc3d.geometry.cameras import View
-from sc3d.geometry.raycast import Surface, depth_edge_distance, first_surface
+from sc3d.geometry.raycast import Surface, first_surface
 from sc3d.geometry.voxels import VoxelField
 from sc3d.settings import Label
 from sc3d.voting import Ballot, open_ballot
@@ -26,7 +26,7 @@ DISTANCE_STEPS = 16  # of a pixel
 STATE_NAMES = ("unseen", "seed", "locked", "propagated", "unlocked")
 
 AS_PRINTED = {  # the paper's own choices, whatever the defaults are
-    "consensus": 1.0, "edge_width": 3.0, "depth_edge_width": 0.0, "depth_excess": True, "incidence": True, "range": True, "verify": "lock", "reproject": True,
+    "consensus": 1.0, "edge_width": 3.0, "depth_excess": True, "incidence": True, "range": True, "verify": "lock", "reproject": True,
 }
 
 Mask = tuple[np.ndarray, np.ndarray | None]  # (h, w) uint8 labels; (h, w) uint8 confidence or None
@@ -116,15 +116,13 @@ def _pictures(views: list[View], read_mask: Callable[[View], Mask], surface: Sur
 
 
 def picture_of(mask: np.ndarray, confidence: np.ndarray | None, edge: np.ndarray, ranges: np.ndarray, settings: Label) -> Picture:
-    """Weight of each mask pixel: confidence x distance to the mask's edges x distance to depth edges.
+    """Weight of each mask pixel: confidence x distance to the mask's edges.
 
     mask: (H, W) uint8; confidence: (H, W) uint8 or None; edge: (H, W) float32 px; ranges: (H, W) float32 or (0, 0)
     """
     weights = np.ones(mask.shape, np.float32) if confidence is None else confidence * np.float32(1 / 255)
     if settings.edge_width > 0:
         weigh_distance(edge, distance_weights(settings.edge_width), weights)
-    if settings.depth_edge_width > 0 and ranges.size:
-        weigh_distance(depth_edge_distance(ranges), distance_weights(settings.depth_edge_width), weights)
     return Picture(mask, weights, edge >= settings.edge_width, ranges)
 
 

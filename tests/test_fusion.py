@@ -7,10 +7,10 @@ import pytest
 
 from sc3d.fusion import LOCKED, SEED, UNLOCKED, UNSEEN, Cloud, edge_distance, fuse, picture_of
 from sc3d.geometry.cameras import look_at, pinhole_view
-from sc3d.geometry.raycast import Surface, depth_edge_distance
+from sc3d.geometry.raycast import Surface
 from sc3d.settings import Label
 
-PLAIN = Label(voxel_size=0.2, edge_width=0, depth_edge_width=0, depth_excess=False, incidence=False, range=False, use_confidence=False, verify="no")
+PLAIN = Label(voxel_size=0.2, edge_width=0, depth_excess=False, incidence=False, range=False, use_confidence=False, verify="no")
 
 
 def plane(height: float = 0.0, half: float = 3.0, step: float = 0.1) -> np.ndarray:
@@ -135,18 +135,17 @@ def test_reprojection_unlocks_what_only_mask_edges_disputed():
     assert (again.label[again.state == UNLOCKED] > 0).all()
 
 
-def test_pixel_weights_follow_the_distances_to_mask_and_depth_edges():
+def test_pixel_weights_follow_the_distance_to_mask_edges():
     mask = np.ones((40, 60), np.uint8)
     mask[:, 30:] = 2
     ranges = np.full((40, 60), 50.0, np.float32)
-    ranges[20:] = 60.0
     confidence = np.full((40, 60), 204, np.uint8)
-    edge, depth_edge = edge_distance(mask), depth_edge_distance(ranges)
-    picture = picture_of(mask, confidence, edge, ranges, Label(edge_width=1.5, depth_edge_width=6.0))
-    np.testing.assert_allclose(picture.weights, 0.8 * (1 - np.exp(-edge / 1.5)) * (1 - np.exp(-depth_edge / 6)), atol=0.01)
+    edge = edge_distance(mask)
+    picture = picture_of(mask, confidence, edge, ranges, Label(edge_width=1.5))
+    assert edge[5, 29] == edge[5, 30] == 0.5 and edge[5, 20] == pytest.approx(9.5, abs=0.2)
+    np.testing.assert_allclose(picture.weights, 0.8 * (1 - np.exp(-edge / 1.5)), atol=0.01)
     assert (picture.strict == (edge >= 1.5)).all()
-    assert depth_edge[19, 5] == depth_edge[20, 5] == 0.5 and depth_edge[10, 5] == pytest.approx(9.5, abs=0.2)
-    assert (picture_of(mask, None, edge, ranges, Label(edge_width=0, depth_edge_width=0)).weights == 1).all()
+    assert (picture_of(mask, None, edge, ranges, Label(edge_width=0)).weights == 1).all()
 
 
 def test_a_second_vote_of_a_single_view_unlocks_nothing():

@@ -143,7 +143,7 @@ def test_one_or_two_threads_views_and_points_in_any_order_give_the_same_bits():
     np.testing.assert_array_equal(found.field.votes[found.cells], expected.field.votes[expected.cells][order])
 
 
-@pytest.mark.parametrize("switch", [{"incidence": False}, {"range": False}, {"depth_excess": False}, {"use_confidence": False}, {"edge_width": 0.0}, {"depth_edge_width": 0.0}])
+@pytest.mark.parametrize("switch", [{"incidence": False}, {"range": False}, {"depth_excess": False}, {"use_confidence": False}, {"edge_width": 0.0}])
 def test_every_weight_is_a_switch(switch):
     (cloud, surface), views = world(), views_of("PINHOLE")
     masks = noise_masks(views)

@@ -15,13 +15,13 @@ import numpy as np
 from sc3d.benchmark import fusion_rivals as rivals
 from sc3d.benchmark.fusion_page import markdown
 from sc3d.benchmark.publish import check_output, publish
-from sc3d.benchmark.table_scenes import Masks
 from sc3d.errors import InputError
 from sc3d.fusion import Cloud, Fusion, Labels, Mask, fuse
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.raycast import Surface
 from sc3d.io import read_cloud, read_mesh
 from sc3d.labelled import point_arrays, read_surface, spacing_of
+from sc3d.labelling import Masks
 from sc3d.propagation import Evidence, complete
 from sc3d.scene import Scene
 from sc3d.settings import BenchmarkFusionSpeed, Label, Propagate

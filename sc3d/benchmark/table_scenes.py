@@ -11,15 +11,15 @@ import numpy as np
 from tqdm import tqdm
 
 from sc3d.errors import InputError
-from sc3d.fusion import Cloud, Mask
+from sc3d.fusion import Cloud
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import Surface, first_surface, nearest_points
 from sc3d.io import atomic_path, read_cloud, read_index_image, write_image
 from sc3d.labelled import REACH, point_arrays, read_surface, spacing_of
+from sc3d.labelling import Masks, point_density
 from sc3d.metrics import Confusion, JudgedPixels, depth_edge_band
 from sc3d.scene import Scene
-from sc3d.stages import label as label_stage  # owns the rules for what depends on the scene
 from sc3d.synthetic import SynthesizeSettings, noisy_mask, synthesize
 
 logger = logging.getLogger(__name__)
@@ -49,28 +49,6 @@ class Place:
     @property
     def num_ids(self) -> int:
         return self.scene.class_table().num_ids
-
-
-@dataclass(frozen=True)
-class Masks:
-    """The masks of a scene and the views that have one."""
-
-    files: dict[str, Path]
-    confidences: dict[str, Path]
-    views: list[View]
-
-    @classmethod
-    def of(cls, scene: Scene) -> Masks:
-        """Masks and, if there are any, confidence maps of a scene; checked."""
-        scene.require(scene.masks, hint="the tables need masks")
-        files = scene.mask_files(scene.masks, scene.class_table())
-        confidences = scene.mask_files(scene.confidence) if scene.confidence.is_dir() else {}
-        return cls(files, confidences, [view for view in scene.model.views if view.name in files])
-
-    def read(self, view: View) -> Mask:
-        """As `fuse` wants it."""
-        confidence = self.confidences.get(view.name)
-        return read_index_image(self.files[view.name]), None if confidence is None else read_index_image(confidence)
 
 
 def synthetic_scene(folder: Path, settings: SynthesizeSettings) -> Scene:
@@ -141,11 +119,6 @@ def judge_masks(place: Place, masks: Masks) -> tuple[Confusion, Confusion]:
     return place.judged.confusions(np.concatenate(parts), place.num_ids)
 
 
-def default_voxel_size(place: Place, masks: Masks) -> float:
-    """As `sc3d label` chooses it."""
-    return label_stage.default_voxel_size(place.cloud.points, masks.views, masks.files)
-
-
 def with_density(place: Place, voxel_size: float) -> Cloud:
     """The cloud with the density of matter that `sc3d label --density` uses."""
-    return replace(place.cloud, density=label_stage.point_density(place.scene, place.cloud.points, voxel_size))
+    return replace(place.cloud, density=point_density(place.scene, place.cloud.points, voxel_size))

@@ -19,10 +19,11 @@ import sc3d
 from sc3d.benchmark.publish import publish
 from sc3d.benchmark.table_page import MASKS, markdown
 from sc3d.benchmark.table_rows import Row, tables
-from sc3d.benchmark.table_scenes import Masks, Place, default_voxel_size, judge_masks, load_place, synthetic_scene, with_density, with_masks
+from sc3d.benchmark.table_scenes import Place, judge_masks, load_place, synthetic_scene, with_density, with_masks
 from sc3d.errors import InputError
 from sc3d.fusion import Cloud, Fusion, Labels, fuse
 from sc3d.io import digest, write_json
+from sc3d.labelling import Masks, default_voxel_size
 from sc3d.metrics import Confusion
 from sc3d.propagation import Evidence, complete
 from sc3d.scene import Scene
@@ -31,7 +32,7 @@ from sc3d.stages import peak_memory_mb, require_writable, reset_peak_memory, ver
 
 logger = logging.getLogger(__name__)
 
-APART = ("benchmark", "report", "segmentation", "splatting", "stages", "synthetic", "view", "cli.py", "settings.py", "sfm.py")  # decide no row
+DECIDE = ("geometry", "propagation", "density.py", "fusion.py", "labelled.py", "labelling.py", "verification.py", "voting.py", "voting_kernels.py")  # the rows
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def unique_rows() -> list[Row]:
 def code_digest() -> str:
     """Hash of the sources that decide a row: rows of other code are not mixed in."""
     root = Path(sc3d.__file__).parent
-    files = sorted(file for file in root.rglob("*.py") if file.relative_to(root).parts[0] not in APART)
+    files = sorted(file for file in root.rglob("*.py") if file.relative_to(root).parts[0] in DECIDE)
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
 
@@ -129,7 +130,7 @@ def _run_variant(place: Place | None, variant: Variant, command: BenchmarkTables
             figures["masks"]["bound"] = _areas(place.judged.confusions(place.judged.look_up(place.truth), place.num_ids), table)
         write_json(_file(command, variant, None), figures["masks"])
     _warm_up(place, masks)
-    voxel_size = default_voxel_size(place, masks)
+    voxel_size = default_voxel_size(place.cloud.points, masks)
     for label, rows in groupby(missing, key=lambda row: row.label):
         seeds, cost = _seeds(place, masks, label if label.voxel_size else replace(label, voxel_size=voxel_size))
         for row in rows:

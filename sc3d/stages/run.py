@@ -46,11 +46,12 @@ def check(command: options.Run, segment: options.Segment) -> None:
         raise InputError(f"{classes} is missing: pass --classes FILE (data/classes.json of the sc3d repository is one to start from)")
     class_table = read_classes(classes)
     if segment.backend == "files":
-        folder = segment.masks or Scene(command.scene).masks
-        if not folder.is_dir():
-            raise InputError("--masks FOLDER is needed (or --segment.backend grounded-sam, which makes masks from the prompts in classes.json)")
-        match_masks(folder, sizes, class_table)
-        if segment.confidence is not None:
-            match_masks(segment.confidence, sizes, None)
+        from sc3d.segmentation.files import MaskFiles, check_masks
+
+        masks = segment.masks or Scene(command.scene).masks
+        if not masks.exists():
+            raise InputError("--masks PATH is needed (or --segment.backend strokes or grounded-sam, which make masks)")
+        source = MaskFiles(masks, segment.format, segment.mapping) if segment.masks else MaskFiles(masks, "index")
+        check_masks(source, sizes, class_table, segment.confidence)
     if command.truth is not None:
         match_masks(command.truth, sizes, class_table)
