@@ -26,12 +26,12 @@ class Masks:
     views: list[View]
 
     @classmethod
-    def of(cls, scene: Scene, use_confidence: bool = True) -> Masks:
-        """Masks and confidence maps of a scene, all checked; InputError for what does not fit."""
+    def of(cls, scene: Scene, confidence: Path | None) -> Masks:
+        """Masks of a scene, and confidence maps in a folder if it exists, all checked; InputError for what does not fit."""
         scene.require(scene.classes, hint="pass --classes FILE to `sc3d run`, or copy data/classes.json of the sc3d repository there and edit it")
         scene.require(scene.masks, hint="run `sc3d segment SCENE` first, with --masks if you have some")
         files = scene.mask_files(scene.masks, scene.class_table())
-        confidences = scene.mask_files(scene.confidence) if use_confidence and scene.confidence.is_dir() else {}
+        confidences = scene.mask_files(confidence) if confidence is not None and confidence.is_dir() else {}
         different = next((name for name, path in confidences.items() if name in files and image_size(path) != image_size(files[name])), None)
         if different:
             raise InputError(f"{confidences[different]} has another size than its mask: both must be the same")
@@ -41,6 +41,11 @@ class Masks:
         """As `fuse` wants it."""
         confidence = self.confidences.get(view.name)
         return read_index_image(self.files[view.name]), None if confidence is None else read_index_image(confidence)
+
+
+def best_confidence(scene: Scene) -> Path:
+    """The confidence maps that `segment --refine` made, or else those that came with the masks."""
+    return scene.confidence_refined if scene.confidence_refined.is_dir() else scene.confidence
 
 
 def read_given_cloud(scene: Scene, file: Path | None) -> o3d.t.geometry.PointCloud:

@@ -10,10 +10,13 @@ import numpy as np
 from tqdm import tqdm
 
 from sc3d.fusion import Cloud, Labels, Mask, fuse
-from sc3d.geometry.cameras import View
-from sc3d.labelled import LabelledSurface
+from sc3d.geometry.cameras import View, local_origin
+from sc3d.geometry.neighbors import NeighborIndex
+from sc3d.labelled import REACH, LabelledSurface, point_arrays, read_surface, spacing_of
+from sc3d.labelling import Masks, default_voxel_size, read_given_cloud
 from sc3d.metrics import Confusion, total
 from sc3d.propagation import Evidence, complete
+from sc3d.scene import Scene
 from sc3d.settings import Label, Propagate
 
 logger = logging.getLogger(__name__)
@@ -47,6 +50,16 @@ class Material:
         """(H, W) uint8 labels and (H, W) float32 confidences, 0 to 1, as a photo of (width, height) sees them."""
         rows, _ = self.seen.rows(view, size)
         return np.where(rows >= 0, labels.label[rows], 0).astype(np.uint8), np.where(rows >= 0, labels.confidence[rows], 0).astype(np.float32)
+
+
+def material_of(scene: Scene, masks: Masks) -> Material:
+    """What refinement needs of a scene, with the default settings of `label` and `propagate`."""
+    cloud = read_given_cloud(scene, None)
+    points, normals = point_arrays(cloud, np.array([view.centre for view in masks.views]))
+    surface = read_surface(scene.mesh, points, normals, local_origin(masks.views))
+    seen = LabelledSurface(surface, NeighborIndex(points), np.zeros(len(points), np.uint8), REACH * spacing_of(points))
+    colors = cloud.point.colors.numpy() if "colors" in cloud.point else None
+    return Material(Cloud(points, normals), colors, seen, scene.class_table().num_ids, Label(voxel_size=default_voxel_size(points, masks)))
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,10 @@ class Scene:
         return self.path / "confidence"
 
     @property
+    def confidence_refined(self) -> Path:
+        return self.path / "confidence_refined"
+
+    @property
     def strokes(self) -> Path:
         return self.path / "strokes"
 

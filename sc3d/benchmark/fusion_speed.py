@@ -60,7 +60,7 @@ def run_fusion_speed(command: BenchmarkFusionSpeed) -> None:
     scene = Scene(command.scene)
     hint = "the benchmark needs cloud.ply, mesh.ply and masks; `sc3d benchmark tables` makes such scenes"
     scene.require(scene.cloud, scene.mesh, scene.masks, scene.classes, hint=hint)
-    load, masks = os.getloadavg()[0], Masks.of(scene)
+    load, masks = os.getloadavg()[0], Masks.of(scene, scene.confidence)
     workload = _workload(scene, masks, command.points[0])
     _label_and_propagate(_cut(workload, 2000, 2))  # compiles
     compared = min(40, len(masks.views))

@@ -122,7 +122,7 @@ def _run_variant(place: Place | None, variant: Variant, command: BenchmarkTables
     missing = [row for row in unique_rows() if row.key not in figures]
     if "masks" in figures and not missing:
         return figures
-    masks = Masks.of(variant.scene)
+    masks = Masks.of(variant.scene, variant.scene.confidence)
     if "masks" not in figures:
         table = variant.scene.class_table()
         figures["masks"] = {"name": MASKS} | _areas(judge_masks(place, masks), table)

@@ -11,13 +11,13 @@ from sc3d.fusion import STATE_NAMES, Cloud, Labels, fuse
 from sc3d.geometry.cameras import local_origin
 from sc3d.io import atomic_path, write_geometry
 from sc3d.labelled import point_arrays, read_surface, with_labels
-from sc3d.labelling import Masks, default_voxel_size, point_density, read_given_cloud
+from sc3d.labelling import Masks, best_confidence, default_voxel_size, point_density, read_given_cloud
 from sc3d.scene import Scene
 from sc3d.settings import Label
 
 
 def inputs(scene: Scene, settings: Label) -> list[Path]:
-    return [scene.sparse, scene.classes, scene.masks, scene.confidence, scene.mesh, settings.cloud or scene.cloud, *([scene.gaussians] if settings.density else [])]
+    return [scene.sparse, scene.classes, scene.masks, best_confidence(scene), scene.mesh, settings.cloud or scene.cloud, *([scene.gaussians] if settings.density else [])]
 
 
 def outputs(scene: Scene, settings: Label) -> list[Path]:
@@ -25,7 +25,7 @@ def outputs(scene: Scene, settings: Label) -> list[Path]:
 
 
 def run(scene: Scene, settings: Label) -> dict[str, object]:
-    masks, cloud = Masks.of(scene, settings.use_confidence), read_given_cloud(scene, settings.cloud)
+    masks, cloud = Masks.of(scene, best_confidence(scene) if settings.use_confidence else None), read_given_cloud(scene, settings.cloud)
     views = masks.views
     points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
     if not settings.voxel_size:

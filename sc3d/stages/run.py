@@ -28,8 +28,8 @@ def main(command: options.Run) -> None:
         with atomic_path(scene.classes) as temporary:
             shutil.copyfile(command.classes, temporary)
     stages = [
-        ("reconstruct", command.reconstruct), ("train", command.train), ("extract", command.extract), ("segment", segment),
-        ("label", command.label), ("propagate", command.propagate),
+        ("reconstruct", command.reconstruct), ("train", command.train), ("extract", command.extract), ("segment", replace(segment, refine=False)),
+        *([("segment", options.Segment(refine=True))] if segment.refine else []), ("label", command.label), ("propagate", command.propagate),
     ]
     if command.truth is not None:
         stages.append(("evaluate", options.Evaluate(truth=command.truth)))
