@@ -1,4 +1,4 @@
-"""Masks: the rules that need no model, the folder backend, and the text-prompted backend on tiny random-weight models."""
+"""Masks: the rules that need no model, the folder backend, photo by photo, and where weights are looked for."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +15,16 @@ from sc3d.classes import parse_classes
 from sc3d.errors import InputError, MissingPackageError
 from sc3d.io import read_index_image, write_image
 from sc3d.segmentation.files import import_masks
-from sc3d.segmentation.grounded_sam import GroundedSam, GroundedSamSettings
-from sc3d.segmentation.merge import Instance, merge_instances
-from sc3d.segmentation.prompts import Caption, Prompt, build_captions, list_prompts, match_classes
-from sc3d.segmentation.run import segment_photos
+from sc3d.segmentation.grounded_sam import GroundedSam
+from sc3d.segmentation.instances import Instance
+from sc3d.segmentation.merge import Areas, fill_gaps, merge_instances, paint, paint_areas
+from sc3d.segmentation.models import check_settings
+from sc3d.segmentation.prompts import Caption, Prompt, build_captions, list_prompts, match_prompts
+from sc3d.segmentation.run import Folders, Segmentation, segment_photos
+from sc3d.segmentation.runs import Window
+from sc3d.segmentation.sam3 import Sam3
 from sc3d.segmentation.weights import find_weights
+from sc3d.settings import Segment
 
 TABLE = parse_classes(
     [
@@ -32,28 +36,17 @@ TABLE = parse_classes(
 )
 
 
-@pytest.fixture
-def models(tiny_models: Path) -> Iterator[Path]:
-    """The tiny models, on one thread: threads would wait for one another longer than they compute, above all on a busy machine."""
-    import torch
-
-    num_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield tiny_models
-    torch.set_num_threads(num_threads)
-
-
 # ---- merging
 
 
-def _merge_slowly(instances: list[Instance], shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def _merge_slowly(found: list[tuple[np.ndarray, Instance]], shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """The rule as it is written, pixel by pixel."""
     label, confidence = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     for row, column in np.ndindex(*shape):
-        covering = [instance for instance in instances if instance.mask[row, column] and instance.score > 0]
+        covering = [(mask, instance) for mask, instance in found if mask[row, column] and instance.box_score * instance.mask_score > 0]
         if covering:
-            winner = min(covering, key=lambda instance: (-instance.score, instance.mask.sum(), instance.class_id))
-            label[row, column], confidence[row, column] = winner.class_id, max(1, round(255 * winner.score))
+            _, winner = min(covering, key=lambda pair: (-pair[1].box_score * pair[1].mask_score, pair[0].sum(), pair[1].class_id))
+            label[row, column], confidence[row, column] = winner.class_id, max(1, round(255 * winner.box_score * winner.mask_score))
     return label, confidence
 
 
@@ -62,13 +55,11 @@ def test_merge_equals_reference_in_any_order():
     for _ in range(20):
         shape = (int(random.integers(1, 9)), int(random.integers(1, 9)))
         # Few different scores and areas, so that ties of every kind occur
-        instances = [
-            Instance(random.random(shape) < random.choice([0.3, 0.6]), int(random.integers(1, 256)), *random.choice([0.0, 0.25, 0.5, 1.0], 2))
-            for _ in range(int(random.integers(0, 9)))
-        ]
-        expected = _merge_slowly(instances, shape)
+        masks = [random.random(shape) < random.choice([0.0, 0.3, 0.6]) for _ in range(int(random.integers(0, 9)))]
+        found = [(mask, Instance.from_mask(mask, int(random.integers(1, 256)), *random.choice([0.0, 0.25, 0.5, 1.0], 2))) for mask in masks]
+        expected = _merge_slowly(found, shape)
         for _ in range(6):
-            result = merge_instances((instances[index] for index in random.permutation(len(instances))), shape)
+            result = merge_instances([found[number][1] for number in random.permutation(len(found))], shape)
             np.testing.assert_array_equal(result, expected)
             assert result[0].dtype == result[1].dtype == np.uint8
 
@@ -76,26 +67,54 @@ def test_merge_equals_reference_in_any_order():
 def test_merge_ties_by_area_then_class():
     whole, half = np.ones((2, 4), bool), np.zeros((2, 4), bool)
     half[:, :2] = True
-    label, confidence = merge_instances([Instance(whole, 1, 0.5, 0.8), Instance(half, 9, 0.8, 0.5), Instance(half.copy(), 4, 0.5, 0.8)], (2, 4))
+    instances = [Instance.from_mask(whole, 1, 0.5, 0.8), Instance.from_mask(half, 9, 0.8, 0.5), Instance.from_mask(half, 4, 0.5, 0.8)]
+    label, confidence = merge_instances(instances, (2, 4))
     assert label.tolist() == [[4, 4, 1, 1]] * 2
     assert (confidence == round(255 * 0.4)).all()
 
 
 def test_merge_ignores_worthless_and_marks_faint_instances():
     mask = np.ones((1, 2), bool)
-    label, confidence = merge_instances([Instance(mask, 3, 0.9, float("nan")), Instance(mask, 3, 0.9, -0.1)], (1, 2))
+    label, confidence = merge_instances([Instance.from_mask(mask, 3, 0.9, float("nan")), Instance.from_mask(mask, 3, 0.9, -0.1)], (1, 2))
     assert not label.any() and not confidence.any()
-    label, confidence = merge_instances([Instance(mask, 3, 0.01, 0.01)], (1, 2))
+    label, confidence = merge_instances([Instance.from_mask(mask, 3, 0.01, 0.01)], (1, 2))
     assert (label == 3).all() and (confidence == 1).all()
-    assert merge_instances([Instance(mask, 3, 1.0, 1.03)], (1, 2))[1].max() == 255
+    assert merge_instances([Instance.from_mask(mask, 3, 1.0, 1.03)], (1, 2))[1].max() == 255
     with pytest.raises(InputError, match="photo"):
-        merge_instances([Instance(mask, 3, 1.0, 1.0)], (2, 1))
+        merge_instances([Instance.from_mask(mask, 3, 1.0, 1.0)], (2, 1))
+
+
+def test_areas_equal_reference_and_fill_only_gaps():
+    """The highest confidence of all concepts and looks wins, the lower class at equal ones, in any order; instances keep their pixels."""
+    random, shape = np.random.default_rng(2), (7, 9)
+    for _ in range(30):
+        maps = [(int(class_id), random.integers(0, 4, shape).astype(np.uint8)) for class_id in random.integers(1, 5, 4)]
+        tile = (int(random.integers(0, 3)), int(random.integers(0, 4)))
+        window = Window(tile[1], tile[0], tile[1] + 4, tile[0] + 3)
+        part = Areas(random.integers(1, 5, (3, 4)).astype(np.uint8), random.integers(0, 4, (3, 4)).astype(np.uint8))
+        part.labels[part.confidence == 0] = 0
+        expected = np.zeros((2, *shape), np.uint8)
+        for row, column in np.ndindex(*shape):
+            said = [(-int(values[row, column]), class_id) for class_id, values in maps if values[row, column]]
+            if window.top <= row < window.bottom and window.left <= column < window.right and part.confidence[row - window.top, column - window.left]:
+                said.append((-int(part.confidence[row - window.top, column - window.left]), int(part.labels[row - window.top, column - window.left])))
+            if said:
+                expected[:, row, column] = min(said)[1], -min(said)[0]
+        areas = Areas(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8))
+        steps = [lambda value=value: paint(areas, *value, Window(0, 0, 9, 7)) for value in maps] + [lambda: paint_areas(areas, part, window)]
+        for number in random.permutation(len(steps)):
+            steps[number]()
+        np.testing.assert_array_equal(areas, expected)
+        labels = np.where(random.random(shape) < 0.5, 9, 0).astype(np.uint8)
+        filled, confidence = labels.copy(), labels * 3
+        fill_gaps(filled, confidence, areas)
+        np.testing.assert_array_equal([filled, confidence], np.where(labels > 0, np.array([labels, labels * 3]), expected))
 
 
 # ---- prompts
 
 # [CLS] building . parking lot . parking garage . road . [SEP]
-CAPTION = Caption(list(range(12)), [(1, 2), (3, 5), (6, 8), (9, 10)], [1, 2, 7, 3])
+CAPTION = Caption(list(range(12)), [(1, 2), (3, 5), (6, 8), (9, 10)], [Prompt(str(class_id), class_id) for class_id in (1, 2, 7, 3)])
 
 
 @pytest.mark.parametrize(
@@ -111,26 +130,27 @@ CAPTION = Caption(list(range(12)), [(1, 2), (3, 5), (6, 8), (9, 10)], [1, 2, 7, 
         ([0, 0.29, 0, 0.9, 0, 0, 0, 0, 0, 0.1, 0, 0], 2, 0.9),  # only prompts above the box threshold are candidates
     ],
 )
-def test_match_classes(scores, expected, score):
-    class_ids, box_scores = match_classes(np.array([scores]), CAPTION, 0.3, 0.25)
-    assert class_ids.tolist() == [expected] and class_ids.dtype == np.uint8
+def test_match_prompts(scores, expected, score):
+    numbers, box_scores = match_prompts(np.array([scores]), CAPTION, 0.3, 0.25)
+    assert [CAPTION.prompts[number].class_id if number >= 0 else 0 for number in numbers] == [expected]
     assert box_scores == pytest.approx([score])
 
 
-def test_match_classes_does_not_depend_on_prompt_order():
+def test_match_prompts_does_not_depend_on_prompt_order():
     random = np.random.default_rng(0)
     scores = random.choice([0.1, 0.28, 0.5, 0.8], (200, 12))
-    expected = match_classes(scores, CAPTION, 0.3, 0.25)[0]
+    expected = match_prompts(scores, CAPTION, 0.3, 0.25)[0]
     for order in (random.permutation(4) for _ in range(10)):
-        shuffled = Caption(CAPTION.token_ids, [CAPTION.spans[index] for index in order], [CAPTION.class_ids[index] for index in order])
-        np.testing.assert_array_equal(match_classes(scores, shuffled, 0.3, 0.25)[0], expected)
-    assert match_classes(np.zeros((0, 12)), CAPTION, 0.3, 0.25)[0].shape == (0,)
+        shuffled = Caption(CAPTION.token_ids, [CAPTION.spans[number] for number in order], [CAPTION.prompts[number] for number in order])
+        numbers = match_prompts(scores, shuffled, 0.3, 0.25)[0]
+        np.testing.assert_array_equal(np.where(numbers >= 0, order[numbers], -1), expected)
+    assert match_prompts(np.zeros((0, 12)), CAPTION, 0.3, 0.25)[0].shape == (0,)
 
 
-def test_match_classes_needs_a_word_above_both_thresholds():
+def test_match_prompts_needs_a_word_above_both_thresholds():
     scores = np.array([[0, 0.5, 0, 0, 0, 0, 0, 0, 0, 0.5, 0, 0]])
-    class_ids, box_scores = match_classes(scores, CAPTION, 0.3, 0.6)
-    assert not class_ids.any() and not box_scores.any()
+    numbers, box_scores = match_prompts(scores, CAPTION, 0.3, 0.6)
+    assert (numbers == -1).all() and not box_scores.any()
 
 
 def test_list_prompts():
@@ -148,11 +168,11 @@ def test_list_prompts():
 def test_captions_fit_the_text_length():
     tokens = [(Prompt(str(index), index), [10 * index + word for word in range(index)]) for index in range(1, 6)]
     captions = build_captions(tokens, 101, 1012, 102, 9)
-    assert [id for caption in captions for id in caption.class_ids] == [1, 2, 3, 4, 5]
+    assert [prompt.class_id for caption in captions for prompt in caption.prompts] == [1, 2, 3, 4, 5]
     for caption in captions:
         assert len(caption.token_ids) <= 9 and caption.token_ids[0] == 101 and caption.token_ids[-2:] == [1012, 102]
-        for (first, last), class_id in zip(caption.spans, caption.class_ids, strict=True):
-            assert caption.token_ids[first:last] == tokens[class_id - 1][1] and caption.token_ids[last] == 1012
+        for (first, last), prompt in zip(caption.spans, caption.prompts, strict=True):
+            assert caption.token_ids[first:last] == tokens[prompt.class_id - 1][1] and caption.token_ids[last] == 1012
     with pytest.raises(InputError, match="shorten"):
         build_captions(tokens, 101, 1012, 102, 7)
 
@@ -247,16 +267,16 @@ def _assert_refused(tmp_path: Path, source: Path, message: str, confidence: Path
 class _Halves:
     """Segmenter that labels the left half, and fails at the photo number `broken`."""
 
-    def __init__(self, broken: int | None = None) -> None:
-        self.num_calls, self.broken = 0, broken
+    def __init__(self, broken: int | None = None, instances: bool = False) -> None:
+        self.num_calls, self.broken, self.instances = 0, broken, instances
 
-    def segment(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def segment(self, image: np.ndarray) -> Segmentation:
         self.num_calls += 1
         if self.num_calls == self.broken:
             raise KeyboardInterrupt
         label = np.zeros(image.shape[:2], np.uint8)
         label[:, : image.shape[1] // 2] = 2
-        return label, label * 100
+        return Segmentation(label, label * 100, (Instance.from_mask(label > 0, 2, 0.8, 0.5, "road"),) if self.instances else None)
 
 
 def _write_photos(folder: Path, num_photos: int = 2) -> list[Path]:
@@ -268,47 +288,71 @@ def _write_photos(folder: Path, num_photos: int = 2) -> list[Path]:
 
 
 def test_segment_photos_resumes(tmp_path):
-    photos, masks, maps = _write_photos(tmp_path / "images", 3), tmp_path / "masks", tmp_path / "confidence"
+    photos, folders = _write_photos(tmp_path / "images", 3), _folders(tmp_path)
     with pytest.raises(KeyboardInterrupt):
-        segment_photos(photos, masks, maps, _Halves(broken=2))
-    assert [file.name for file in masks.iterdir()] == ["photo0.png"]
+        segment_photos(photos, folders, _Halves(broken=2), TABLE)
+    assert [file.name for file in folders.masks.iterdir()] == ["photo0.png"]
     segmenter = _Halves()
-    summary = segment_photos(photos, masks, maps, segmenter)
+    summary = segment_photos(photos, folders, segmenter, TABLE)
     assert (summary.segmented, summary.skipped) == (["photo1.jpg", "photo2.jpg"], ["photo0.jpg"]) and segmenter.num_calls == 2
-    assert summary.num_pixels.sum() == 80 * (64 + 80) and summary.num_pixels[2] == 40 * (64 + 80)
-    assert read_index_image(masks / "photo2.png").shape == (80, 80) and (read_index_image(maps / "photo2.png")[:, :40] == 200).all()
-    assert segment_photos(photos, masks, maps, segmenter).segmented == [] and segmenter.num_calls == 2
-    assert len(segment_photos(photos, masks, maps, segmenter, overwrite=True).segmented) == 3
+    assert summary.num_pixels.sum() == 80 * (64 + 80) and summary.num_pixels[2] == 40 * (64 + 80) and summary.num_instances == 0
+    assert read_index_image(folders.masks / "photo2.png").shape == (80, 80)
+    assert (read_index_image(folders.confidence / "photo2.png")[:, :40] == 200).all() and not folders.instances.exists()
+    assert segment_photos(photos, folders, segmenter, TABLE).segmented == [] and segmenter.num_calls == 2
+    assert len(segment_photos(photos, folders, segmenter, TABLE, overwrite=True).segmented) == 3
+
+
+def test_instances_are_written_and_do_not_outlive_their_mask(tmp_path):
+    photos, folders = _write_photos(tmp_path / "images"), _folders(tmp_path)
+    assert segment_photos(photos, folders, _Halves(instances=True), TABLE).num_instances == 2
+    content = json.loads((folders.instances / "photo1.json").read_text())
+    assert content["images"][0] == {"id": 1, "file_name": "photo1.jpg", "width": 80, "height": 64}
+    (annotation,) = content["annotations"]
+    assert (annotation["category_id"], annotation["name"], annotation["prompt"], annotation["score"]) == (2, "road", "road", 0.4)
+    assert annotation["bbox"] == [0, 0, 40, 64] and annotation["segmentation"]["size"] == [64, 80]
+    segment_photos(photos, folders, _Halves(), TABLE, overwrite=True)
+    assert not list(folders.instances.iterdir())
 
 
 def test_segment_photos_checks_all_photos_first(tmp_path):
-    photos, masks, segmenter = _write_photos(tmp_path / "images"), tmp_path / "masks", _Halves()
+    photos, folders, segmenter = _write_photos(tmp_path / "images"), _folders(tmp_path), _Halves()
     bad = tmp_path / "images" / "bad.jpg"
     bad.write_bytes(b"not a photo")
     with pytest.raises(InputError, match="bad.jpg"):
-        segment_photos([*photos, bad], masks, tmp_path / "confidence", segmenter)
+        segment_photos([*photos, bad], folders, segmenter, TABLE)
     double = Path(shutil.copy(photos[0], tmp_path / "photo0.jpeg"))
     with pytest.raises(InputError, match="share the name"):
-        segment_photos([*photos, double], masks, tmp_path / "confidence", segmenter)
-    write_image(masks / "photo1.png", np.zeros((64, 64), np.uint8))
+        segment_photos([*photos, double], folders, segmenter, TABLE)
+    write_image(folders.masks / "photo1.png", np.zeros((64, 64), np.uint8))
     with pytest.raises(InputError, match="aspect"):
-        segment_photos(photos, masks, tmp_path / "confidence", segmenter)
-    assert segmenter.num_calls == 0 and not (tmp_path / "confidence").exists()
+        segment_photos(photos, folders, segmenter, TABLE)
+    assert segmenter.num_calls == 0 and not folders.confidence.exists()
+
+
+def _folders(scene: Path) -> Folders:
+    return Folders(scene / "masks", scene / "confidence", scene / "instances")
 
 
 # ---- weights
 
 
-def test_missing_weights_say_what_to_do(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("backend", "words"), [
+    (GroundedSam, ("IDEA-Research/grounding-dino-tiny", "690 MB", "Apache-2.0", "{0}/grounding-dino-tiny", "{0}/IDEA-Research/grounding-dino-tiny")),
+    (Sam3, ("facebook/sam3", "3440 MB", "SAM licence, gated", "hf auth login", "{0}/sam3", "{0}/facebook/sam3")),
+])
+def test_missing_weights_say_what_to_do(tmp_path, monkeypatch, backend, words):
     pytest.importorskip("transformers")
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *args, **kwargs: pytest.fail("went to the network"))
     monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *args, **kwargs: None)
     with pytest.raises(InputError) as raised:
-        GroundedSam(GroundedSamSettings(model_dir=tmp_path), TABLE)
-    places = (str(tmp_path / "grounding-dino-tiny"), "hub cache")
-    for part in ("IDEA-Research/grounding-dino-tiny", "690 MB", "Apache-2.0", *places, "--download", "hf download"):
-        assert part in str(raised.value)
+        backend(Segment(model_dir=tmp_path), TABLE)
+    for part in (*words, "hub cache", "--download", "hf download"):
+        assert part.format(tmp_path) in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+def test_only_names_of_models_are_looked_for(tmp_path):
+    pytest.importorskip("huggingface_hub")
     with pytest.raises(InputError, match="size and licence"):
         find_weights("someone/else", None, download=False)
     for name in ("../secret", "a/..", "no-owner", "/etc/passwd", "a/b/c", "a b/c"):
@@ -351,176 +395,28 @@ def test_missing_package(monkeypatch):
 
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "4.57.1")
     with pytest.raises(MissingPackageError, match=r"transformers 5 or newer, not 4.57.1: pip install -U 'sc3d\[masks\]'"):
-        GroundedSam(GroundedSamSettings(), TABLE)
+        GroundedSam(Segment(), TABLE)
 
     def missing(name):
         raise importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(importlib.metadata, "version", missing)
     with pytest.raises(MissingPackageError, match=r"pip install 'sc3d\[masks\]'"):
-        GroundedSam(GroundedSamSettings(), TABLE)
+        GroundedSam(Segment(), TABLE)
 
 
 def test_settings_are_checked():
-    for wrong in ({"box_threshold": 1.0}, {"text_threshold": -0.1}, {"max_size": 10}, {"box_threshold": float("nan")}):
+    wrongs = ({"box_threshold": 1.0}, {"text_threshold": -0.1}, {"box_threshold": float("nan")}, {"tile": -5}, {"tile": 10}, {"overlap": 0.0}, {"overlap": 0.9})
+    for wrong in wrongs:
         with pytest.raises(InputError, match=next(iter(wrong))):
-            GroundedSamSettings(**wrong)
+            check_settings(Segment(**wrong))
+    check_settings(Segment(tile=0))
 
 
 def test_import_is_light():
     code = """
-import sys, sc3d.segmentation.files, sc3d.segmentation.grounded_sam, sc3d.segmentation.run
+import sys, sc3d.segmentation.files, sc3d.segmentation.grounded_sam, sc3d.segmentation.sam3, sc3d.segmentation.run
 print([name for name in ("torch", "transformers", "huggingface_hub", "PIL", "cv2") if name in sys.modules])
 """
     root = Path(__file__).parents[1]
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root).stdout.strip() == "[]"
-
-
-# ---- real code on tiny random models
-
-
-def _tiny(models: Path, segmenter: str, **changes) -> GroundedSamSettings:
-    return GroundedSamSettings(detector="tiny/dino", segmenter=f"tiny/{segmenter}", model_dir=models, device="cpu", max_size=128, **changes)
-
-
-@pytest.mark.parametrize("segmenter", ["sam", "sam2", "sam2_video"])
-def test_grounded_sam_writes_valid_masks(models, tmp_path, segmenter):
-    photos, masks, maps = _write_photos(tmp_path / "images"), tmp_path / "masks", tmp_path / "confidence"
-    backend = GroundedSam(_tiny(models, segmenter), TABLE)
-    assert segment_photos(photos, masks, maps, backend).segmented == ["photo0.jpg", "photo1.jpg"]
-    for index in range(2):
-        label, confidence = read_index_image(masks / f"photo{index}.png"), read_index_image(maps / f"photo{index}.png")
-        assert label.shape == confidence.shape == (48 + 16 * index, 80)
-        assert not TABLE.unknown(label) and label.any()
-        assert ((label == 0) == (confidence == 0)).all()
-    before = {file: file.read_bytes() for file in masks.iterdir()}
-    assert segment_photos(photos, masks, maps, backend).segmented == []
-    segment_photos(photos, masks, maps, GroundedSam(_tiny(models, segmenter), TABLE), overwrite=True)
-    assert before == {file: file.read_bytes() for file in masks.iterdir()}
-
-
-def test_nothing_found_is_unlabelled(models):
-    label, confidence = GroundedSam(_tiny(models, "sam2", box_threshold=0.9999), TABLE).segment(np.zeros((20, 30, 3), np.uint8))
-    assert label.shape == (20, 30) and not label.any() and not confidence.any()
-
-
-def test_detections_equal_those_of_the_models_own_processor(models):
-    """One prompt per class, so that the library's boxes and scores must come out, and its phrases name the class."""
-    from transformers import AutoTokenizer, GroundingDinoForObjectDetection, GroundingDinoImageProcessorPil, GroundingDinoProcessor
-
-    image = np.random.default_rng(5).integers(0, 256, (96, 128, 3)).astype(np.uint8)
-    words = ["building", "parking lot", "trees"]
-    table = parse_classes([{"id": 3 + index, "name": word, "color": [0, 0, 0]} for index, word in enumerate(words)], "test")
-    backend = GroundedSam(_tiny(models, "sam2", box_threshold=0.5, text_threshold=0.0), table)
-    boxes, class_ids, scores = backend.detect(image)
-
-    model = GroundingDinoForObjectDetection.from_pretrained(models / "dino").eval()
-    tokenizer = AutoTokenizer.from_pretrained(models / "dino")
-    processor = GroundingDinoProcessor(GroundingDinoImageProcessorPil(size={"shortest_edge": 77, "longest_edge": 128}), tokenizer)
-    inputs = processor(images=image, text=[words], return_tensors="pt")
-    assert inputs["input_ids"][0].tolist() == backend._captions[0].token_ids
-    np.testing.assert_allclose(backend._detector_pixels(image), inputs["pixel_values"], atol=1e-5)
-    output = model(**inputs)
-    tokens = output.logits[0].sigmoid().detach().numpy()
-    expected = processor.post_process_grounded_object_detection(output, inputs["input_ids"], threshold=0.5, target_sizes=[(96, 128)])[0]
-    spans = [slice(1, 2), slice(3, 5), slice(6, 8)]
-    best = np.stack([tokens[:, span].max(axis=1) for span in spans], axis=1)
-    found = best.max(axis=1) > 0.5
-    mean = np.where(best > 0.5, np.stack([tokens[:, span].mean(axis=1) for span in spans], axis=1), 0)[found]
-    assert 0 < len(boxes) == found.sum() <= len(expected["boxes"])
-    np.testing.assert_array_equal(class_ids, 3 + mean.argmax(axis=1))
-    np.testing.assert_allclose(scores, best[found][np.arange(len(scores)), mean.argmax(axis=1)], atol=1e-5)
-    kept = tokens.max(axis=1) > 0.5  # the library counts special tokens as well
-    np.testing.assert_allclose(boxes, expected["boxes"].detach().numpy()[found[kept]].clip(0, [128, 96, 128, 96]), atol=1e-3)
-
-
-def test_long_prompt_lists_take_several_captions(models):
-    words = ["building", "house", "roof", "road", "tree", "grass", "solar panel", "parking lot"]
-    table = parse_classes([{"id": 1, "name": "x", "color": [0, 0, 0], "prompts": [f"{a} {b}" for a in words for b in words]}], "test")
-    backend = GroundedSam(_tiny(models, "sam2"), table)
-    assert len(backend._captions) > 1 and all(len(caption.token_ids) <= 32 for caption in backend._captions)
-    boxes, class_ids, scores = backend.detect(np.full((30, 40, 3), 128, np.uint8))
-    assert len(boxes) == len(class_ids) == len(scores) <= 12 * len(backend._captions)
-
-
-def test_sam1_masks_equal_those_of_its_own_processor(models):
-    from transformers import SamImageProcessorPil, SamModel, SamProcessor
-
-    image = np.random.default_rng(5).integers(0, 256, (60, 90, 3)).astype(np.uint8)
-    boxes = np.array([[5, 6, 50, 40], [0, 0, 90, 60], [30.5, 10.25, 80, 59]], np.float32)
-    backend = GroundedSam(_tiny(models, "sam"), TABLE)
-    instances = list(backend._outline(image, boxes, np.array([1, 2, 7], np.uint8), np.full(3, 0.5)))
-
-    sizes = {"size": {"longest_edge": 128}, "pad_size": {"height": 128, "width": 128}}
-    processor = SamProcessor(SamImageProcessorPil(**sizes, mask_size={"longest_edge": 32}, mask_pad_size={"height": 32, "width": 32}))
-    inputs = processor(images=image, input_boxes=[boxes.tolist()], return_tensors="pt")
-    output = SamModel.from_pretrained(models / "sam").eval()(**inputs, multimask_output=False)
-    masks = processor.post_process_masks(output.pred_masks.detach(), inputs["original_sizes"], inputs["reshaped_input_sizes"])[0][:, 0].numpy()
-    np.testing.assert_allclose([instance.mask_score for instance in instances], output.iou_scores[0, :, 0].detach(), atol=1e-4)
-    assert (np.stack([instance.mask for instance in instances]) == masks).mean() > 0.999 and 0 < masks.mean() < 1
-
-
-@pytest.mark.parametrize(("segmenter", "keep_aspect"), [("sam", True), ("sam2", False)])
-def test_outlines_lie_where_the_boxes_are(models, segmenter, keep_aspect):
-    """A stand-in for the model fills the boxes it is given in its own square frame; more boxes than go through it at once."""
-    import types
-
-    import torch
-
-    height, width, side, cells = 120, 200, 1024, 256
-
-    def fill(image_embeddings, input_boxes, multimask_output):
-        centres = (torch.arange(cells) + 0.5) * side / cells
-        left, top, right, bottom = (input_boxes[0, :, None, None, index] for index in range(4))
-        inside = (centres > left) & (centres < right) & (centres[:, None] > top) & (centres[:, None] < bottom)
-        return types.SimpleNamespace(pred_masks=torch.where(inside, 1.0, -1.0)[None, :, None], iou_scores=torch.full((1, len(inside), 1), 0.5))
-
-    def embed(pixels):
-        assert pixels.shape == (1, 3, side, side) and bool((pixels[0, :, 640:] == 0).all()) == keep_aspect
-        return pixels
-
-    backend = GroundedSam(_tiny(models, segmenter), TABLE)
-    config = types.SimpleNamespace(prompt_encoder_config=types.SimpleNamespace(image_size=side))
-    methods = {"get_image_embeddings": staticmethod(embed), "__call__": staticmethod(fill)}
-    backend.__dict__["_segmenter"] = type("Filler", (), {"config": config, **methods})()
-    corners = np.random.default_rng(2).uniform([0, 0], [130, 60], (20, 2))
-    boxes = np.concatenate([corners, corners + np.random.default_rng(3).uniform(20, 60, (20, 2))], axis=1).astype(np.float32)
-    instances = list(backend._outline(np.full((height, width, 3), 90, np.uint8), boxes, np.arange(1, 21, dtype=np.uint8), np.full(20, 0.5)))
-    assert [instance.class_id for instance in instances] == list(range(1, 21))
-    for instance, (left, top, right, bottom) in zip(instances, boxes, strict=True):
-        rows, columns = np.nonzero(instance.mask)
-        np.testing.assert_allclose([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], [left, top, right, bottom], atol=1.0)
-
-
-def test_unusable_models_are_refused(models, tmp_path):
-    own = Path(shutil.copytree(models, tmp_path / "models"))
-    with pytest.raises(InputError, match="type 'sam2'"):
-        GroundedSam(GroundedSamSettings(detector="tiny/sam2", segmenter="tiny/sam2", model_dir=own), TABLE)
-    with pytest.raises(InputError, match="device 'gpu'"):
-        GroundedSam(GroundedSamSettings(detector="tiny/dino", segmenter="tiny/sam2", model_dir=own, device="gpu"), TABLE)
-    photo = np.zeros((20, 30, 3), np.uint8)
-    weights = own / "sam2" / "model.safetensors"
-    weights.write_text("version https://git-lfs.github.com/spec/v1")
-    with pytest.raises(InputError, match="cannot load the model in .*sam2"):
-        GroundedSam(_tiny(own, "sam2"), TABLE).segment(photo)
-    from safetensors.torch import load_file, save_file
-
-    tensors = load_file(models / "sam2" / "model.safetensors")
-    tensors.pop(sorted(tensors)[0])
-    save_file(tensors, weights, metadata={"format": "pt"})
-    with pytest.raises(InputError, match="incomplete"):
-        GroundedSam(_tiny(own, "sam2"), TABLE).segment(photo)
-    weights.rename(weights.with_name("pytorch_model.bin"))
-    with pytest.raises(InputError, match="not on this machine"):
-        GroundedSam(_tiny(own, "sam2"), TABLE)
-
-
-def test_code_in_a_model_folder_is_not_run(models, tmp_path):
-    own = Path(shutil.copytree(models, tmp_path / "models"))
-    for name, base in (("dino", "GroundingDinoForObjectDetection"), ("sam2", "Sam2Model")):
-        config = json.loads((own / name / "config.json").read_text())
-        config["auto_map"] = {"AutoConfig": "evil.Config", "AutoModel": f"evil.{base}", "AutoTokenizer": ["evil.Tokenizer", "evil.Tokenizer"]}
-        (own / name / "config.json").write_text(json.dumps(config))
-        (own / name / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
-    GroundedSam(_tiny(own, "sam2"), TABLE).segment(np.zeros((20, 30, 3), np.uint8))
-    assert not (tmp_path / "ran").exists()

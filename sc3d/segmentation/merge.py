@@ -2,55 +2,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.segmentation.instances import Instance, useful
+from sc3d.segmentation.runs import Window, fill_runs
 
 
-@dataclass(frozen=True)
-class Instance:
-    """One object that a segmenter found in a photo.
+class Areas(NamedTuple):
+    """What a model says of every pixel, without telling objects apart: (H, W) uint8 class id; (H, W) uint8 confidence; both 0 where it says nothing."""
 
-    mask: (H, W) bool
-    class_id: 1 to 255
-    box_score, mask_score: 0 to 1, how sure the detector is of the class and the segmenter of the outline
-    """
-
-    mask: np.ndarray
-    class_id: int
-    box_score: float
-    mask_score: float
-
-    @property
-    def score(self) -> float:
-        """Box score x mask score; mask scores are regressed and may leave 0 to 1 a little, so both are clipped."""
-        return float(np.clip(self.box_score, 0, 1) * np.clip(self.mask_score, 0, 1))
+    labels: np.ndarray
+    confidence: np.ndarray
 
 
-def merge_instances(instances: Iterable[Instance], shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def merge_instances(instances: list[Instance] | tuple[Instance, ...], shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Give every pixel the class of its best instance, whatever the order of the instances.
 
-    instances: taken one by one, so a generator keeps memory at a few bytes per pixel; those with a score of 0 or NaN are ignored
+    instances: those with a score of 0 or NaN are ignored
     shape: (H, W) px
     returns: (H, W) uint8 class id, 0 where there is no instance; (H, W) uint8 confidence, 1 to 255 = score 1, 0 where unlabelled
     source: highest box score x mask score wins; ties go to the smaller mask, then to the lower class id
     """
-    # Each pixel keeps the number of its best instance so far; number 0 is "none", which everything beats.
-    best = np.zeros(shape, np.int32)
-    ranks: list[tuple[float, int, int]] = [(0.0, 0, 0)]
-    for instance in instances:
-        if instance.mask.shape != tuple(shape):
-            raise InputError(f"a mask is {instance.mask.shape} (rows, columns), but its photo is {tuple(shape)}")
-        rank = (instance.score, -int(np.count_nonzero(instance.mask)), -int(instance.class_id))
-        if not rank[0] > 0:
-            continue
-        beaten = np.array([rank > other for other in ranks])
-        best[instance.mask & beaten[best]] = len(ranks)
-        ranks.append(rank)
-    labels = np.array([-rank[2] for rank in ranks], np.uint8)
-    # At least 1, so that a confidence of 0 always means unlabelled.
-    confidences = np.array([0] + [max(1, round(255 * rank[0])) for rank in ranks[1:]], np.uint8)
-    return labels[best], confidences[best]
+    labels, confidence = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+    for instance in reversed(useful(list(instances))):  # painted over by better ones
+        if tuple(instance.size) != tuple(shape):
+            raise InputError(f"a mask is {tuple(instance.size)} (rows, columns), but its photo is {tuple(shape)}")
+        mask, window = fill_runs(instance.runs, shape[0])
+        place = slice(window.top, window.bottom), slice(window.left, window.right)
+        labels[place][mask] = instance.class_id
+        confidence[place][mask] = max(1, round(255 * instance.score))  # at least 1, so that 0 always means unlabelled
+    return labels, confidence
+
+
+def fill_gaps(labels: np.ndarray, confidence: np.ndarray, areas: Areas) -> None:
+    """Label the pixels that no instance claims by what the model says of every pixel; labels and confidence are changed in place."""
+    empty = labels == 0
+    labels[empty], confidence[empty] = areas.labels[empty], areas.confidence[empty]
+
+
+def paint(areas: Areas, class_id: int, confidence: np.ndarray, place: Window) -> None:
+    """Give pixels of a window a class where its confidence is higher than theirs; at equal confidence the lower id stays. Changes `areas`.
+
+    confidence: (h, w) uint8 of that class, 0 where it is not present
+    """
+    window = slice(place.top, place.bottom), slice(place.left, place.right)
+    _keep_better(areas.labels[window], areas.confidence[window], np.full_like(confidence, class_id), confidence)
+
+
+def paint_areas(areas: Areas, others: Areas, place: Window) -> None:
+    """The same with the areas of a window of the photo, such as a tile."""
+    window = slice(place.top, place.bottom), slice(place.left, place.right)
+    _keep_better(areas.labels[window], areas.confidence[window], *others)
+
+
+def _keep_better(labels: np.ndarray, confidence: np.ndarray, new_labels: np.ndarray, new_confidence: np.ndarray) -> None:
+    better = (new_confidence > confidence) | (new_confidence == confidence) & (new_confidence > 0) & (new_labels < labels)
+    labels[better], confidence[better] = new_labels[better], new_confidence[better]

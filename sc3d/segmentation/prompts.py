@@ -24,12 +24,12 @@ class Caption:
 
     token_ids: T ids, with the tokenizer's start and end tokens and a full stop after each prompt
     spans: first and last token + 1 of each prompt, without its full stop
-    class_ids: class of each prompt
+    prompts: the prompts
     """
 
     token_ids: list[int]
     spans: list[tuple[int, int]]
-    class_ids: list[int]
+    prompts: list[Prompt]
 
 
 def list_prompts(class_table: ClassTable) -> list[Prompt]:
@@ -66,32 +66,31 @@ def build_captions(tokens: list[tuple[Prompt, list[int]]], start: int, stop: int
             captions.append(Caption([start], [], []))
         caption = captions[-1]
         caption.spans.append((len(caption.token_ids), len(caption.token_ids) + len(ids)))
-        caption.class_ids.append(prompt.class_id)
+        caption.prompts.append(prompt)
         caption.token_ids.extend([*ids, stop])
     for caption in captions:
         caption.token_ids.append(end)
     return captions
 
 
-def match_classes(token_scores: np.ndarray, caption: Caption, box_threshold: float, text_threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Class and score of each of N boxes, from how well the box matches every token of the caption.
+def match_prompts(token_scores: np.ndarray, caption: Caption, box_threshold: float, text_threshold: float) -> tuple[np.ndarray, np.ndarray]:
+    """Prompt and score of each of N boxes, from how well the box matches every token of the caption.
 
     token_scores: (N, >= T) probability 0 to 1 that the box shows what the token says
     box_threshold, text_threshold: a prompt is a candidate if the box matches one of its tokens better than both;
         tokens that match no better than text_threshold do not count
-    returns: (N,) uint8 class id, 0 for a box without candidate; (N,) float64 score: the best token of the prompt chosen
+    returns: (N,) int64 number of the prompt in the caption, -1 for a box without candidate; (N,) float64 score: the best token of that prompt
 
     A box may match tokens of several prompts ("building. road."). It goes to the candidate with the highest mean over all tokens of the prompt,
     where tokens that do not count are 0: so "parking lot" with both words beats "parking garage" with one. Ties go to the lower class id.
     """
     scores = np.asarray(token_scores, np.float64)
     counted = np.where(scores > text_threshold, scores, 0.0)
-    order = np.argsort(caption.class_ids, kind="stable")  # argmax takes the first of equals
-    spans = [caption.spans[index] for index in order]
+    order = np.argsort([prompt.class_id for prompt in caption.prompts], kind="stable")  # argmax takes the first of equals
+    spans = [caption.spans[number] for number in order]
     best = np.stack([scores[:, first:last].max(axis=1) for first, last in spans], axis=1)
     mean = np.stack([counted[:, first:last].mean(axis=1) for first, last in spans], axis=1)
     candidate = (best > box_threshold) & (mean > 0)
     chosen = np.where(candidate, mean, -1.0).argmax(axis=1)
     found = candidate.any(axis=1)
-    class_ids = np.array(caption.class_ids, np.uint8)[order][chosen]
-    return np.where(found, class_ids, 0).astype(np.uint8), np.where(found, np.take_along_axis(best, chosen[:, None], axis=1)[:, 0], 0.0)
+    return np.where(found, order[chosen], -1), np.where(found, np.take_along_axis(best, chosen[:, None], axis=1)[:, 0], 0.0)

@@ -10,16 +10,18 @@ from sc3d.io import read_json
 
 # Only data: no pickles (*.bin, *.pt), no code (*.py).
 _FILES = ["*.json", "*.txt", "*.safetensors"]
-_KNOWN = {  # download size in MB; all of these are Apache-2.0 and need no account
-    "IDEA-Research/grounding-dino-tiny": 690,
-    "IDEA-Research/grounding-dino-base": 930,
-    "facebook/sam2.1-hiera-tiny": 160,
-    "facebook/sam2.1-hiera-small": 185,
-    "facebook/sam2.1-hiera-base-plus": 325,
-    "facebook/sam2.1-hiera-large": 900,
-    "facebook/sam-vit-base": 375,
-    "facebook/sam-vit-large": 1250,
-    "facebook/sam-vit-huge": 2570,
+_FREE, _GATED = "Apache-2.0", "SAM licence, gated: accept it on the model's page on the hub and log in with `hf auth login`"
+_KNOWN = {  # download size in MB, licence
+    "IDEA-Research/grounding-dino-tiny": (690, _FREE),
+    "IDEA-Research/grounding-dino-base": (930, _FREE),
+    "facebook/sam2.1-hiera-tiny": (160, _FREE),
+    "facebook/sam2.1-hiera-small": (185, _FREE),
+    "facebook/sam2.1-hiera-base-plus": (325, _FREE),
+    "facebook/sam2.1-hiera-large": (900, _FREE),
+    "facebook/sam-vit-base": (375, _FREE),
+    "facebook/sam-vit-large": (1250, _FREE),
+    "facebook/sam-vit-huge": (2570, _FREE),
+    "facebook/sam3": (3440, _GATED),
 }
 
 
@@ -77,7 +79,7 @@ def _missing_message(name: str, model_dir: Path | None) -> str:
     from huggingface_hub.constants import HF_HUB_CACHE
 
     own = "no model folder was given" if model_dir is None else f"looked for {model_dir / name.split('/')[1]} and {model_dir / name}"
-    size = f"about {_KNOWN[name]} MB, Apache-2.0" if name in _KNOWN else "size and licence: see its page on the hub"
+    size = "about {} MB, {}".format(*_KNOWN[name]) if name in _KNOWN else "size and licence: see its page on the hub"
     return f"the weights of {name} ({size}) are not on this machine: {own}, and in the hub cache {HF_HUB_CACHE}; {_advice(name)}"
 
 

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+from tqdm import tqdm
+
 from sc3d.classes import ClassTable
 from sc3d.errors import InputError
-from sc3d.io import find_photos, read_json, write_json
+from sc3d.io import atomic_path, digest, find_photos, read_json, write_image, write_json
 from sc3d.scene import Scene, photo_sizes
 from sc3d.settings import Segment
 
 
 def inputs(scene: Scene, settings: Segment) -> list[Path]:
+    if settings.refine:
+        return [scene.classes, scene.sparse, scene.masks, scene.confidence, scene.cloud, scene.mesh]
     given = [path for path in (settings.masks, settings.confidence, settings.mapping) if path is not None]
     if settings.backend == "files":
         return [scene.classes, *given]
@@ -21,26 +26,48 @@ def inputs(scene: Scene, settings: Segment) -> list[Path]:
 
 
 def outputs(scene: Scene, settings: Segment) -> list[Path]:
-    return [scene.masks]
+    return [scene.confidence_refined if settings.refine else scene.masks]
 
 
 def run(scene: Scene, settings: Segment) -> dict[str, object]:
     class_table = scene.class_table()
+    if settings.refine:
+        return _refine(scene, settings)
+    if scene.confidence_refined.is_dir():  # it belongs to the masks that are replaced
+        shutil.rmtree(scene.confidence_refined)
     if settings.backend == "files":
         return _import(scene, settings, class_table)
-    from sc3d.segmentation.run import segment_photos
+    from sc3d.segmentation.run import Folders, segment_photos
 
     class_table = with_prompts(class_table, settings.prompts)
     segmenter = _segmenter(scene, settings, class_table)
+    folders = Folders(scene.masks, scene.confidence, scene.instances)
     # Masks of an interrupted run are gone on with if they were made with the same settings; others are the user's to remove.
-    marker, state = scene.path / "segment.unfinished.json", json.loads(json.dumps([repr(settings), class_table.as_json()]))
-    if scene.masks.exists() and not (marker.exists() and read_json(marker) == state):
+    marker, state = scene.path / "segment.unfinished.json", _state(scene, settings, class_table)
+    unfinished = marker.exists() and read_json(marker) == state
+    if scene.masks.exists() and not unfinished:
         raise InputError(f"{scene.masks} holds masks that other settings made: remove the folder to make new ones")
+    if unfinished:
+        _remove_leftovers(folders.masks, folders.confidence, folders.instances)
     write_json(marker, state)
-    summary = segment_photos(find_photos(scene.images), scene.masks, scene.confidence, segmenter)
+    summary = segment_photos(find_photos(scene.images), folders, segmenter, class_table)
     marker.unlink()
     pixels = {class_table.name(label): int(count) for label, count in enumerate(summary.num_pixels) if count}
-    return {"segmented": len(summary.segmented), "already_there": len(summary.skipped)} | {f"pixels_{name}": count for name, count in pixels.items()}
+    figures = {"segmented": len(summary.segmented), "already_there": len(summary.skipped), "instances": summary.num_instances}
+    return figures | {f"pixels_{name}": count for name, count in pixels.items()}
+
+
+def _state(scene: Scene, settings: Segment, class_table: ClassTable) -> object:
+    """What decides the masks, as JSON: everything but where the models lie and run."""
+    decisive = replace(settings, device="auto", download=False, model_dir=None)
+    strokes = digest(settings.strokes or scene.strokes) if settings.backend == "strokes" else ""
+    return json.loads(json.dumps([repr(decisive), class_table.as_json(), strokes]))
+
+
+def _remove_leftovers(*folders: Path) -> None:
+    """Temporary files that a killed run left behind (see `sc3d.io.atomic_path`)."""
+    for file in (file for folder in folders for file in folder.glob(".*.tmp.*")):
+        file.unlink()
 
 
 def _segmenter(scene: Scene, settings: Segment, class_table: ClassTable):  # noqa: ANN202 - a sc3d.segmentation.run.Segmenter; packages load late
@@ -52,10 +79,9 @@ def _segmenter(scene: Scene, settings: Segment, class_table: ClassTable):  # noq
         from sc3d.segmentation.sam3 import Sam3
 
         return Sam3(settings, class_table)
-    from sc3d.segmentation.grounded_sam import GroundedSam, GroundedSamSettings
+    from sc3d.segmentation.grounded_sam import GroundedSam
 
-    names = GroundedSamSettings.__dataclass_fields__.keys() & Segment.__dataclass_fields__.keys()
-    return GroundedSam(GroundedSamSettings(**{name: getattr(settings, name) for name in names}), class_table)
+    return GroundedSam(settings, class_table)
 
 
 def with_prompts(class_table: ClassTable, prompts: tuple[str, ...]) -> ClassTable:
@@ -69,12 +95,35 @@ def with_prompts(class_table: ClassTable, prompts: tuple[str, ...]) -> ClassTabl
     return ClassTable(tuple(replace(entry, prompts=texts.get(entry.name, entry.prompts)) for entry in class_table))
 
 
+def _refine(scene: Scene, settings: Segment) -> dict[str, object]:
+    """Lower the confidence of doubted masks, if that helps."""
+    from sc3d.labelling import Masks
+    from sc3d.refinement import material_of, refine
+
+    if settings.backend != "files" or settings.masks is not None:
+        raise InputError("--refine works on the masks that are in the scene: make them first, then run `sc3d segment SCENE --refine`")
+    masks = Masks.of(scene, scene.confidence)
+    refinement = refine(material_of(scene, masks), masks.views, masks.read)
+    if refinement.helps:
+        with atomic_path(scene.confidence_refined) as folder:
+            folder.mkdir()
+            for view in tqdm(masks.views, desc="writing confidence", unit="photo", disable=None):
+                write_image(folder / f"{Path(view.name).stem}.png", refinement.confidence(view, masks.read))
+    elif scene.confidence_refined.is_dir():
+        shutil.rmtree(scene.confidence_refined)
+    return {"agreement_before": f"{refinement.before:.2%}", "agreement_after": f"{refinement.after:.2%}", "kept": refinement.helps}
+
+
 def _import(scene: Scene, settings: Segment, class_table: ClassTable) -> dict[str, object]:
-    from sc3d.segmentation.files import import_masks
+    from sc3d.segmentation.files import MaskFiles, import_masks, warn_of_turned
 
     if settings.masks is None:
+        if settings.mapping is not None or settings.format not in ("auto", "index"):
+            raise InputError("--mapping and --format say how to read --masks, which is missing")
         if not scene.masks.is_dir():
             raise InputError("--masks FOLDER is needed (or --backend grounded-sam, which makes masks from the prompts in classes.json)")
         return {"masks": len(scene.mask_files(scene.masks, class_table)), "source": "already in the scene"}
-    names = import_masks(settings.masks, scene.masks, photo_sizes(scene.images), class_table, settings.confidence, scene.confidence)
+    source, sizes = MaskFiles(settings.masks, settings.format, settings.mapping), photo_sizes(scene.images)
+    names = import_masks(source, scene.masks, sizes, class_table, settings.confidence, scene.confidence)
+    warn_of_turned([scene.photo(name) for name in names])
     return {"masks": len(names), "confidence": settings.confidence is not None}

@@ -1,0 +1,173 @@
+"""What the text-prompted backends share: packages, device, loading models, pixels in, outlines out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sc3d.errors import InputError, MissingPackageError
+from sc3d.segmentation.runs import find_runs
+from sc3d.segmentation.weights import model_type
+from sc3d.settings import Segment
+
+if TYPE_CHECKING:
+    import torch
+
+IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # mean and standard deviation of RGB that Grounding DINO, SAM 1 and SAM 2 were trained with
+HALVES = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)  # the same of SAM 3
+
+
+def check_packages(backend: str) -> None:
+    """Raise MissingPackageError if torch or transformers is missing or too old."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    for package, oldest in (("torch", 2), ("transformers", 5)):
+        try:
+            found = version(package)
+        except PackageNotFoundError:
+            raise MissingPackageError(f"the {backend} backend needs {package}: pip install 'sc3d[masks]'") from None
+        if int(found.split(".")[0]) < oldest:
+            raise MissingPackageError(f"the {backend} backend needs {package} {oldest} or newer, not {found}: pip install -U 'sc3d[masks]'")
+
+
+def check_settings(settings: Segment) -> None:
+    """Raise InputError if an option of the text-prompted backends is out of range."""
+    for name in ("box_threshold", "text_threshold"):
+        if not 0 <= getattr(settings, name) < 1:
+            raise InputError(f"{name} is {getattr(settings, name)}, but must be from 0 to below 1")
+    if settings.tile and settings.tile < 64:
+        raise InputError(f"tile is {settings.tile} px, but must be at least 64, or 0 for no tiles")
+    if not 0 < settings.overlap <= 0.75:
+        raise InputError(f"overlap is {settings.overlap}, but must be above 0 (tiles are joined where they overlap) and at most 0.75")
+
+
+def choose_device(settings: Segment) -> str:
+    """Name of a torch device that works; InputError if there is none of that name, or half precision is wanted without a GPU."""
+    import torch
+
+    name = settings.device
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.empty(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"the device {name!r} cannot be used ({first_line(error)}): choose cpu, or leave it at auto") from None
+    if settings.half and torch.device(name).type != "cuda":
+        raise InputError(f"half precision is for CUDA GPUs, but the device is {name}, where it is slower and less exact: leave --half away")
+    return name
+
+
+@contextmanager
+def inference(device: str, half: bool) -> Iterator[None]:
+    """No gradients; with `half`, matrix products in bfloat16 (float16 on GPUs older than Ampere), what needs range in float32."""
+    import torch
+
+    with ExitStack() as stack:
+        stack.enter_context(torch.inference_mode())
+        if half:
+            kind = torch.device(device).type
+            old = kind == "cuda" and not torch.cuda.is_bf16_supported(including_emulation=False)
+            stack.enter_context(torch.autocast(kind, dtype=torch.float16 if old else torch.bfloat16))
+        yield
+
+
+def load_model(path: Path, classes: dict[str, str], device: str) -> torch.nn.Module:
+    """Load a model for inference: safetensors only, from this machine only; InputError if the weights are damaged or incomplete.
+
+    classes: name of the class in transformers by model type
+    """
+    import transformers
+    from transformers.utils import logging
+
+    model_class = getattr(transformers, classes[model_type(path)])
+    verbosity, progress = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    logging.set_verbosity_error()  # else it warns that a video model is loaded for images, which is meant
+    logging.disable_progress_bar()
+    try:
+        model, report = model_class.from_pretrained(
+            path, local_files_only=True, use_safetensors=True, trust_remote_code=False, output_loading_info=True, dtype="float32",
+        )
+    except Exception as error:  # OSError, ValueError, RuntimeError, SafetensorError, TypeError: whatever a damaged file brings about
+        raise InputError(f"cannot load the model in {path}: {first_line(error)}; download it again") from None
+    finally:
+        logging.set_verbosity(verbosity)
+        if progress:
+            logging.enable_progress_bar()
+    if report["missing_keys"]:  # those would silently be random
+        raise InputError(f"the weights in {path} are incomplete ({sorted(report['missing_keys'])[0]} is missing): download the model again")
+    return model.to(device).eval()
+
+
+def load_tokenizer(path: Path, name: str):  # noqa: ANN201 - a transformers tokenizer
+    """Load the tokenizer in a model's folder by the name of its class in transformers; InputError if it is missing or damaged."""
+    import transformers
+
+    try:
+        return getattr(transformers, name).from_pretrained(path, local_files_only=True, trust_remote_code=False)
+    except Exception as error:
+        raise InputError(f"cannot load the tokenizer in {path}: {first_line(error)}; download the model again") from None
+
+
+def to_pixels(image: np.ndarray, size: tuple[int, int], statistics: tuple, device: str) -> torch.Tensor:
+    """(1, 3, height, width) float32 of an (H, W, 3) uint8 photo, resized with antialiasing to `size` (width, height) and normalised.
+
+    Done here rather than by the models' own processors: those of SAM 2 and 3 need torchvision, and results would differ with and without it.
+    """
+    import torch
+    from PIL import Image
+
+    mean, deviation = (np.array(values, np.float32) for values in statistics)
+    resized = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BILINEAR), np.float32) / 255
+    return torch.from_numpy(((resized - mean) / deviation).transpose(2, 0, 1)[None].copy()).to(device)
+
+
+class Patch(NamedTuple):
+    """Part of a map of the photo: (h, w) float32 values; row and column of its first pixel."""
+
+    values: torch.Tensor
+    top: int
+    left: int
+
+
+def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> Patch:
+    """Enlarge a map to the size of the photo, bilinearly (pixel centres at +0.5), but only where the result may exceed a threshold.
+
+    values: (h, w) float32
+    shape: (H, W) px
+    returns: a rectangle of the enlarged map that holds all pixels above `threshold`, and few others; empty if there are none
+    """
+    import torch
+
+    above = values > threshold
+    low_rows, high_rows, down, top = _sources(above.any(dim=1), shape[0])
+    low_columns, high_columns, across, left = _sources(above.any(dim=0), shape[1])
+    rows = torch.lerp(values[low_rows], values[high_rows], down[:, None])
+    return Patch(torch.lerp(rows[:, low_columns], rows[:, high_columns], across), top, left)
+
+
+def _sources(present: torch.Tensor, length: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, int]:
+    """For each of the `length` output places that touch a present one: the two input places, the weight of the second; and the first such place."""
+    import torch
+
+    number, there = len(present), present.cpu()  # few numbers, and not every device has float64
+    places = ((torch.arange(length, dtype=torch.float64) + 0.5) * (number / length) - 0.5).clamp(0, number - 1)
+    low = places.floor().long()
+    high = (low + 1).clamp(max=number - 1)
+    touched = torch.nonzero(there[low] | there[high])[:, 0]
+    part = slice(int(touched[0]), int(touched[-1]) + 1) if len(touched) else slice(0, 0)
+    return *(values[part].to(present.device) for values in (low, high, (places - low).float())), part.start
+
+
+def outline(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> np.ndarray:
+    """(K, 2) runs of the pixels of a photo of `shape` (H, W) where the enlarged map exceeds a threshold."""
+    patch = enlarge(values.float(), threshold, shape)
+    return find_runs((patch.values > threshold).cpu().numpy(), shape[0], patch.top, patch.left)
+
+
+def first_line(error: Exception) -> str:
+    """First line of an error's text, or its name."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
