@@ -13,26 +13,8 @@ from typing import Annotated
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
-from sc3d import settings as options
+from sc3d.commands import COMMANDS, DESCRIPTIONS, MODULES, STAGES
 from sc3d.errors import InputError, Sc3dError
-
-# stages that are one settings record applied to one scene folder, in the order of the data flow
-STAGES: dict[str, type] = {
-    "synthesize": options.Synthesize,
-    "train": options.Train,
-    "extract": options.Extract,
-    "segment": options.Segment,
-    "label": options.Label,
-    "propagate": options.Propagate,
-    "evaluate": options.Evaluate,
-    "export": options.Export,
-    "report": options.Report,
-}
-# commands with arguments of their own
-COMMANDS: dict[str, type] = {
-    "reconstruct": options.ReconstructCommand, "run": options.Run, "view": options.View, "doctor": options.Doctor, "benchmark": options.Benchmark,
-}
-DESCRIPTIONS = {options.Benchmark: "Measure sc3d on this machine."}  # of commands with subcommands: a union of records has no docstring of its own
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -97,7 +79,7 @@ def _dispatch(name: str, command: object) -> None:
     from sc3d.stages import execute, require_writable
 
     if name in COMMANDS:
-        importlib.import_module(f"sc3d.stages.{name}").main(command)
+        importlib.import_module(f"sc3d.stages.{MODULES.get(name, name)}").main(command)
         return
     require_writable(command.scene)
     execute(name, Scene(command.scene), command.settings, command.overwrite)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg, subcommand
+from tyro.conf import Positional, Suppress, arg, subcommand
 
 from sc3d.splatting.settings import TrainSettings as Train
 from sc3d.synthetic.settings import SynthesizeSettings as Synthesize
@@ -23,14 +23,37 @@ class Reconstruct:
     """Which photo pairs to match: all, neighbours in name order, or neighbours by GPS (hundreds of photos and more)."""
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP camera model, shared by all photos of one size and EXIF camera."""
+    focal: Literal["auto", "refine", "exif"] = "auto"
+    """Estimate the focal length, or keep that of EXIF. auto: estimate, unless all photos look the same way from one height (straight down), where
+    focal length and flight height cannot be told apart."""
     max_size: int = 1600
     """Longest photo side for feature extraction, px."""
     max_features: int = 8192
     """SIFT features per photo."""
     gps: bool = True
-    """Use EXIF GPS positions for scale, orientation and position."""
+    """Use GPS positions (EXIF; RTK accuracies in DJI's XMP) for scale, orientation and position."""
+    gcp: Path | None = None
+    """Ground control points in ODM's gcp_list.txt format; they replace GPS as the frame."""
+    epsg: int | None = None
+    """Projected CRS of exports; the UTM zone (or the CRS of --gcp) otherwise. `sc3d georeference` changes it afterwards."""
+    altitude_offset: float = 0.0
+    """Added to all heights in exports, m: drones differ in what they measure altitude from."""
     seed: int = 0
     """Seed of RANSAC."""
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """Say where a scene lies on Earth (georeference.json), from the GPS of its photos or by hand; or choose another CRS for exports."""
+
+    epsg: int | None = None
+    """Projected CRS of exports; the present one, or else the UTM zone, otherwise."""
+    altitude_offset: float = 0.0
+    """Added to all heights in exports, m."""
+    offset: tuple[float, float, float] | None = None
+    """For scenes whose world is the CRS of --epsg minus this (easting, northing, height); 0 0 0 if it is the CRS itself."""
+    from_gps: bool = False
+    """Replace the present georeference by one from GPS."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +111,11 @@ class Segment:
     """Photos larger than this are also looked at in overlapping tiles of this size, px, so that small things are found; 0 = never (grounded-sam, sam3)."""
     overlap: float = 0.2
     """Share of a tile that it has in common with the next."""
+    refine: bool = False
+    """One more round on the masks that are in the scene (needs its cloud): what contradicts the fused labels loses confidence, if that brings the
+    labels nearer to the masks of photos that were left out. Writes SCENE/confidence_refined, which label then takes instead of SCENE/confidence."""
     half: bool = False
-    """Compute in half precision, on a GPU (grounded-sam, sam3)."""
+    """Compute in half precision (bfloat16; float16 on older GPUs); needs CUDA (grounded-sam, sam3)."""
     device: str = "auto"
     """torch device: auto, cpu, cuda."""
 
@@ -109,10 +135,8 @@ class Label:
     """Label voxel, world units; 0 = 2 times the median point spacing, at least 1.5 times the median mask pixel on the ground."""
     use_confidence: bool = True
     """Weigh mask pixels by the confidence maps, where there are any."""
-    edge_width: float = 1.5
+    edge_width: float = 3.0
     """Mask pixels closer than this to a label boundary count less, px; 0 = off."""
-    depth_edge_width: float = 6.0
-    """Pixels closer than this to a depth discontinuity count less, px, because masks bleed over silhouettes; 0 = off."""
     depth_excess: bool = True
     """Weigh votes less, the farther a point lies behind the first surface (within the tolerance)."""
     incidence: bool = False
@@ -176,15 +200,27 @@ class Evaluate:
 class Export:
     """Results for other programs, in SCENE/export."""
 
-    format: tuple[Literal["masks", "laz", "clouds", "splats", "spz", "orthophoto", "objects"], ...] = ("laz",)
+    format: tuple[Literal["masks", "laz", "clouds", "splats", "spz", "orthophoto", "objects", "transforms", "colmap-text"], ...] = ("laz",)
     """What to write. masks: the fused labels as each photo sees them; laz: LAZ 1.4 with ASPRS classes; clouds: one PLY per class; splats, spz: Gaussians
-    with labels; orthophoto: GeoTIFFs of colour, class and height; objects: footprints of buildings and crowns of trees as GeoJSON."""
+    with labels; orthophoto: GeoTIFFs of colour, class and height; objects: footprints of buildings and crowns of trees as GeoJSON;
+    transforms: cameras and sparse points as nerfstudio's transforms.json; colmap-text: the same as COLMAP's text files."""
     classes: tuple[str, ...] = ()
     """Names of the classes to write; all otherwise (laz, clouds, splats, spz)."""
     labelled: Path | None = None
     """Labelled cloud; SCENE/labelled.ply otherwise."""
     max_size: int = 0
     """Longest side of the masks, px; 0 = as the photo (masks)."""
+    epsg: int = 0
+    """EPSG code of a projected CRS for the coordinates (laz, clouds, orthophoto, objects); 0 = that of the scene. Without a georeference it says which
+    CRS the scene's coordinates are in."""
+    pixel_size: float = 0.0
+    """Side of a pixel on the ground, m; 0 = the spacing of the points, rounded to one digit (orthophoto)."""
+    min_height: float = 2.0
+    """Lower buildings and plants are left out, m (objects)."""
+    min_area: float = 10.0
+    """Smaller buildings are left out, m2 (objects)."""
+    rectangular: bool = True
+    """Draw buildings with right angles where that fits; --no-rectangular keeps the simplified outline (objects)."""
 
 
 @dataclass(frozen=True)
@@ -202,6 +238,35 @@ class ReconstructCommand:
     photos: Annotated[Positional[Path], arg(help="Folder of photos; never modified.")]
     scene: Annotated[Positional[Path], arg(help="Scene folder to write.")]
     reconstruct: Annotated[Reconstruct, arg(name="")] = Reconstruct()
+    overwrite: bool = False
+    """Run again even if the outputs are up to date."""
+
+
+@dataclass(frozen=True)
+class Import:
+    """Start from another program's project, cloud or mesh: nerfstudio, OpenSfM, ODM, Metashape, Pix4D, COLMAP; PLY, LAS, LAZ, PCD, XYZ, OBJ."""
+
+    source: Annotated[Literal["auto", "nerfstudio", "opensfm", "odm", "metashape", "pix4d", "colmap", "cloud"], arg(name="from")] = "auto"
+    """What PROJECT is; auto looks at it."""
+    images: Path | None = None
+    """Folder of the photos; where the project says otherwise. Needed for Metashape and Pix4D, which do not say."""
+    cloud: tuple[Path, ...] = ()
+    """Cloud (PLY, LAS, LAZ, PCD, XYZ) or mesh (PLY, OBJ) that belongs to it, or one of each; becomes cloud.ply and mesh.ply."""
+    epsg: int | None = None
+    """CRS of coordinates whose file does not state one."""
+    tolerance: float = 0.01
+    """Largest error, px, from lens parameters that no COLMAP model has; a project that needs more is refused."""
+    project: Annotated[Path, Suppress] = Path()
+    """Set by the command."""
+
+
+@dataclass(frozen=True)
+class ImportCommand:
+    """Start from another program's project, cloud or mesh: nerfstudio, OpenSfM, ODM, Metashape, Pix4D, COLMAP; PLY, LAS, LAZ, PCD, XYZ, OBJ."""
+
+    project: Annotated[Positional[Path], arg(help="Project folder or file, or a cloud or mesh alone; never modified.")]
+    scene: Annotated[Positional[Path], arg(help="Scene folder to write.")]
+    settings: Annotated[Import, arg(name="")] = Import()
     overwrite: bool = False
     """Run again even if the outputs are up to date."""
 
@@ -237,6 +302,13 @@ class Doctor:
 
     model_dir: Path | None = None
     """Folder with downloaded model weights."""
+
+
+@dataclass(frozen=True)
+class Manual:
+    """Write the manual's pages of commands, with all their options, as Markdown."""
+
+    folder: Annotated[Positional[Path], arg(help="Folder to write.")]
 
 
 @dataclass(frozen=True)
@@ -277,7 +349,7 @@ class BenchmarkTables:
     width: int = 800
     """Width of the synthetic photos, px."""
     every: int = 4
-    """Judge every nth photo with truth."""
+    """Judge every nth photo with truth, but not fewer than 8."""
     output: Path | None = None
     """Folder for tables.md and tables.json; WORKDIR otherwise."""
 

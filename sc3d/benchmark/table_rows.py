@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import ast
 import hashlib
-import inspect
 import json
-import textwrap
 from dataclasses import asdict, dataclass, fields, replace
-from functools import cache
 from typing import Literal, get_args, get_origin, get_type_hints
 
+from sc3d.manual import helps
 from sc3d.settings import Label, Propagate
 
 OURS, DEFAULT = "conflict-lock + geometry", "sc3d as it is by default"
@@ -93,14 +90,6 @@ def turned(record: Label | Propagate) -> list[tuple[str, Label | Propagate]]:
             other = 0.0 if value else ON_VALUES.get((stage, field.name), 1.0)
             found.append((f"--{option} {other:g}", replace(record, **{field.name: type(value)(other)})))
     return found
-
-
-@cache
-def helps(record: type) -> dict[str, str]:
-    """The docstring below each field of a settings record."""
-    body = ast.parse(textwrap.dedent(inspect.getsource(record))).body[0].body
-    return {before.target.id: after.value.value for before, after in zip(body, body[1:], strict=False)
-            if isinstance(before, ast.AnnAssign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)}
 
 
 def _is_mechanism(record: type, name: str) -> bool:

@@ -1,0 +1,119 @@
+"""The manual's pages of commands, from the same records as `--help`."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import textwrap
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from sc3d.io import write_text
+
+NOTE = "<!-- Written by `sc3d manual`; edit sc3d/settings.py instead. -->"
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a command. flag: as typed; values: what it takes; default: as text, "" = required; help: one paragraph."""
+
+    flag: str
+    values: str
+    default: str
+    help: str
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of the manual.
+
+    about: one sentence; records: settings by subcommand, {"": record} if it has none; scene: it takes a scene folder and --overwrite beside its record
+    """
+
+    about: str
+    records: dict[str, type]
+    scene: bool
+
+
+@cache
+def helps(record: type) -> dict[str, str]:
+    """The docstring below each field of a settings record."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(record))).body[0].body
+    return {before.target.id: after.value.value for before, after in zip(body, body[1:], strict=False)
+            if isinstance(before, ast.AnnAssign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)}
+
+
+def options(record: type) -> list[Option]:
+    """The options of a record, in order; records inside it belong to other commands, to which one line points."""
+    found = []
+    for field in fields(record):
+        kind = get_type_hints(record, include_extras=True)[field.name]
+        notes = get_args(kind)[1:] if get_origin(kind) is Annotated else ()
+        bare = get_args(kind)[0] if notes else kind
+        if "Suppress" in repr(notes):
+            continue
+        name = next((note.name for note in notes if getattr(note, "name", None) is not None), field.name).replace("_", "-")
+        if is_dataclass(bare):
+            found += [Option(f"--{name}.OPTION", "", "", f"The options of `sc3d {name}`.")] if name else options(bare)
+            continue
+        about = next((note.help for note in notes if getattr(note, "help", None)), None) or helps(record).get(field.name, "")
+        positional = "Positional" in repr(kind)
+        default = None if field.default is MISSING else field.default
+        flag = name.upper() if positional else f"--{name}, --no-{name}" if bare is bool else f"--{name}"
+        found.append(Option(flag, "" if bare is bool else _values(bare), "" if positional else _shown(default), " ".join(about.split())))
+    return found
+
+
+def page(name: str, command: Command) -> str:
+    """Markdown page of a command."""
+    parts = [NOTE, f"# sc3d {name}", command.about]
+    for subcommand, record in command.records.items():
+        usage = " ".join(["sc3d", name, *([subcommand] if subcommand else []), *(["SCENE"] if command.scene else []),
+                          *(option.flag for option in options(record) if not option.flag.startswith("-")), "[options]"])
+        heading = [f"## {subcommand}", " ".join((record.__doc__ or "").split())] if subcommand else []
+        parts += [*heading, f"```\n{usage}\n```", _table(options(record), command.scene)]
+    return "\n\n".join(parts) + "\n"
+
+
+def write_pages(folder: Path, commands: dict[str, Command]) -> list[Path]:
+    """`<command>.md` for every command, and `README.md`, the list of them."""
+    written = []
+    for name, command in commands.items():
+        written.append(folder / f"{name}.md")
+        write_text(written[-1], page(name, command))
+    lines = [f"| [{name}]({name}.md) | {command.about} |" for name, command in commands.items()]
+    write_text(folder / "README.md", "\n".join([NOTE, "", "# Commands", "", "| command | |", "|---|---|", *lines]) + "\n")
+    return [*written, folder / "README.md"]
+
+
+def _table(found: list[Option], scene: bool) -> str:
+    rows = [(option.flag, option.values, option.default, option.help) for option in found]
+    rows += [("--overwrite", "", "False", "Run again even if the outputs are up to date.")] if scene else []
+    cells = ["| " + " | ".join(_escaped(cell) for cell in (f"`{flag}`", values, default, about)) + " |" for flag, values, default, about in rows]
+    return "\n".join(["| option | values | default | |", "|---|---|---|---|", *cells])
+
+
+def _escaped(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def _values(kind: Any) -> str:  # noqa: ANN401 - any type of a field
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _values(arguments[0])
+    if origin is Literal:
+        return ", ".join(map(str, arguments))
+    if origin in (Union, UnionType):
+        return _values(next(argument for argument in arguments if argument is not NoneType))
+    if origin is tuple:
+        return f"{_values(arguments[0])} ..." if arguments[-1] is Ellipsis else " ".join(_values(argument) for argument in arguments)
+    return {int: "whole number", float: "number", str: "text", Path: "path"}.get(kind, getattr(kind, "__name__", str(kind)))
+
+
+def _shown(value: object) -> str:
+    if value is None or value == ():
+        return "none"
+    return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
