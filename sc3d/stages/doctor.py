@@ -35,7 +35,7 @@ def main(command: Doctor) -> None:
     for name, code in PROBES.items():
         logger.info("%-22s %s", name, _probe(code))
     logger.info("%-22s %s", "processor cores", os.cpu_count())
-    for model in (Segment.detector, Segment.segmenter):
+    for model in (Segment.detector, Segment.segmenter, Segment.concept_model):
         logger.info("%-22s %s", model, _weights(model, command.model_dir))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,8 @@ from sc3d.errors import InputError
 from sc3d.io import atomic_path, digest, find_photos, read_json, write_image, write_json
 from sc3d.scene import Scene, photo_sizes
 from sc3d.settings import Segment
+
+logger = logging.getLogger(__name__)
 
 
 def inputs(scene: Scene, settings: Segment) -> list[Path]:
@@ -42,13 +45,13 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
     class_table = with_prompts(class_table, settings.prompts)
     segmenter = _segmenter(scene, settings, class_table)
     folders = Folders(scene.masks, scene.confidence, scene.instances)
-    # Masks of an interrupted run are gone on with if they were made with the same settings; others are the user's to remove.
+    # Masks of an interrupted run are gone on with if they were made with the same settings; others are set aside.
     marker, state = scene.path / "segment.unfinished.json", _state(scene, settings, class_table)
     unfinished = marker.exists() and read_json(marker) == state
-    if scene.masks.exists() and not unfinished:
-        raise InputError(f"{scene.masks} holds masks that other settings made: remove the folder to make new ones")
     if unfinished:
         _remove_leftovers(folders.masks, folders.confidence, folders.instances)
+    else:
+        _set_aside(folders.masks, folders.confidence, folders.instances)
     write_json(marker, state)
     summary = segment_photos(find_photos(scene.images), folders, segmenter, class_table)
     marker.unlink()
@@ -62,6 +65,17 @@ def _state(scene: Scene, settings: Segment, class_table: ClassTable) -> object:
     decisive = replace(settings, device="auto", download=False, model_dir=None)
     strokes = digest(settings.strokes or scene.strokes) if settings.backend == "strokes" else ""
     return json.loads(json.dumps([repr(decisive), class_table.as_json(), strokes]))
+
+
+def _set_aside(*folders: Path) -> None:
+    """Older masks may hold somebody's work: they become `<folder>.before`, in place of still older ones."""
+    for folder in folders:
+        before = folder.with_name(f"{folder.name}.before")
+        if before.is_dir():
+            shutil.rmtree(before)
+        if folder.is_dir():
+            folder.rename(before)
+            logger.info("%s is now %s", folder, before)
 
 
 def _remove_leftovers(*folders: Path) -> None:
