@@ -202,7 +202,7 @@ def test_flight_passes_through_the_cameras(trained, tmp_path):
 
 def test_side_by_side_keeps_the_pictures():
     left, right = (np.full((30, 200, 3), value, np.uint8) for value in (10, 200))
-    picture = side_by_side(left, right, ("a" * 200, "b"))
+    picture = side_by_side((left, right), ("a" * 200, "b"))
     assert np.array_equal(picture[:30, :200], left) and np.array_equal(picture[:30, -200:], right) and picture.shape[0] > 40
 
 

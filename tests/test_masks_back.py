@@ -41,6 +41,7 @@ def test_masks_back_are_right_where_the_given_ones_are_not(scene):
         assert (mask == truth)[truth > 0].mean() > 0.985
         confidence = np.array(Image.open(scene / "export" / "confidence" / stem(view)))
         assert ((confidence > 0) == (mask > 0)).all() and np.median(confidence[mask > 0]) > 200
+    assert Image.open(scene / "export" / "masks.jpg").size[0] >= 1200  # masks in and back; there are no photos
 
 
 def test_masks_back_can_be_small_and_go_in_again(scene):

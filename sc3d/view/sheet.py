@@ -97,15 +97,17 @@ def half_of(size: tuple[int, int]) -> tuple[int, int]:
     return max(1, (size[0] - _GAP) // 2), max(1, size[1] - 2 * caption_font(size[0])[1])
 
 
-def side_by_side(left: np.ndarray, right: np.ndarray, captions: tuple[str, str]) -> np.ndarray:
-    """Two (H, W, 3) uint8 RGB pictures of one size beside one another, with a line of text below each."""
+def side_by_side(pictures: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
+    """(H, W, 3) uint8 RGB pictures of one size beside one another, with a line of text below each."""
     from PIL import Image, ImageDraw
 
-    height, width = left.shape[:2]
-    font, size = caption_font(2 * width + _GAP)
-    picture = Image.new("RGB", (2 * width + _GAP, height + 2 * size), PAPER)
+    height, width = pictures[0].shape[:2]
+    total = len(pictures) * (width + _GAP) - _GAP
+    font, size = caption_font(total)
+    picture = Image.new("RGB", (total, height + 2 * size), PAPER)
     draw = ImageDraw.Draw(picture)
-    for image, caption, start in zip((left, right), captions, (0, width + _GAP), strict=True):
+    for row, (image, caption) in enumerate(zip(pictures, captions, strict=True)):
+        start = row * (width + _GAP)
         picture.paste(Image.fromarray(image), (start, 0))
         draw.text((start + size // 2, height + size), _shortened(caption, font, width - size), font=font, fill=INK, anchor="lm")
     return np.asarray(picture)
