@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,6 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.io import read_json
+
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # in names: they would act on terminals, or cannot be written
+MAX_NAME, MAX_BYTES = 200, 1 << 20
 
 
 @dataclass(frozen=True)
@@ -65,12 +69,9 @@ class ClassTable:
 
 def read_classes(path: Path) -> ClassTable:
     """Read `classes.json`; raises InputError that names the faulty entry."""
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path} is missing: pass --classes FILE, or copy data/classes.json from the sc3d repository and edit it") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not valid JSON ({error})") from None
+    if not path.exists():
+        raise InputError(f"{path} is missing: pass --classes FILE, or copy data/classes.json from the sc3d repository and edit it")
+    entries = read_json(path, MAX_BYTES)
     return parse_classes(entries, path)
 
 
@@ -100,6 +101,8 @@ def _parse_class(entry: object, origin: Path | str) -> SemanticClass:
     prompts, asprs = entry.get("prompts", [name]), entry.get("asprs", 1)
     if not isinstance(prompts, list | tuple) or not all(isinstance(prompt, str) for prompt in prompts):
         raise InputError(f"{origin}: prompts of class {label} must be a list of texts")
+    if any(CONTROL.search(text) for text in (name, *prompts)) or len(name) > MAX_NAME:
+        raise InputError(f"{origin}: name or prompts of class {label} hold control characters, or more than {MAX_NAME} letters")
     if not _is_int(asprs, 0, 255):
         raise InputError(f"{origin}: asprs code of class {label} must be a whole number from 0 to 255")
     return SemanticClass(label, name.strip(), tuple(color), tuple(prompts), asprs)

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.fusion import Labels
+from sc3d.fusion import STATE_NAMES, Labels
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, orient_normals, point_spacing
-from sc3d.geometry.raycast import FirstSurface, Surface, first_surface, nearest_points
+from sc3d.geometry.raycast import FirstSurface, RayTarget, Surface, first_surface, nearest_points
+from sc3d.geometry.traversal import VoxelSurface
 from sc3d.io import read_cloud, read_mesh
 
 NORMAL_NEIGHBORS = 30
+SURFACE_VOXEL = 2.5  # of the grid that blocks rays where there is no mesh, in point spacings
 REACH = 4.0  # a pixel shows the label of a cloud point at most this many point spacings away from the surface that it sees
 VOTES = "votes_"  # + class id; PLY has scalar properties only
 
@@ -37,12 +40,17 @@ def point_arrays(cloud: o3d.t.geometry.PointCloud, centres: np.ndarray) -> tuple
     return points, orient_normals(points, estimate_normals(points, neighbors), centres)
 
 
-def read_surface(mesh: Path, points: np.ndarray, normals: np.ndarray, origin: np.ndarray) -> Surface:
-    """The surface that rays hit: the mesh file if there is one, else surfels at the points (world), in a frame shifted by `origin`."""
-    if not mesh.exists():
+def read_surface(mesh: Path, points: np.ndarray, normals: np.ndarray | None, origin: np.ndarray, kind: Literal["auto", "surfels", "voxels"] = "auto") -> RayTarget:
+    """The surface that rays hit, `Label.surface`: the mesh file if there is one and nothing else is wanted, else that of the points.
+
+    points: (N, 3) float64 world; normals: (N, 3) float32 unit or None = estimated; origin: (3,) world, shift of the frame for float32
+    """
+    if kind == "auto" and mesh.exists():
+        read = read_mesh(mesh)
+        return Surface.from_mesh(read.vertex.positions.numpy().astype(np.float64), read.triangle.indices.numpy(), origin)
+    if kind == "surfels":
         return Surface.from_cloud(points, normals, origin)
-    read = read_mesh(mesh)
-    return Surface.from_mesh(read.vertex.positions.numpy().astype(np.float64), read.triangle.indices.numpy(), origin)
+    return VoxelSurface.from_cloud(points, normals, SURFACE_VOXEL * spacing_of(points))
 
 
 def with_labels(cloud: o3d.t.geometry.PointCloud, normals: np.ndarray, labels: Labels, votes: np.ndarray | None = None) -> o3d.t.geometry.PointCloud:
@@ -69,18 +77,32 @@ def read_labelled(path: Path, made_by: str) -> tuple[o3d.t.geometry.PointCloud, 
     if not path.exists():
         raise InputError(f"{path} is missing: run `sc3d {made_by} SCENE` first")
     cloud = read_cloud(path)
-    missing = [name for name in ("label", "confidence", "state", "num_views") if name not in cloud.point]
+    ranges = {"label": (255, np.uint8), "confidence": (1, np.float32), "state": (len(STATE_NAMES) - 1, np.uint8), "num_views": (2**31 - 1, np.int32)}
+    missing = [name for name in ranges if name not in cloud.point]
     if missing:
         raise InputError(f"{path} has no attribute {missing[0]!r}: it was not written by `sc3d {made_by}`")
-    return cloud, Labels(*(cloud.point[name].numpy().ravel() for name in ("label", "confidence", "state", "num_views")))
+    labels = Labels(*(_in_range(path, name, cloud.point[name].numpy().ravel(), *ranges[name]) for name in ranges))
+    for name in ranges:
+        cloud.point[name] = o3d.core.Tensor(getattr(labels, name)[:, None])
+    return cloud, labels
+
+
+def _in_range(path: Path, name: str, values: np.ndarray, largest: int, dtype: type) -> np.ndarray:
+    """The values as `dtype`; InputError if it cannot hold them, or they are not from 0 to `largest`."""
+    if not ((values >= 0) & (values <= largest)).all() or (np.issubdtype(dtype, np.integer) and (values != np.floor(values)).any()):
+        raise InputError(f"{path} has values of {name!r} that are not from 0 to {largest}: it is damaged, or was not written by sc3d")
+    return values.astype(dtype)
 
 
 def read_votes(cloud: o3d.t.geometry.PointCloud) -> np.ndarray | None:
-    """(N, num_ids) float32 votes that `label` left in a cloud; None if there are none."""
+    """(N, num_ids) float32 votes that `label` left in a cloud; None if there are none. InputError if they are none."""
     ids = sorted(int(name[len(VOTES) :]) for name in cloud.point if name.startswith(VOTES) and name[len(VOTES) :].isdigit())
     if not ids or ids != list(range(len(ids))):
         return None
-    return np.concatenate([cloud.point[f"{VOTES}{label}"].numpy() for label in ids], axis=1)
+    votes = np.concatenate([cloud.point[f"{VOTES}{label}"].numpy().astype(np.float32) for label in ids], axis=1)
+    if len(ids) > 256 or not (np.isfinite(votes) & (votes >= 0)).all():
+        raise InputError("the votes of the cloud are not finite numbers of up to 255 classes: run `sc3d label` again")
+    return votes
 
 
 def spacing_of(points: np.ndarray) -> float:
@@ -96,14 +118,14 @@ class LabelledSurface:
     label: (N,) uint8 ids; reach: largest distance between surface and point, world units
     """
 
-    surface: Surface
+    surface: RayTarget
     index: NeighborIndex
     label: np.ndarray
     reach: float
 
     @classmethod
     def build(cls, cloud: o3d.t.geometry.PointCloud, views: list[View], mesh: Path) -> LabelledSurface:
-        """cloud: with `label`; views: of the scene, for the side that normals face; mesh: file of the surface, surfels if it does not exist."""
+        """cloud: with `label`; views: of the scene, for the side that normals face; mesh: file of the surface, voxels of the cloud if it does not exist."""
         if "label" not in cloud.point:
             raise InputError("the cloud has no labels: run `sc3d label SCENE` and `sc3d propagate SCENE`")
         points, normals = point_arrays(cloud, np.array([view.centre for view in views]))

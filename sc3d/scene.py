@@ -8,9 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.classes import ClassTable, read_classes
+from sc3d.classes import CONTROL, ClassTable, read_classes
 from sc3d.errors import InputError
-from sc3d.io import find_photos, image_size, read_index_image
+from sc3d.formats import FARTHEST
+from sc3d.io import check_photo, find_photos, image_size, read_index_image, require_within
+
+
+MAX_MASK = 100_000_000  # pixels of a mask that is larger than its photo
 
 
 @dataclass(frozen=True)
@@ -139,18 +143,12 @@ def read_sparse_model(path: Path) -> SparseModel:
     """Read a COLMAP model, binary or text; InputError if it is missing, broken or names photos outside the scene."""
     import pycolmap
 
+    from sc3d.formats.colmap import load_model
     from sc3d.geometry.cameras import View
 
-    if not any((path / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
-        raise InputError(f"no cameras in {path}: run `sc3d reconstruct PHOTOS SCENE`, or put a COLMAP model there")
-    try:
-        reconstruction = pycolmap.Reconstruction(str(path))
-    except Exception as error:  # pycolmap raises bare RuntimeError, ValueError and IndexError for broken files
-        raise InputError(f"cannot read the COLMAP model in {path}: {str(error).splitlines()[0]}") from None
-    if not reconstruction.num_reg_images():
-        raise InputError(f"the COLMAP model in {path} has no registered photos")
+    reconstruction = load_model(path)
     images = sorted((reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()), key=lambda image: image.name)
-    point_ids = np.array(sorted(reconstruction.point3D_ids()), dtype=np.int64)
+    point_ids = np.array(sorted(reconstruction.point3D_ids()), dtype=np.uint64)
     points = [reconstruction.point3D(int(point_id)) for point_id in point_ids]
     views, tracks = [], []
     for image in images:
@@ -158,14 +156,14 @@ def read_sparse_model(path: Path) -> SparseModel:
         cam_from_world = np.eye(4)
         cam_from_world[:3] = image.cam_from_world().matrix()
         views.append(View(image.name, pycolmap.Camera(image.camera.todict()), cam_from_world))  # a copy: image.camera dies with the model
-        seen = np.array([point.point3D_id for point in image.get_observation_points2D()], dtype=np.int64)
-        tracks.append(np.unique(np.searchsorted(point_ids, seen)))
+        seen = np.array([point.point3D_id for point in image.get_observation_points2D()], dtype=np.uint64)
+        tracks.append(np.searchsorted(point_ids, np.intersect1d(seen, point_ids)))  # without points that were filtered out of the model
     stems = [Path(view.name).stem for view in views]
     if len(set(stems)) < len(stems):
         raise InputError(f"{path}: two photos share a name up to the suffix, by which masks are found; rename one")
     xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
-    if not (np.isfinite(xyz).all() and all(np.isfinite(view.cam_from_world).all() for view in views)):
-        raise InputError(f"{path} holds positions that are not finite numbers")
+    if not (np.abs(xyz) < FARTHEST).all():
+        raise InputError(f"{path} holds positions that are not finite numbers, or more than {FARTHEST:g} from the origin")
     return SparseModel(views, xyz, np.array([point.color for point in points], np.uint8).reshape(-1, 3), tracks)
 
 
@@ -184,6 +182,7 @@ def match_masks(folder: Path, photo_sizes: dict[str, tuple[int, int]], class_tab
         name = names.get(file.stem)
         if name is None:
             raise InputError(f"{file} belongs to no photo: {len(names)} photos are known, such as {next(iter(photo_sizes))}")
+        require_within(file, folder)
         check_mask_aspect(file, image_size(file), photo_sizes[name])
         if class_table is not None:
             unknown = class_table.unknown(read_index_image(file))
@@ -196,15 +195,18 @@ def match_masks(folder: Path, photo_sizes: dict[str, tuple[int, int]], class_tab
 def check_mask_aspect(file: Path, mask_size: tuple[int, int], photo_size: tuple[int, int]) -> None:
     """Raise InputError unless a mask has the aspect of its photo within 1 px of the smaller of the two."""
     (width, height), (photo_width, photo_height) = mask_size, photo_size
+    if width * height > max(MAX_MASK, photo_width * photo_height):
+        raise InputError(f"{file} is {width}x{height}, but its photo is {photo_width}x{photo_height}: more than {MAX_MASK // 10**6} megapixels are refused")
     scale = min(1.0, min(photo_width / width, photo_height / height))
     if abs(width * photo_height - height * photo_width) * scale > max(photo_width, photo_height):
         raise InputError(f"{file} is {width}x{height}, but its photo is {photo_width}x{photo_height}: the aspect must be the same within 1 px")
 
 
 def check_photos(scene: Scene, names: list[str]) -> None:
-    """Raise InputError if a photo of the model is not in `images/` or cannot be read."""
+    """Raise InputError if a photo of the model is not in `images/`, cannot be read, is cut off, or is a link that leads elsewhere."""
     for name in names:
-        image_size(scene.photo(name))
+        check_photo(scene.photo(name))
+        require_within(scene.photo(name), scene.images)
 
 
 def photo_sizes(folder: Path) -> dict[str, tuple[int, int]]:
@@ -214,5 +216,5 @@ def photo_sizes(folder: Path) -> dict[str, tuple[int, int]]:
 
 def _check_name(name: str, origin: Path) -> None:
     path = Path(name)
-    if not name or path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
+    if not path.name or path.is_absolute() or ".." in path.parts or "\\" in name or CONTROL.search(name):
         raise InputError(f"{origin} names the photo {name!r}, which lies outside the scene")

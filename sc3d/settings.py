@@ -129,6 +129,9 @@ class Label:
     disagreement and the paper's weights, whatever the other options say."""
     depth_filter: bool = True
     """Only the first surface along each ray is labelled; --no-depth-filter lets labels penetrate."""
+    surface: Literal["auto", "surfels", "voxels"] = "auto"
+    """What hides the points behind it. auto: mesh.ply, without it the same as voxels; voxels: the grid of the cloud's own points, traversed coarse to fine;
+    surfels: a square around every point."""
     consensus: float = 0.66
     """Share of the votes that the winning class needs, else the voxel is locked (conflict-lock)."""
     voxel_size: float = 0.0
@@ -214,7 +217,7 @@ class Export:
     """EPSG code of a projected CRS for the coordinates (laz, clouds, orthophoto, objects); 0 = that of the scene. Without a georeference it says which
     CRS the scene's coordinates are in."""
     pixel_size: float = 0.0
-    """Side of a pixel on the ground, m; 0 = the spacing of the points, rounded to one digit (orthophoto)."""
+    """Side of a pixel on the ground, m; 0 = the spacing of the points, twice that without a mesh, rounded to one digit (orthophoto)."""
     min_height: float = 2.0
     """Lower buildings and plants are left out, m (objects)."""
     min_area: float = 10.0
@@ -273,21 +276,33 @@ class ImportCommand:
 
 @dataclass(frozen=True)
 class View:
-    """Look at a scene: Open3D window, or a picture without a display."""
+    """Look at a scene: Open3D window, page in the browser, or a picture without a display."""
 
     scene: Annotated[Positional[Path], arg(help="Scene folder.")]
-    by: Literal["photo", "label", "confidence", "state"] = "label"
-    """What the colours show."""
+    by: Literal["photo", "label", "confidence", "state", "disagreement"] = "label"
+    """What the colours show; disagreement: share of the votes that the winning class did not get."""
+    classes: tuple[str, ...] = ()
+    """Names of the classes to show; all otherwise."""
     file: Path | None = None
     """Cloud or mesh to show; the labelled cloud, or else cloud.ply, otherwise."""
     photo: str | None = None
     """Look through the camera of this photo."""
     splats: bool = False
-    """Render the Gaussians instead of the cloud; with --photo, beside the photo (with --screenshot)."""
+    """Show the Gaussians instead of the cloud (with --web, --html, --screenshot); with --photo and --screenshot, beside the photo."""
     from_above: bool = False
-    """Straight down instead of oblique (with --screenshot)."""
+    """Straight down instead of oblique (with --web, --html, --screenshot)."""
     cameras: bool = True
     """Draw the cameras."""
+    web: bool = False
+    """Serve a page for the browser instead of opening a window, until Ctrl + C; needs `pip install 'sc3d[web]'`."""
+    host: str = "127.0.0.1"
+    """Address to serve on; 0.0.0.0 = to everybody who can reach this machine, without a password (with --web)."""
+    port: int = 8080
+    """Port to serve on; the next free one if it is taken (with --web)."""
+    html: Path | None = None
+    """Write a page that opens from disk without a server."""
+    points: int = 0
+    """Points shown at the start, of which the page can show more (with --web), or at most (with --html); 0 = 1000000, and 300000 in a file."""
     screenshot: Path | None = None
     """Write a picture (PNG, JPEG) instead of opening a window."""
     flight: Path | None = None
@@ -394,7 +409,7 @@ class Run:
     photos: Annotated[Positional[Path], arg(help="Folder of photos; never modified.")]
     scene: Annotated[Positional[Path], arg(help="Scene folder to write.")]
     masks: Path | None = None
-    """Folder of masks <photo stem>.png; short for --segment.masks."""
+    """Masks made elsewhere; short for --segment.masks."""
     confidence: Path | None = None
     """Folder of confidence maps; short for --segment.confidence."""
     classes: Path | None = None

@@ -8,45 +8,62 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from tqdm import tqdm
 
+from sc3d.georeferencing.alignment import Similarity, main_plane
+from sc3d.georeferencing.control_points import ControlPoints, align_to_control_points, transform
 from sc3d.errors import InputError, Sc3dError
+from sc3d.georeferencing.focal import anchor_focal, tells_focal
+from sc3d.georeferencing.georeference import Georeference, from_origin
+from sc3d.georeferencing.gps import Flight, place, read_flight, residuals
 from sc3d.io import atomic_path
 from sc3d.settings import Reconstruct
 
 logger = logging.getLogger(__name__)
 
-MIN_GPS = 3  # a similarity transform needs three positions
+LOOSE = 1.1  # a model is moved onto its GPS if that makes the root mean square distance smaller by this factor
 
 
-def reconstruct(images: Path, names: list[str], sparse: Path, settings: Reconstruct) -> dict[str, object]:
-    """Photos to a COLMAP model in `sparse`.
+@dataclass(frozen=True)
+class Reconstructed:
+    """What `reconstruct` found besides the model: figures for the summary, and where the model lies on Earth, if that is known."""
+
+    summary: dict[str, object]
+    georeference: Georeference | None
+
+
+def reconstruct(images: Path, names: list[str], sparse: Path, settings: Reconstruct, control_points: ControlPoints | None = None) -> Reconstructed:
+    """Photos to a COLMAP model in `sparse`: in local ENU, metric and upright, where GPS or control points allow it.
 
     images: folder; names: photos relative to it; sparse: folder to write the binary model to
-    returns: summary with the registered and left-out photos, reprojection error in px, and the frame of the result
     """
     pycolmap.set_random_seed(settings.seed)
     pycolmap.logging.minloglevel = 2
     if settings.camera_model not in pycolmap.CameraModelId.__members__ or settings.camera_model == "INVALID":
         raise InputError(f"unknown camera model {settings.camera_model!r}: one of {', '.join(list(pycolmap.CameraModelId.__members__)[1:])}")
+    flight = read_flight(images, names) if settings.gps else None
+    if settings.matching == "spatial" and flight is None:
+        raise InputError("--matching spatial needs GPS in the photos' EXIF: use exhaustive or sequential")
     sparse.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".work-", dir=sparse.parent) as folder:
         work = Path(folder)
         database = work / "database.db"
         _extract(database, images, names, settings)
-        origin = _gps_origin(database) if settings.gps else None
-        _match(database, len(names), settings, origin is not None)
-        reconstruction = _map(database, images, work, settings, len(names), origin is not None)
-        if origin is None:
-            _level(reconstruction)
+        _write_priors(database, flight)
+        _match(database, len(names), settings)
+        model = _map(database, images, work, settings, len(names), flight is not None)
+        free = settings.focal == "refine" or (settings.focal == "auto" and tells_focal(model))
+        focal = {} if free else anchor_focal(model, images, flight)
+        georeference = _georeference(model, flight, control_points, settings)
         with atomic_path(sparse) as output:
             output.mkdir()
-            reconstruction.write_binary(str(output))
-    return _summary(reconstruction, names, origin)
+            model.write_binary(str(output))
+    return Reconstructed(_summary(model, names, georeference) | focal | _heights(model, flight, georeference), georeference)
 
 
 def _extract(database: Path, images: Path, names: list[str], settings: Reconstruct) -> None:
@@ -59,9 +76,28 @@ def _extract(database: Path, images: Path, names: list[str], settings: Reconstru
         pycolmap.extract_features(database, images, names, pycolmap.CameraMode.AUTO, reader, options, pycolmap.Device.cpu)
 
 
-def _match(database: Path, num_photos: int, settings: Reconstruct, has_gps: bool) -> None:
-    if settings.matching == "spatial" and not has_gps:
-        raise InputError("--matching spatial needs GPS in the photos' EXIF: use exhaustive or sequential")
+def _write_priors(database: Path, flight: Flight | None) -> None:
+    """Replace the positions that pycolmap read from EXIF by ENU positions with their covariance; photos without get none."""
+    none = np.full(3, np.nan)
+    with pycolmap.Database.open(database) as opened:
+        images = {image.image_id: image for image in opened.read_all_images()}
+        priors = {prior.corr_data_id.id: prior for prior in opened.read_all_pose_priors()}
+        for image_id, image in sorted(images.items()):
+            tag = flight.tags.get(image.name) if flight else None
+            prior = priors.get(image_id) or (pycolmap.PosePrior() if tag else None)
+            if prior is None:
+                continue
+            prior.corr_data_id = image.data_id
+            prior.position = flight.positions[image.name] if tag else none
+            prior.position_covariance = np.diag(tag.sigma**2 if tag else none)
+            prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
+            if image_id in priors:
+                opened.update_pose_prior(prior)
+            else:
+                opened.write_pose_prior(prior)
+
+
+def _match(database: Path, num_photos: int, settings: Reconstruct) -> None:
     match = {"exhaustive": pycolmap.match_exhaustive, "sequential": pycolmap.match_sequential, "spatial": pycolmap.match_spatial}
     num_pairs = num_photos * (num_photos - 1) // 2 if settings.matching == "exhaustive" else None
     with _progress(database, "two_view_geometries", num_pairs, "matching", "pair"):
@@ -103,30 +139,45 @@ def _progress(database: Path, table: str, total: int | None, description: str, u
         thread.join()
 
 
-def _gps_origin(database: Path) -> list[float] | None:
-    """Latitude, longitude (degrees) and altitude (m) of the first photo with GPS, the origin of pycolmap's ENU frame; None without GPS."""
-    with pycolmap.Database.open(database) as opened:
-        priors = sorted(opened.read_all_pose_priors(), key=lambda prior: prior.corr_data_id.id)
-    positions = [prior.position for prior in priors if prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84]
-    positions = [position for position in positions if np.isfinite(position).all()]
-    return [float(value) for value in positions[0]] if len(positions) >= MIN_GPS else None
+def _georeference(
+    model: pycolmap.Reconstruction, flight: Flight | None, control_points: ControlPoints | None, settings: Reconstruct
+) -> Georeference | None:
+    """Bring a model into local ENU, from control points or else from GPS, or make it level at least; returns what is then known of its place."""
+    if control_points is not None:
+        figures = align_to_control_points(model, control_points, refine_focal=tells_focal(model))
+        return from_origin(control_points.origin, settings.epsg or control_points.epsg, settings.altitude_offset, {"control_points": figures})
+    fit = place(flight, _centres(model), _points(model)) if flight else None
+    if fit is None:
+        if flight:
+            logger.warning("the registered photos do not fit their GPS: the model has no scale, no north and no position")
+        _level(model)
+        return None
+    moved = dict(zip(_centres(model), fit.apply(np.array(list(_centres(model).values())))))
+    if flight.shape == "line" or residuals(flight, _centres(model))["rms"] > LOOSE * residuals(flight, moved)["rms"]:
+        transform(model, fit)
+    return from_origin(flight.origin, settings.epsg, settings.altitude_offset, {"gps": residuals(flight, _centres(model))})
 
 
-def _level(reconstruction: pycolmap.Reconstruction) -> None:
+def _centres(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    """Camera centre (3,) by photo name."""
+    images = sorted((model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name)
+    return {image.name: image.projection_center() for image in images}
+
+
+def _points(model: pycolmap.Reconstruction) -> np.ndarray:
+    return np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+
+
+def _level(model: pycolmap.Reconstruction) -> None:
     """Without GPS: z up = normal of the main plane of the sparse points, towards the cameras; unit = unknown."""
-    points = np.array([point.xyz for point in reconstruction.points3D.values()])
-    centres = np.array([reconstruction.image(image_id).projection_center() for image_id in reconstruction.reg_image_ids()])
-    middle = np.median(points, axis=0)
-    near = points[np.linalg.norm(points - middle, axis=1) <= np.quantile(np.linalg.norm(points - middle, axis=1), 0.9)]
-    axes = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2]
-    if axes[2] @ (centres.mean(axis=0) - middle) < 0:
-        axes = axes * [[1], [1], [-1]]
-    axes[1] = np.cross(axes[2], axes[0])
-    reconstruction.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(axes), -axes @ middle))
+    axes, middle = main_plane(_points(model))
+    if axes[2] @ (np.mean(list(_centres(model).values()), axis=0) - middle) < 0:
+        axes = axes * [[1], [-1], [-1]]
+    transform(model, Similarity(1.0, axes, -axes @ middle))
 
 
-def _summary(reconstruction: pycolmap.Reconstruction, names: list[str], origin: list[float] | None) -> dict[str, object]:
-    registered = {reconstruction.image(image_id).name for image_id in reconstruction.reg_image_ids()}
+def _summary(model: pycolmap.Reconstruction, names: list[str], georeference: Georeference | None) -> dict[str, object]:
+    registered = {model.image(image_id).name for image_id in model.reg_image_ids()}
     left_out = [name for name in names if name not in registered]
     if left_out:
         logger.warning("%d of %d photos could not be registered: %s", len(left_out), len(names), ", ".join(left_out))
@@ -134,8 +185,29 @@ def _summary(reconstruction: pycolmap.Reconstruction, names: list[str], origin: 
         "photos": len(names),
         "registered": len(registered),
         "left_out": left_out,
-        "points": reconstruction.num_points3D(),
-        "reprojection_error_px": round(float(reconstruction.compute_mean_reprojection_error()), 3),
-        "frame": "local" if origin is None else "ENU",
-        "origin_lat_lon_alt": origin,
-    }
+        "points": model.num_points3D(),
+        "reprojection_error_px": round(float(model.compute_mean_reprojection_error()), 3),
+        "frame": "ENU" if georeference else "local",
+        "origin_lat_lon_alt": list(georeference.origin) if georeference else None,
+        "epsg": georeference.epsg if georeference else None,
+    } | _errors(georeference)
+
+
+def _heights(model: pycolmap.Reconstruction, flight: Flight | None, georeference: Georeference | None) -> dict[str, float]:
+    """Flight height above the middle of the points, and above take-off where DJI's XMP states it, m; a warning where they are far apart."""
+    if georeference is None:
+        return {}
+    heights = {"height_above_points_m": round(float(np.mean([centre[2] for centre in _centres(model).values()]) - np.median(_points(model)[:, 2])), 1)}
+    stated = [tag.above_takeoff for tag in flight.tags.values() if tag.above_takeoff is not None] if flight else []
+    if stated:
+        heights["height_above_takeoff_m"] = round(float(np.median(stated)), 1)
+        if not 0.7 < heights["height_above_points_m"] / max(np.median(stated), 0.1) < 1.4:
+            logger.warning("the cameras lie %.0f m above the points, XMP says %.0f m above take-off: unless the ground is that uneven, the focal length is wrong "
+                           "(see --focal)", heights["height_above_points_m"], heights["height_above_takeoff_m"])
+    return heights
+
+
+def _errors(georeference: Georeference | None) -> dict[str, object]:
+    """Residuals for the summary: "rms_to_gps_m" or "rms_to_control_points_m"."""
+    figures = georeference.figures if georeference else {}
+    return {f"rms_to_{kind}_m": found["rms"] for kind, found in figures.items()}

@@ -21,8 +21,9 @@ from sc3d.io import write_geometry, write_image, write_json
 from sc3d.report import write_report
 from sc3d.report.charts import flight_map, histogram, paired_bars, reliability_curve
 from sc3d.report.images import comparison, ground_picture
-from sc3d.report.material import gather
-from sc3d.report.sections import certainty_section, class_section, headline, processing_section, quality_section, summary_line
+from sc3d.report.material import Material, gather
+from sc3d.report.found import class_areas, found_section
+from sc3d.report.sections import certainty_section, headline, processing_section, quality_section, summary_line
 from sc3d.scene import Scene
 from sc3d.labelled import LabelledSurface
 
@@ -164,7 +165,7 @@ def test_text_from_files_is_escaped(page):
 
 
 def test_all_sections_and_figures_are_there(page):
-    assert re.findall(r'<section id="(\w+)"', page) == ["cloud", "quality", "photos", "classes", "certainty", "flight", "processing"]
+    assert re.findall(r'<section id="(\w+)"', page) == ["cloud", "found", "quality", "photos", "certainty", "flight", "processing"]
     text = " ".join(Page(page).text)
     for figure in ("93.1%", "given masks 81.0%", "0.871", "98.8%", "8,000 points", "4 photos", "0.950", "0.792", "12.3", "2,345", "abc123", "0.20.0", "error 0.032"):
         assert figure in text, figure
@@ -234,7 +235,7 @@ def test_labels_without_truth_give_no_accuracy(toy, tmp_path):
     assert "accuracy" not in headline(material).lower() and "IoU" not in headline(material)
     assert "100.0%" in headline(material)
     assert quality_section(material) == "" and processing_section(material) == ""
-    assert "IoU" not in class_section(material) and "8,000 points in 2 classes." in summary_line(material)
+    assert "IoU" not in found_section(material) and "8,000 points in 2 classes." in summary_line(material)
     assert "seed" in certainty_section(material)
 
 
@@ -323,3 +324,21 @@ def test_no_renderer_leaves_out_the_pictures(toy, tmp_path, monkeypatch):
 def test_sidecar_floats_and_paths_are_readable(toy):
     assert json.dumps(gather(toy).records[1]["settings"])
     assert "<dd>0.8</dd>" in processing_section(gather(toy))
+
+
+def test_areas_are_those_of_the_highest_surface():
+    x, y = np.meshgrid(np.arange(0, 40, 0.25), np.arange(0, 20, 0.25))
+    ground = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    roof = ground[(ground[:, 0] < 10) & (ground[:, 1] < 10)] + [0, 0, 5]
+    points, labels = np.concatenate([ground, roof]), np.repeat(np.uint8([3, 1]), [len(ground), len(roof)])
+    areas = class_areas(points + [500000, 5200000, 0], labels)
+    assert areas[1] == pytest.approx(100, rel=0.06) and areas[3] == pytest.approx(700, rel=0.06) and areas.sum() == pytest.approx(800, rel=0.06)
+
+
+def test_counted_objects_are_in_the_report(tmp_path):
+    (tmp_path / "export").mkdir()
+    features = [{"type": "Feature", "properties": {"area_m2": area, "height_m": height}, "geometry": None} for area, height in ((100, 4), (60, 6), (20, 9))]
+    (tmp_path / "export" / "trees_local.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    (tmp_path / "export" / "buildings.geojson").write_text("[1]")
+    table = found_section(Material(Scene(tmp_path)))
+    assert "buildings" not in table and all(f"<td>{value}</td>" in table for value in ("3", "180", "60", "6.0", "9.0"))

@@ -6,8 +6,8 @@ Distances along rays are ranges (from the camera centre); depth = range * z comp
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
-import cv2
 import numba
 import numpy as np
 import open3d as o3d
@@ -16,12 +16,21 @@ from sc3d.geometry.cameras import View, camera_rays, in_image, project, rays
 from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, point_spacing
 
 RAYS = 1 << 19  # cast at a time: bounds memory, not results
-DEPTH_STEP = 0.02  # of the range between neighbouring pixels: a discontinuity
 SURFEL_NEIGHBORS = 8
 FLAT, SCATTERED = 0.8, 0.38  # half width of a surfel, in distances to the farthest neighbour
 RANGE_TOLERANCE, MIN_COSINE = 0.005, 0.2  # depth tolerance: share of the range, and the cosine of incidence below which it grows no more
 MAX_ROUGHNESS = 0.12  # mean distance of flat neighbours from the tangent plane, in the same unit
 MIN_SUPPORT = 4  # points around a surfel, itself not counted; fewer: a floater, which blocks nothing
+
+
+class RayTarget(Protocol):
+    """What rays can hit: `Surface` here, or `traversal.VoxelSurface`."""
+
+    def cast(self, view: View, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rays from the centre of `view` along (K, 3) float32 unit directions in its camera frame, NaN = no ray.
+
+        returns: (K,) float32 range, world units, inf = nothing hit; (K,) float32 |cosine| between ray and surface normal
+        """
 
 
 @dataclass(frozen=True)
@@ -47,6 +56,19 @@ class Surface:
         vertices, triangles = surfels(points - origin, normals)
         return cls(cls.from_mesh(vertices, triangles, np.zeros(3)).scene, np.asarray(origin, np.float64))
 
+    def cast(self, view: View, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `RayTarget.cast`."""
+        count = len(directions)
+        distance, incidence = np.empty(count, np.float32), np.empty(count, np.float32)
+        start = (view.centre - self.origin).astype(np.float32)
+        bundle = np.empty((min(count, RAYS), 6), np.float32)
+        for first in range(0, count, RAYS):
+            part = slice(first, min(first + RAYS, count))
+            _aim(directions[part], view.cam_from_world, start, bundle)
+            hit = self.scene.cast_rays(o3d.core.Tensor.from_numpy(bundle[: part.stop - first]))
+            _measure(directions[part], bundle, hit["t_hit"].numpy(), hit["primitive_normals"].numpy(), distance[part], incidence[part])
+        return distance, incidence
+
 
 @dataclass(frozen=True)
 class FirstSurface:
@@ -62,18 +84,10 @@ class FirstSurface:
     ray_z: np.ndarray
 
 
-def first_surface(surface: Surface, view: View) -> FirstSurface:
+def first_surface(surface: RayTarget, view: View) -> FirstSurface:
     """Cast the rays of all pixel centres of `view`, by the camera's own model."""
-    directions = camera_rays(view.camera)
-    count, shape = len(directions), (view.height, view.width)
-    distance, incidence = np.empty(count, np.float32), np.empty(count, np.float32)
-    origin = (view.centre - surface.origin).astype(np.float32)
-    bundle = np.empty((min(count, RAYS), 6), np.float32)
-    for start in range(0, count, RAYS):
-        part = slice(start, min(start + RAYS, count))
-        _aim(directions[part], view.cam_from_world, origin, bundle)
-        hit = surface.scene.cast_rays(o3d.core.Tensor.from_numpy(bundle[: part.stop - start]))
-        _measure(directions[part], bundle, hit["t_hit"].numpy(), hit["primitive_normals"].numpy(), distance[part], incidence[part])
+    directions, shape = camera_rays(view.camera), (view.height, view.width)
+    distance, incidence = surface.cast(view, directions)
     return FirstSurface(distance.reshape(shape), incidence.reshape(shape), directions[:, 2].reshape(shape))
 
 
@@ -94,20 +108,6 @@ def _measure(directions, bundle, t_hit, normals, distance, incidence):  # noqa: 
     for k in numba.prange(len(directions)):
         distance[k] = t_hit[k] if np.isfinite(directions[k, 2]) else np.float32(np.inf)
         incidence[k] = abs(normals[k, 0] * bundle[k, 3] + normals[k, 1] * bundle[k, 4] + normals[k, 2] * bundle[k, 5])
-
-
-def depth_edge_distance(ranges: np.ndarray) -> np.ndarray:
-    """(H, W) float32 distance of each pixel to the nearest depth discontinuity (a step of more than DEPTH_STEP, or the end of the surface), px.
-
-    ranges: (H, W) float32, inf = nothing hit. Pixels at the step have 0.5; large where there is none.
-    """
-    known = np.where(np.isfinite(ranges), ranges, np.float32(0))
-    kernel = np.ones((3, 3), np.uint8)
-    low, high = cv2.erode(known, kernel), cv2.dilate(known, kernel)
-    smooth = low >= (1 - DEPTH_STEP) * high
-    if smooth.all():
-        return np.full(ranges.shape, np.float32(sum(ranges.shape)))
-    return cv2.distanceTransform(smooth.view(np.uint8), cv2.DIST_L2, 5) + np.float32(0.5)
 
 
 def surface_points(first: FirstSurface, view: View, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:

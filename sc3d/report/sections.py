@@ -10,7 +10,8 @@ import numpy as np
 
 from sc3d.io import read_image
 from sc3d.report.certainty import certainty_section
-from sc3d.report.charts import css_color, flight_map, formatted, number, paired_bars
+from sc3d.report.charts import css_color, flight_map, number, paired_bars
+from sc3d.report.found import found_section, iou_of
 from sc3d.report.images import cloud_pictures, comparison, ground_picture, jpeg
 from sc3d.report.material import Material
 from sc3d.report.processing import processing_section
@@ -25,9 +26,9 @@ _COLOURING_NAMES = {"label": "Classes", "photo": "Photo colours", "confidence": 
 def sections(material: Material) -> Iterator[tuple[str, str, str]]:
     """Anchor, title and HTML of each part; empty HTML where its files are missing."""
     yield "cloud", "The labelled cloud", cloud_section(material)
+    yield "found", "What was found", found_section(material)
     yield "quality", "Agreement with the truth", quality_section(material)
     yield "photos", "In the photos", photo_section(material)
-    yield "classes", "Classes", class_section(material)
     yield "certainty", "Certainty", certainty_section(material)
     yield "flight", "Flight", flight_section(material)
     yield "training", "Gaussians", training_section(material)
@@ -95,7 +96,7 @@ def _zoomable(uri: str, aspect: float, text: str) -> str:
 
 def quality_section(material: Material) -> str:
     """IoU per class, labels against the given masks, and the confusion of the labels."""
-    labels, masks = _iou(material, "labels"), _iou(material, "masks")
+    labels, masks = iou_of(material, "labels"), iou_of(material, "masks")
     if not labels:
         return ""
     colors = _class_colors(material)
@@ -120,26 +121,6 @@ def photo_section(material: Material) -> str:
                              for caption, uri in panels)
             rows.append(f'<h3>{escape(view.name)}{_photo_figures(material, view.name)}</h3><div class="row">{images}</div>')
     return "".join(rows) + _legend(material, "label", everything=True) if rows else ""
-
-
-def class_section(material: Material) -> str:
-    """Points, share and confidence of each class."""
-    counts = material.label_counts
-    if counts is None or material.class_table is None:
-        return ""
-    labels, confidence, iou = material.values("label"), material.values("confidence"), _iou(material, "labels")
-    total, rows = max(int(counts.sum()), 1), []
-    sums = None if confidence is None else np.bincount(labels, np.nan_to_num(confidence), minlength=256)
-    for label in [*(entry.id for entry in material.class_table), *([0] if counts[0] else [])]:
-        name = material.class_table.name(label)
-        mean = "–" if sums is None or not counts[label] else f"{sums[label] / counts[label]:.2f}"
-        cells = [f"{counts[label]:,}", f"{counts[label] / total:.1%}"] + ([mean] if sums is not None else [])
-        cells += [formatted(iou.get(name), ".3f")] if iou else []
-        swatch = f'<i style="background:{css_color(material.class_table.palette[label])}"></i>'
-        rows.append(f"<tr><th>{swatch}{escape(name)}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
-    heads = ["Class", "Points", "Share"] + (["Confidence"] if sums is not None else []) + (["IoU"] if iou else [])
-    head = "".join(f"<th>{name}</th>" for name in heads)
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
 
 
 def flight_section(material: Material) -> str:
@@ -215,11 +196,6 @@ def _confusion(material: Material) -> str:
     head = "".join(f"<th>{escape(material.class_table.name(label))}</th>" for label in ids) + "<th>no label</th>"
     return (f'<h3>Confusion</h3><p class="note">Rows: the true class. Columns: what the fused labels say, as share of the row.</p>'
             f'<div class="scroll"><table class="confusion"><thead><tr><th></th>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>')
-
-
-def _iou(material: Material, source: str) -> dict[str, float | None]:
-    found = material.figures(source).get("iou")
-    return {str(name): number(value) for name, value in found.items()} if isinstance(found, dict) else {}
 
 
 def _class_colors(material: Material) -> dict[str, tuple[int, int, int]]:

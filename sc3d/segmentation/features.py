@@ -16,12 +16,12 @@ def pixel_features(image: np.ndarray) -> np.ndarray:
     """Features of every pixel.
 
     image: (H, W, 3) uint8 RGB
-    returns: (H, W, F) float32: means, standard deviations, band energies, edge strength and coherence, extremes
+    returns: (H, W, F) float32: means, standard deviations, band energies, strength and coherence of edges, extremes
     """
-    base = _channels(image)
-    lightness, log_red = base[0], base[3]
-    planes = list(base) + [_mean(channel, radius) for channel in base for radius in RADII]
-    planes += [_deviation(channel, radius) for channel in (lightness, log_red) for radius in TEXTURE_RADII]
+    channels = _channels(image)
+    lightness, green_over_red = channels[0], channels[3]
+    planes = channels + [_mean(channel, radius) for channel in channels for radius in RADII]
+    planes += [_deviation(channel, radius) for channel in (lightness, green_over_red) for radius in TEXTURE_RADII]
     planes += _band_energies(lightness) + _edges(lightness) + _extremes(lightness)
     return np.stack(planes, axis=-1)
 
@@ -46,8 +46,9 @@ def _deviation(plane: np.ndarray, radius: int) -> np.ndarray:
 
 def _band_energies(lightness: np.ndarray) -> list[np.ndarray]:
     """Mean size of the differences between neighbouring scales: how coarse the texture is."""
-    levels = [lightness, *(_mean(lightness, radius) for radius in RADII[:5])]
-    return [5 * np.log(_mean(np.abs(fine - coarse), 4 * radius) + 0.2) for fine, coarse, radius in zip(levels, levels[1:], RADII, strict=False)]
+    radii = RADII[:-1]
+    levels = [lightness, *(_mean(lightness, radius) for radius in radii)]
+    return [5 * np.log(_mean(np.abs(fine - coarse), 4 * radius) + 0.2) for fine, coarse, radius in zip(levels[:-1], levels[1:], radii, strict=True)]
 
 
 def _edges(lightness: np.ndarray) -> list[np.ndarray]:
@@ -57,8 +58,8 @@ def _edges(lightness: np.ndarray) -> list[np.ndarray]:
     planes = []
     for radius in TENSOR_RADII:
         xx, yy, xy = (_mean(product, radius) for product in (across * across, down * down, across * down))
-        trace, gap = xx + yy, np.sqrt((xx - yy) ** 2 + 4 * xy**2)
-        planes += [5 * np.log(np.sqrt(np.maximum(trace, 0)) + 0.2), 10 * gap / (trace + 0.5)]
+        trace, gap = np.maximum(xx + yy, 0), np.sqrt((xx - yy) ** 2 + 4 * xy**2)
+        planes += [5 * np.log(np.sqrt(trace) + 0.2), 10 * gap / (trace + 0.5)]
     return planes
 
 

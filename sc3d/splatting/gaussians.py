@@ -10,15 +10,15 @@ import torch
 from scipy.spatial import cKDTree
 
 from sc3d.errors import InputError
-from sc3d.io import atomic_path
+from sc3d.files import atomic_path
+from sc3d.formats import FARTHEST
+from sc3d.formats.ply import check_ply
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic Y_0."""
 
-_PLY_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
-    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
-}
+LARGEST_LOG = 40.0  # of a scale: beyond, its square is no float32
+LARGEST_VALUE = 1e6  # of quaternions and harmonics
 
 
 @dataclass
@@ -130,7 +130,7 @@ class Gaussians:
 
     @classmethod
     def load(cls, path: str | Path) -> tuple[Gaussians, list[str]]:
-        """Read a 3DGS PLY; returns the Gaussians and the file's comment lines. Raises InputError if it is not one."""
+        """Read a 3DGS PLY; returns the Gaussians and the file's comment lines. Raises InputError if it is not one, or holds absurd values."""
         table, comments = _read_vertices(Path(path))
 
         def columns(names: list[str]) -> torch.Tensor:
@@ -147,7 +147,16 @@ class Gaussians:
             rest = columns(_numbered("f_rest", num_rest)).reshape(len(table), 3, num_rest // 3)
             sh = torch.cat([sh, rest.transpose(1, 2)], 1)
         gaussians = cls(columns(list("xyz")), columns(_numbered("scale", 3)), columns(_numbered("rot", 4)), columns(["opacity"])[:, 0], sh)
+        gaussians.check(path)
         return gaussians, comments
+
+    def check(self, origin: str | Path) -> None:
+        """Raise InputError, which names `origin`, for values that cannot be rendered: not finite, or absurd; infinite opacities are possible."""
+        limits = {"means": FARTHEST, "log_scales": LARGEST_LOG, "quats": LARGEST_VALUE, "opacity_logits": float("inf"), "sh": LARGEST_VALUE}
+        for name, values in self.parameters().items():
+            sizes = values if name == "log_scales" else values.abs()
+            if not (sizes <= limits[name]).all() or (name != "opacity_logits" and not values.isfinite().all()):
+                raise InputError(f"{origin} has Gaussians whose {name} are not finite, or beyond {limits[name]:g}: train again")
 
 
 def rotations_from_quats(quats: torch.Tensor) -> torch.Tensor:
@@ -180,33 +189,12 @@ def _numbered(name: str, count: int) -> list[str]:
 
 
 def _read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
-    if not path.is_file():
-        raise InputError(f"{path} does not exist")
-    with open(path, "rb") as file:
-        header = []
-        while not header or header[-1] != "end_header":
-            line = file.readline()
-            if not line or (not header and line.strip() != b"ply"):
-                raise InputError(f"{path} is not a PLY file")
-            header.append(line.decode("ascii", "replace").rstrip("\r\n"))
-        if not any(line.split() == ["format", "binary_little_endian", "1.0"] for line in header):
-            raise InputError(f"{path} is not a binary little endian PLY")
-        elements = [line.split() for line in header if line.startswith("element ")]
-        if not elements or elements[0][1] != "vertex":
-            raise InputError(f"{path} does not start with an element named vertex")
-        body = header[header.index(" ".join(elements[0])) + 1:]
-        properties = []
-        for line in body:
-            words = line.split()
-            if words[0] == "element":
-                break
-            if words[0] == "property":
-                if words[1] not in _PLY_TYPES:
-                    raise InputError(f"{path}: property type {words[1]} is not supported in vertices")
-                properties.append((words[2], _PLY_TYPES[words[1]]))
-        dtype, count = np.dtype(properties), int(elements[0][2])
-        data = file.read(count * dtype.itemsize)
-    if len(data) < count * dtype.itemsize:
-        raise InputError(f"{path} ends early: {count} Gaussians are announced, {len(data) // max(dtype.itemsize, 1)} are there")
-    comments = [line.removeprefix("comment").strip() for line in header if line.startswith("comment")]
-    return np.frombuffer(data, dtype), comments
+    """Structured (N,) table of the element "vertex", which comes first, and the comments."""
+    header = check_ply(path)
+    if header.order != "<":
+        raise InputError(f"{path} is not a binary little endian PLY")
+    vertex = header.elements[0] if header.elements else None
+    if vertex is None or vertex.name != "vertex" or vertex.has_lists:
+        raise InputError(f"{path} does not start with an element named vertex, without lists")
+    dtype = np.dtype([(entry.name, header.order + entry.dtype) for entry in vertex.properties])
+    return np.fromfile(path, dtype, vertex.rows, offset=header.size), list(header.comments)

@@ -5,14 +5,17 @@ from __future__ import annotations
 import importlib
 from pathlib import Path
 
+from sc3d.georeferencing.georeference import georeference_path
 from sc3d.scene import Scene
 from sc3d.settings import Export
 
-MODULES = {"masks": "masks", "laz": "laz", "clouds": "clouds", "splats": "splats", "spz": "splats", "orthophoto": "orthophoto", "objects": "objects"}
+MODULES = {"masks": "masks", "laz": "laz", "clouds": "clouds", "splats": "splats", "spz": "spz", "orthophoto": "orthophoto", "objects": "objects",
+           "transforms": "transforms", "colmap-text": "colmap_text"}
+CAMERAS_ONLY = {"transforms", "colmap-text"}  # formats that hold no labels, and so need no class table
 
 
 def inputs(scene: Scene, settings: Export) -> list[Path]:
-    return [scene.sparse, scene.classes, scene.mesh, settings.labelled or scene.labelled, scene.gaussians]
+    return [scene.sparse, scene.classes, scene.mesh, settings.labelled or scene.labelled, scene.gaussians, georeference_path(scene)]
 
 
 def outputs(scene: Scene, settings: Export) -> list[Path]:
@@ -20,7 +23,8 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 
 
 def run(scene: Scene, settings: Export) -> dict[str, object]:
-    scene.require(scene.classes, hint="copy the class table of the labels there")
+    if set(settings.format) - CAMERAS_ONLY:
+        scene.require(scene.classes, hint="copy the class table of the labels there")
     figures = {}
     for name in dict.fromkeys(settings.format):
         figures |= {f"{name}_{key}": value for key, value in _module(name).write(scene, settings).items()}

@@ -1,4 +1,4 @@
-"""Photos -> sparse/0."""
+"""Photos -> sparse/0, and georeference.json where GPS or ground control points say where the scene is."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import os
 import shutil
 from pathlib import Path
 
+from sc3d.georeferencing.control_points import read_control_points
 from sc3d.errors import InputError
+from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
 from sc3d.io import atomic_path, find_photos, image_size
 from sc3d.scene import Scene
 from sc3d.settings import Reconstruct, ReconstructCommand
@@ -41,13 +43,20 @@ def prepare(photos: Path, scene: Scene) -> None:
 
 
 def inputs(scene: Scene, settings: Reconstruct) -> list[Path]:
-    return [scene.images]
+    return [scene.images] + ([settings.gcp] if settings.gcp else [])
 
 
 def outputs(scene: Scene, settings: Reconstruct) -> list[Path]:
-    return [scene.sparse]
+    return [scene.sparse]  # without georeference.json: photos without GPS give none
 
 
 def run(scene: Scene, settings: Reconstruct) -> dict[str, object]:
     names = [str(photo.relative_to(scene.images)) for photo in find_photos(scene.images)]
-    return reconstruct(scene.images, names, scene.sparse, settings)
+    if settings.epsg is not None:
+        projected_crs(settings.epsg)
+    control_points = read_control_points(settings.gcp, names) if settings.gcp else None
+    found = reconstruct(scene.images, names, scene.sparse, settings, control_points)
+    georeference_path(scene).unlink(missing_ok=True)  # of an earlier model
+    if found.georeference is not None:
+        write_georeference(scene, found.georeference)
+    return found.summary

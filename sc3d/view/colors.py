@@ -1,4 +1,4 @@
-"""What a point's colour means: the photos, its class, its confidence or the way its label came about."""
+"""What a point's colour means: the photos, its class, its confidence, the way its label came about, or how much the photos disagree about it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 
 from sc3d.classes import ClassTable
 from sc3d.errors import InputError
+from sc3d.labelled import read_votes
 
 if TYPE_CHECKING:
     import open3d as o3d
 
-Colouring = Literal["photo", "label", "confidence", "state"]
+Colouring = Literal["photo", "label", "confidence", "state", "disagreement"]
 COLOURINGS: tuple[str, ...] = get_args(Colouring)
 
 
@@ -32,29 +33,34 @@ STATES = (  # by value of `state`; colours apart for the colour-blind too (Okabe
     State("unlocked by reprojection", (204, 121, 167)),
 )
 
-_ATTRIBUTES = {"photo": "colors", "label": "label", "confidence": "confidence", "state": "state"}
+CONTESTED = 0.5  # disagreement from which on the colour stays the same: no class has a majority there
+_AGREED_TO_CONTESTED = ((222, 226, 230), (244, 165, 60), (165, 15, 60))
+_LIGHT, _AMBIENT = (-0.5, 0.5, 0.7071), 0.45
+_ATTRIBUTES = {"photo": "colors", "label": "label", "confidence": "confidence", "state": "state", "disagreement": "votes_1"}
 _MAKERS = {
     "photo": "the cloud has no photo colours: `sc3d extract SCENE` makes them",
     "label": "the cloud has no labels: run `sc3d label SCENE` and `sc3d propagate SCENE`",
     "confidence": "the cloud has no confidence: run `sc3d label SCENE` and `sc3d propagate SCENE`",
     "state": "the cloud has no label states: run `sc3d label SCENE` and `sc3d propagate SCENE`",
+    "disagreement": "the cloud has no votes: run `sc3d label SCENE`, which leaves them in seeds.ply, and pass no other --file",
 }
 
 
 def color_points(cloud: o3d.t.geometry.PointCloud, by: Colouring, class_table: ClassTable | None = None) -> np.ndarray:
     """Colours that show one attribute of a cloud, or of the vertices of a mesh.
 
-    by: "photo" (colors), "label" (class colours), "confidence" (viridis, 0 dark to 1 bright) or "state" (see STATES)
+    by: "photo" (colors), "label" (class colours), "confidence" (viridis, 0 dark to 1 bright), "state" (see STATES) or "disagreement" (of the votes)
     class_table: needed for "label"
     returns: (N, 3) uint8 RGB
     Raises InputError that names the stage if the attribute is missing.
     """
     if by not in COLOURINGS:
         raise InputError(f"unknown colouring {by!r}: choose one of {', '.join(COLOURINGS)}")
-    attributes = cloud.point if hasattr(cloud, "point") else cloud.vertex
-    if _ATTRIBUTES[by] not in attributes:
+    if not can_color(cloud, by):
         raise InputError(_MAKERS[by])
-    values = attributes[_ATTRIBUTES[by]].cpu().numpy()
+    if by == "disagreement":
+        return disagreement_colors(disagreement(read_votes(cloud)))
+    values = _attributes(cloud)[_ATTRIBUTES[by]].cpu().numpy()
     if by == "photo":
         return as_uint8(values)
     if by == "confidence":
@@ -68,6 +74,35 @@ def color_points(cloud: o3d.t.geometry.PointCloud, by: Colouring, class_table: C
     return palette[values.reshape(-1).astype(np.uint8)]
 
 
+def can_color(cloud: o3d.t.geometry.PointCloud, by: Colouring) -> bool:
+    """Whether a cloud, or a mesh, has the attribute that a colouring shows."""
+    return _ATTRIBUTES[by] in _attributes(cloud)
+
+
+def _attributes(geometry: o3d.t.geometry.PointCloud | o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TensorMap:
+    return geometry.point if hasattr(geometry, "point") else geometry.vertex
+
+
+def disagreement(votes: np.ndarray) -> np.ndarray:
+    """Share of the votes that the winning class did not get.
+
+    votes: (N, num_ids) as in `labelled.read_votes`; column 0 counts views and does not vote
+    returns: (N,) float32, 0 = all agree, at most 1 - 1 / classes; NaN where nothing voted
+    """
+    cast = votes[:, 1:]
+    total = cast.sum(axis=1, dtype=np.float64)
+    best = cast.max(axis=1, initial=0.0)
+    return np.where(total > 0, 1 - best / np.where(total > 0, total, 1), np.nan).astype(np.float32)
+
+
+def disagreement_colors(values: np.ndarray) -> np.ndarray:
+    """(N, 3) uint8 RGB of (N,) disagreements: light grey where all agree, over orange to dark red from CONTESTED on; grey like unseen points where NaN."""
+    stops = np.linspace(0, CONTESTED, len(_AGREED_TO_CONTESTED))
+    known = np.nan_to_num(np.asarray(values, np.float64))
+    colors = np.stack([np.interp(known, stops, channel) for channel in np.transpose(_AGREED_TO_CONTESTED)], axis=-1)
+    return np.where(np.isnan(values)[..., None], STATES[0].color, np.round(colors)).astype(np.uint8)
+
+
 def confidence_colors(confidence: np.ndarray) -> np.ndarray:
     """(N, 3) uint8 RGB, viridis, of (N,) or (N, 1) confidences from 0 to 1; not finite counts as 0."""
     values = np.nan_to_num(np.asarray(confidence, np.float64).reshape(-1), nan=0.0, posinf=0.0, neginf=0.0)
@@ -77,7 +112,7 @@ def confidence_colors(confidence: np.ndarray) -> np.ndarray:
 
 
 def legend_entries(by: Colouring, class_table: ClassTable | None, present: set[int] | None = None) -> list[tuple[str, tuple[int, int, int]]]:
-    """Names and RGB colours that explain a colouring; empty for photo colours and confidence (a colour bar).
+    """Names and RGB colours that explain a colouring; empty for photo colours and for confidence and disagreement, which have a scale.
 
     present: ids that occur; None = list all classes or states
     """
@@ -88,6 +123,35 @@ def legend_entries(by: Colouring, class_table: ClassTable | None, present: set[i
     entries = [(entry.name, entry.color) for entry in class_table if present is None or entry.id in present]
     unlabelled = [("unlabelled", tuple(int(value) for value in class_table.palette[0]))]
     return entries + (unlabelled if present is None or 0 in present else [])
+
+
+class ColorScale(NamedTuple):
+    """A colouring by a number. low, high: what its ends mean; colors: (256, 3) uint8 RGB from low to high."""
+
+    low: str
+    high: str
+    colors: np.ndarray
+
+
+def color_scale(by: Colouring) -> ColorScale | None:
+    """The scale of a colouring by a number; None for the others."""
+    steps = np.linspace(0, 1, 256)
+    if by == "confidence":
+        return ColorScale("confidence 0", "1", confidence_colors(steps))
+    if by == "disagreement":
+        return ColorScale("all photos agree", "half or more disagree", disagreement_colors(CONTESTED * steps))
+    return None
+
+
+def shaded(colors: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Colours in light from the north-west and above, as maps shade hills, so that shapes show where a whole class has one colour.
+
+    colors: (N, 3) uint8 RGB; normals: (N, 3) towards the outside; returns: (N, 3) uint8 RGB, the given colours on level ground
+    """
+    lengths = np.linalg.norm(normals, axis=1)
+    cosine = normals @ np.float32(_LIGHT) / np.where(lengths > 0, lengths, 1)
+    light = np.where(lengths > 0, _AMBIENT + (1 - _AMBIENT) * np.clip(cosine, 0, 1) / _LIGHT[2], 1)
+    return np.round(np.clip(colors * light[:, None], 0, 255)).astype(np.uint8)
 
 
 def as_uint8(colors: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sc3d.classes import ClassTable
-from sc3d.view.colors import Colouring, confidence_colors, legend_entries
+from sc3d.view.colors import Colouring, ColorScale, color_scale, legend_entries
 
 PAPER, INK = (255, 255, 255), (32, 34, 38)
 
@@ -16,8 +16,9 @@ def add_legend(image: np.ndarray, by: Colouring, class_table: ClassTable | None,
     image: (H, W, 3) uint8 RGB; present: ids to list, None = all
     returns: (H + strip, W, 3) uint8 RGB; unchanged for photo colours
     """
-    if by == "confidence":
-        strip = _color_bar(image.shape[1])
+    scale = color_scale(by)
+    if scale is not None:
+        strip = _color_bar(scale, image.shape[1])
     else:
         entries = legend_entries(by, class_table, present)
         if not entries:
@@ -47,19 +48,18 @@ def _swatches(entries: list[tuple[str, tuple[int, int, int]]], width: int) -> np
     return np.asarray(strip)
 
 
-def _color_bar(width: int) -> np.ndarray:
+def _color_bar(scale: ColorScale, width: int) -> np.ndarray:
     from PIL import Image, ImageDraw
 
     font, size = caption_font(width)
-    height, length = 3 * size, min(width - 2 * size, 18 * size)
+    height, start = 3 * size, round(1.5 * size + font.getlength(scale.low + " "))
     strip = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(strip)
-    start = size + round(font.getlength("confidence 0 ")) + size // 2
-    length = max(2, min(length, width - start - 3 * size))
-    bar = np.repeat(confidence_colors(np.linspace(0, 1, length))[None], size, axis=0)
-    draw.text((size, height / 2), "confidence 0", font=font, fill=INK, anchor="lm")
+    length = int(np.clip(width - start - 2 * size - font.getlength(scale.high), 2, 18 * size))
+    bar = np.repeat(scale.colors[np.linspace(0, 255, length).astype(int)][None], size, axis=0)
+    draw.text((size, height / 2), scale.low, font=font, fill=INK, anchor="lm")
     strip.paste(Image.fromarray(bar), (start, (height - size) // 2))
-    draw.text((start + length + size // 2, height / 2), "1", font=font, fill=INK, anchor="lm")
+    draw.text((start + length + size // 2, height / 2), scale.high, font=font, fill=INK, anchor="lm")
     return np.asarray(strip)
 
 

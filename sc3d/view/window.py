@@ -1,4 +1,4 @@
-"""The window: the cloud in any of its colourings, the cameras, and a legend. Needs a display."""
+"""The window: the cloud in any of its colourings, classes on and off, the cameras, and what is known of a clicked point. Needs a display."""
 
 from __future__ import annotations
 
@@ -7,46 +7,50 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sc3d.classes import ClassTable
-from sc3d.errors import InputError, Sc3dError
+from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.view.aerial import frusta, frustum_depth
-from sc3d.view.colors import COLOURINGS, Colouring, color_points, legend_entries
+from sc3d.view.colors import Colouring, color_points, color_scale, legend_entries
+from sc3d.view.picking import Inspector
 from sc3d.view.pictures import LINE_COLOR
 from sc3d.view.renderers import vulkan_works
-
-if TYPE_CHECKING:
-    import open3d as o3d
+from sc3d.view.shown import ShownCloud
 
 logger = logging.getLogger(__name__)
 
-_PANEL_EM = 13  # width of the panel, in font heights
+_PANEL_EM = 15  # width of the panel, in font heights
+_PICKED_COLOR = (1.0, 0.0, 0.8)
 
 
-def show(cloud: o3d.t.geometry.PointCloud, views: Sequence[View], class_table: ClassTable | None = None, by: Colouring = "label") -> None:
-    """Open a window and return when it is closed.
+def show(inspector: Inspector, views: Sequence[View] = (), by: Colouring = "label", classes: set[int] | None = None) -> None:
+    """Open a window and return when it is closed. A point clicked with Ctrl held is described in the panel and in the log.
 
-    cloud: with any of the attributes that `color_points` shows; those it has can be chosen in the panel, or with keys 1 to 4 without Vulkan
-    views: cameras drawn as pyramids; by: colouring at the start
+    inspector: has the cloud, with any of the attributes that `color_points` shows; those it has can be chosen
+    views: cameras drawn as pyramids; by: colouring at the start; classes: ids shown at the start, None = all
     Raises Sc3dError without a display, InputError if the attribute for `by` is missing.
     """
-    if not has_display():
-        raise Sc3dError("no display to open a window on: `sc3d view SCENE --screenshot FILE` renders a picture without one")
-    colorings = {by: color_points(cloud, by, class_table)}
-    for other in COLOURINGS:
-        with suppress(InputError):  # attributes the cloud lacks cannot be chosen
-            colorings[other] = color_points(cloud, other, class_table)
-    points = cloud.point.positions.cpu().numpy().astype(np.float64)
+    check_display()
+    color_points(inspector.cloud, by, inspector.class_table)
+    points = inspector.cloud.point.positions.cpu().numpy().astype(np.float64)
     origin = local_origin(list(views)) if len(views) else np.round(points.mean(axis=0))
     lines = frusta(views, frustum_depth(views, points)) - origin
-    colorings = {name: colorings[name] for name in COLOURINGS if name in colorings}
-    opened = _show_with_panel if vulkan_works() else _show_with_keys
-    opened((points - origin).astype(np.float32), colorings, lines, by, class_table)
+    shown = ShownCloud.of(inspector.cloud, origin, inspector.class_table)
+    hidden = set() if classes is None else set(shown.class_counts) - classes
+    if vulkan_works():
+        _show_with_panel(shown, lines, inspector, hidden, by)
+    else:
+        from sc3d.view.window_keys import show_with_keys
+
+        show_with_keys(shown, lines, inspector, hidden, by)
+
+
+def check_display() -> None:
+    """Raise Sc3dError that says what to do where no window can be opened."""
+    if not has_display():
+        raise Sc3dError("no display to open a window on: `sc3d view SCENE --screenshot FILE` renders a picture without one, --web shows it in a browser")
 
 
 def has_display() -> bool:
@@ -66,25 +70,24 @@ def has_display() -> bool:
     return bool(display)
 
 
-def _show_with_panel(points: np.ndarray, colorings: dict[str, np.ndarray], lines: np.ndarray, by: str, class_table: ClassTable | None) -> None:
+def _show_with_panel(shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int], by: Colouring) -> None:
     import open3d as o3d
 
     application = o3d.visualization.gui.Application.instance
     application.initialize()
-    window = _Window(points, colorings, lines, class_table)
+    window = _Window(shown, lines, inspector, hidden)
     window.choose(by)
     application.run()
 
 
 class _Window:
-    """A 3D view with a panel at its right: colouring, legend, cameras, point size."""
+    """A 3D view with a panel at its right: colouring, legend, classes, cameras, point size, the picked point. One geometry per class."""
 
-    def __init__(self, points: np.ndarray, colorings: dict[str, np.ndarray], lines: np.ndarray, class_table: ClassTable | None) -> None:
+    def __init__(self, shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int]) -> None:
         import open3d as o3d
 
         self._gui, self._rendering = o3d.visualization.gui, o3d.visualization.rendering
-        self._colorings, self._class_table = colorings, class_table
-        self._cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(np.ascontiguousarray(points)))
+        self._shown, self._inspector, self._hidden = shown, inspector, hidden
         self._material = self._rendering.MaterialRecord()
         self._material.shader, self._material.point_size = "defaultUnlit", 3.0
         self._window = self._gui.Application.instance.create_window("sc3d", 1400, 900)
@@ -93,66 +96,97 @@ class _Window:
         self._scene.scene = self._rendering.Open3DScene(self._window.renderer)
         self._scene.scene.set_background([1.0, 1.0, 1.0, 1.0])
         self._scene.scene.view.set_post_processing(False)  # tone mapping would change class colours
+        self._scene.set_on_mouse(self._on_mouse)
         self._panel = self._build_panel()
         self._window.add_child(self._scene)
         self._window.add_child(self._panel)
         self._window.set_on_layout(self._lay_out)
         self._add_cameras(lines)
-        low, high = np.quantile(points[:: max(1, len(points) // 100_000)], [0.002, 0.998], axis=0)
-        middle, span = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
-        bounds = o3d.geometry.AxisAlignedBoundingBox(low.astype(np.float64), high.astype(np.float64))
-        self._scene.setup_camera(50.0, bounds, middle.astype(np.float32))
-        self._scene.look_at(middle, middle + np.array([0.0, -0.75, 0.75]) * span, [0, 0, 1])
+        self._look()
 
     def choose(self, by: str) -> None:
         """Colour the cloud by an attribute and explain its colours."""
         import open3d as o3d
 
-        self._radio.selected_index = list(self._colorings).index(by)
-        self._cloud.point.colors = o3d.core.Tensor.from_numpy(self._colorings[by].astype(np.float32) / np.float32(255))
-        self._scene.scene.remove_geometry("cloud")
-        self._scene.scene.add_geometry("cloud", self._cloud, self._material)
+        self._radio.selected_index = self._shown.colourings.index(by)
+        colors = self._shown.colors(by).astype(np.float32) / np.float32(255)
+        for label in self._shown.class_counts:
+            chosen = self._shown.label == label
+            cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(np.ascontiguousarray(self._shown.points[chosen])))
+            cloud.point.colors = o3d.core.Tensor.from_numpy(np.ascontiguousarray(colors[chosen]))
+            self._scene.scene.remove_geometry(f"class {label}")
+            self._scene.scene.add_geometry(f"class {label}", cloud, self._material)
+            self._scene.scene.show_geometry(f"class {label}", label not in self._hidden)
         for name, legend in self._legends.items():
             legend.visible = name == by
         self._window.set_needs_layout()
 
+    def _look(self) -> None:
+        """From the south, 45 degrees down."""
+        import open3d as o3d
+
+        low, high = np.quantile(self._shown.points[:100_000], [0.002, 0.998], axis=0)
+        middle, span = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
+        bounds = o3d.geometry.AxisAlignedBoundingBox(low.astype(np.float64), high.astype(np.float64))
+        self._scene.setup_camera(50.0, bounds, middle.astype(np.float32))
+        self._scene.look_at(middle, middle + np.array([0.0, -0.75, 0.75]) * span, [0, 0, 1])
+
     def _build_panel(self) -> object:
         gui, half = self._gui, self._em // 2
-        panel = gui.Vert(half, gui.Margins(self._em, self._em, self._em, self._em))
+        panel = gui.ScrollableVert(half, gui.Margins(self._em, self._em, self._em, self._em))
         panel.add_child(gui.Label("Colour by"))
         self._radio = gui.RadioButton(gui.RadioButton.VERT)
-        self._radio.set_items(list(self._colorings))
-        self._radio.set_on_selection_changed(lambda index: self.choose(list(self._colorings)[index]))
+        self._radio.set_items(list(self._shown.colourings))
+        self._radio.set_on_selection_changed(lambda index: self.choose(self._shown.colourings[index]))
         panel.add_child(self._radio)
-        self._legends = {name: self._build_legend(name) for name in self._colorings}
+        self._legends = {name: self._build_legend(name) for name in self._shown.colourings}
         for legend in self._legends.values():
             panel.add_child(legend)
-        cameras = gui.Checkbox("Cameras")
-        cameras.checked = True
-        cameras.set_on_checked(lambda shown: self._scene.scene.show_geometry("cameras", shown))
-        panel.add_child(cameras)
+        self._add_class_boxes(panel)
+        self._add_box(panel, "cameras", True, lambda shown: self._scene.scene.show_geometry("cameras", shown))
         panel.add_child(gui.Label("Point size"))
         slider = gui.Slider(gui.Slider.INT)
         slider.set_limits(1, 12)
         slider.int_value = int(self._material.point_size)
         slider.set_on_value_changed(self._resize_points)
         panel.add_child(slider)
+        self._description = gui.Label("Ctrl + click: what is known of a point")
+        panel.add_child(self._description)
         return panel
 
     def _build_legend(self, by: str) -> object:
         import open3d as o3d
 
-        gui = self._gui
+        gui, scale = self._gui, color_scale(by)
         legend = gui.Vert(self._em // 4, gui.Margins(0, self._em // 2, 0, self._em // 2))
-        entries = legend_entries(by, self._class_table)
-        if by == "confidence":
-            entries = [("1 (bright)", (253, 231, 36)), ("0 (dark)", (110, 60, 140))]
+        entries = legend_entries(by, self._shown.class_table)
+        if scale is not None:
+            entries = [(scale.high, scale.colors[-1]), (scale.low, scale.colors[0])]
         for name, color in entries:
             row = gui.Horiz(self._em // 2)
             row.add_child(gui.ImageWidget(o3d.geometry.Image(np.tile(np.uint8(color), (self._em, self._em, 1)))))
             row.add_child(gui.Label(name))
             legend.add_child(row)
         return legend
+
+    def _add_class_boxes(self, panel: object) -> None:
+        if self._shown.class_table is None or "label" not in self._shown.cloud.point:
+            return
+        panel.add_child(self._gui.Label("Classes"))
+        for label, count in self._shown.class_counts.items():
+            name = f"{self._shown.class_table.name(label)} ({count:,})"
+            self._add_box(panel, name, label not in self._hidden, lambda shown, label=label: self._show_class(label, shown))
+
+    def _add_box(self, panel: object, name: str, checked: bool, changed: object) -> None:
+        box = self._gui.Checkbox(name)
+        box.checked = checked
+        box.set_on_checked(changed)
+        panel.add_child(box)
+
+    def _show_class(self, label: int, shown: bool) -> None:
+        (self._hidden.discard if shown else self._hidden.add)(label)
+        self._scene.scene.show_geometry(f"class {label}", shown)
+        self._scene.force_redraw()
 
     def _add_cameras(self, lines: np.ndarray) -> None:
         import open3d as o3d
@@ -168,38 +202,40 @@ class _Window:
 
     def _resize_points(self, size: float) -> None:
         self._material.point_size = float(size)
-        self._scene.scene.modify_geometry_material("cloud", self._material)
+        for label in self._shown.class_counts:
+            self._scene.scene.modify_geometry_material(f"class {label}", self._material)
+
+    def _on_mouse(self, event: object) -> object:
+        gui = self._gui
+        if event.type != gui.MouseEvent.Type.BUTTON_DOWN or not event.is_modifier_down(gui.KeyModifier.CTRL):
+            return gui.Widget.EventCallbackResult.IGNORED
+        column, row = event.x - self._scene.frame.x, event.y - self._scene.frame.y
+        self._scene.scene.scene.render_to_depth_image(lambda depth: self._pick(np.asarray(depth), column, row))
+        return gui.Widget.EventCallbackResult.HANDLED
+
+    def _pick(self, depth: np.ndarray, column: int, row: int) -> None:
+        """depth: (H, W) of the 3D view, 1 = nothing; called from the renderer, so the panel is changed later, by the window's own thread."""
+        if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]) or depth[row, column] >= 1:
+            return
+        camera = self._scene.scene.camera
+        position = camera.unproject(column, row, depth[row, column], self._scene.frame.width, self._scene.frame.height).ravel()
+        picked = self._inspector.look_up(self._inspector.nearest(position.astype(np.float64) + self._shown.origin))
+        logger.info("%s", picked)
+        lines = [f"{name}: {value}" for name, value in picked.facts()] + [f"  {name}" for name in picked.photos]
+        self._gui.Application.instance.post_to_main_thread(self._window, lambda: self._describe(picked.position, "\n".join(lines)))
+
+    def _describe(self, position: np.ndarray, text: str) -> None:
+        import open3d as o3d
+
+        self._description.text = text
+        mark = o3d.t.geometry.PointCloud(o3d.core.Tensor((position - self._shown.origin).astype(np.float32)[None]))
+        material = self._rendering.MaterialRecord()
+        material.shader, material.point_size, material.base_color = "defaultUnlit", 14.0, [*_PICKED_COLOR, 1.0]
+        self._scene.scene.remove_geometry("picked")
+        self._scene.scene.add_geometry("picked", mark, material)
+        self._window.set_needs_layout()
 
     def _lay_out(self, _context: object) -> None:
         area, width = self._window.content_rect, _PANEL_EM * self._em
         self._scene.frame = self._gui.Rect(area.x, area.y, area.width - width, area.height)
         self._panel.frame = self._gui.Rect(area.get_right() - width, area.y, width, area.height)
-
-
-def _show_with_keys(points: np.ndarray, colorings: dict[str, np.ndarray], lines: np.ndarray, by: str, class_table: ClassTable | None) -> None:
-    """The OpenGL window, where Vulkan is missing: keys 1 to 4 choose the colouring, the legend goes to the log."""
-    import open3d as o3d
-
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
-    visualizer = o3d.visualization.VisualizerWithKeyCallback()
-    if not visualizer.create_window("sc3d", 1400, 900):
-        raise Sc3dError("cannot open a window here: `sc3d view SCENE --screenshot FILE` renders a picture without one")
-
-    def choose(name: str) -> bool:
-        cloud.colors = o3d.utility.Vector3dVector(colorings[name] / 255.0)
-        visualizer.update_geometry(cloud)
-        return False
-
-    choose(by)
-    visualizer.add_geometry(cloud)
-    if len(lines):
-        ends = lines.reshape(-1, 3)
-        line_set = o3d.geometry.LineSet(o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(np.arange(len(ends)).reshape(-1, 2)))
-        line_set.paint_uniform_color(np.array(LINE_COLOR) / 255)
-        visualizer.add_geometry(line_set)
-    for number, name in enumerate(colorings, start=1):
-        visualizer.register_key_callback(ord(str(number)), lambda _, name=name: choose(name))
-        legend = ", ".join(f"{entry} rgb{tuple(color)}" for entry, color in legend_entries(name, class_table))
-        logger.info("key %d: %s%s", number, name, f" ({legend})" if legend else "")
-    visualizer.run()
-    visualizer.destroy_window()

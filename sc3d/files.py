@@ -1,0 +1,148 @@
+"""Files that are whole or not there: written under a temporary name, brought to the disk, renamed; what killed runs leave behind is found and removed."""
+
+from __future__ import annotations
+
+import errno
+import os
+import platform
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from sc3d.errors import InputError
+
+HOST = re.sub(r"\W+", "_", platform.node(), flags=re.ASCII)[:32] or "host"
+LEFTOVER = re.compile(r"\..*\.(?P<host>\w+)-(?P<process>\d+)\.tmp")
+OLD = 24 * 3600  # s: temporary files of other machines are dead after that
+ROOM = 1 << 16  # bytes; with less left on the disk, what was written may not be whole, which not every library notices
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path` with the same suffix (file or folder); it replaces `path` only if the block succeeds.
+
+    Then all of it is on the disk: a crash of the machine leaves the old or the new, not a part. OSError if the disk is full.
+    """
+    path = Path(path)
+    temporary = path.with_name(temporary_name(path.stem) + path.suffix)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not os.access(path.parent, os.W_OK, effective_ids=True):
+            raise PermissionError
+    except (PermissionError, NotADirectoryError, FileExistsError):
+        raise InputError(f"cannot write to {path.parent}: check its permissions or choose another folder") from None
+    try:
+        try:
+            yield temporary
+            if not os.path.lexists(temporary):
+                raise OSError(f"nothing was written to {temporary}")
+        finally:
+            _require_room(path)
+        _sync(temporary)
+        _replace(temporary, path)
+    finally:
+        remove(temporary)
+
+
+def temporary_name(name: str) -> str:
+    """A hidden name for something unfinished, which tells the process that makes it."""
+    return f".{name}.{HOST}-{os.getpid()}.tmp"
+
+
+def remove(path: Path) -> None:
+    """Remove a file, link or folder, if it is there; of a link, not what it leads to."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what killed processes of this machine, or of others more than a day ago, left unfinished in a folder. Linked folders are let alone."""
+    if folder.is_symlink() or not folder.is_dir():
+        return
+    for entry in folder.iterdir():
+        found = LEFTOVER.match(entry.name)
+        if found and _is_dead(found["host"], int(found["process"]), entry):
+            remove(entry)
+
+
+def require_inside(folder: Path, path: Path) -> None:
+    """InputError if writing `path`, which lies in `folder` by name, would lead out of it by a link."""
+    if folder not in path.parents:
+        return
+    if path.is_symlink() and path.is_dir():
+        raise InputError(f"{path} is a link to {path.resolve()}, which would be overwritten: remove the link")
+    outer = next(parent for parent in path.parents if parent.exists())
+    if not outer.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"{outer} is a link that leads out of {folder}: what lies there is not overwritten, remove the link")
+
+
+def _is_dead(host: str, process: int, entry: Path) -> bool:
+    if host == HOST and process != os.getpid() and not _runs(process):
+        return True
+    with suppress(OSError):
+        return process != os.getpid() and time.time() - entry.lstat().st_mtime > OLD
+    return False
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+def _require_room(path: Path) -> None:
+    """OSError if the disk is full: some libraries then fail in other words, and some do not notice."""
+    try:
+        found = os.statvfs(path.parent)
+    except OSError:
+        return
+    free = found.f_bfree if os.geteuid() == 0 else found.f_bavail
+    if found.f_blocks and free * found.f_frsize < ROOM:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from None
+
+
+def _replace(temporary: Path, path: Path) -> None:
+    is_folder = temporary.is_dir() and not temporary.is_symlink()
+    if is_folder and path.is_symlink():
+        raise InputError(f"{path} is a link: remove it, so that the folder it leads to is not overwritten")
+    if is_folder and path.is_dir():  # folders cannot be replaced in one step
+        before = temporary.with_name(f"{temporary.name}.before")
+        path.rename(before)
+        try:
+            temporary.rename(path)
+        except OSError:
+            before.rename(path)
+            raise
+        shutil.rmtree(before, ignore_errors=True)
+    else:
+        os.replace(temporary, path)
+    _sync_one(path.parent)
+
+
+def _sync(path: Path) -> None:
+    """Bring a file, or a folder with all that is in it, to the disk."""
+    if path.is_symlink():
+        return
+    for entry in [*path.rglob("*"), path] if path.is_dir() else [path]:
+        if not entry.is_symlink():
+            _sync_one(entry)
+
+
+def _sync_one(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems that know no such thing
+            raise
+    finally:
+        os.close(handle)

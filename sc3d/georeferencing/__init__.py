@@ -1,0 +1,1 @@
+"""Where a scene lies on Earth: GPS of the photos, ground control points, coordinate reference systems."""

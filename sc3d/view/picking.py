@@ -1,0 +1,156 @@
+"""A point that was clicked: its label, how sure it is, how the photos voted, and which of them saw it. Needs no window."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import open3d as o3d
+
+from sc3d.classes import ClassTable
+from sc3d.geometry.cameras import View, in_image, local_origin, project, rays
+from sc3d.geometry.neighbors import estimate_normals, orient_normals
+from sc3d.geometry.raycast import FirstSurface, see_points
+from sc3d.labelled import NORMAL_NEIGHBORS, read_surface, read_votes, spacing_of
+from sc3d.view.colors import STATES
+
+if TYPE_CHECKING:
+    from sc3d.geometry.raycast import RayTarget
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PickedPoint:
+    """What is known of one point; None where the cloud does not have it.
+
+    row: in the cloud; position: (3,) float64 world; label: name of its class; confidence: 0 to 1; state: see `colors.STATES`
+    votes: by class name, in photos of full weight, largest first; photos: names of those that see it on their first surface
+    """
+
+    row: int
+    position: np.ndarray
+    label: str | None
+    confidence: float | None
+    state: str | None
+    votes: dict[str, float]
+    photos: tuple[str, ...]
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Names and values for people to read; photos not included."""
+        found = [("position", " ".join(f"{value:.2f}" for value in self.position)), ("class", self.label)]
+        found += [("confidence", None if self.confidence is None else f"{self.confidence:.2f}"), ("state", self.state)]
+        found += [("votes", ", ".join(f"{name} {count:.1f}" for name, count in self.votes.items()) or None), ("seen by", f"{len(self.photos)} photos")]
+        return [(name, value) for name, value in found if value is not None]
+
+    def __str__(self) -> str:
+        facts = "; ".join(f"{name} {value}" for name, value in self.facts())
+        return f"point {self.row}: {facts}{': ' if self.photos else ''}{', '.join(self.photos)}"
+
+
+class Inspector:
+    """Looks points of one cloud up; the search tree and the surface that hides them are made when they are first needed.
+
+    views: photos that may have seen the points; mesh: file of the surface, surfels of the cloud if it does not exist
+    voxel_size: of the labels, which is the tolerance of visibility, world units; None = 2 point spacings
+    """
+
+    def __init__(
+        self, cloud: o3d.t.geometry.PointCloud, views: Sequence[View], class_table: ClassTable | None, mesh: Path, voxel_size: float | None = None,
+    ) -> None:
+        self.cloud, self.views, self.class_table, self._mesh = cloud, list(views), class_table, mesh
+        self._points = cloud.point.positions.cpu().numpy().astype(np.float64)
+        self._given_voxel_size = voxel_size
+
+    def nearest(self, position: np.ndarray) -> int:
+        """Row of the point nearest to a (3,) world position."""
+        _, rows, _ = self._tree.search_knn_vector_3d(np.asarray(position, np.float64) - self._points[0], 1)
+        return int(rows[0])
+
+    def look_up(self, row: int) -> PickedPoint:
+        """All that is known of a point of the cloud."""
+        attributes, table = self.cloud.point, self.class_table
+        value = {name: attributes[name][row].item() for name in ("label", "confidence", "state") if name in attributes}
+        label = None if "label" not in value else table.name(value["label"]) if table is not None else f"class {value['label']}"
+        state = None if "state" not in value else STATES[value["state"]].name if value["state"] < len(STATES) else f"state {value['state']}"
+        photos = photos_that_see(self._points[row], self._normal(row), self.views, self._surface, self._voxel_size) if self.views else []
+        return PickedPoint(row, self._points[row], label, value.get("confidence"), state, self._votes_of(row), tuple(photos))
+
+    def _votes_of(self, row: int) -> dict[str, float]:
+        votes = self._votes
+        if votes is None:
+            return {}
+        cast = [(float(votes[row, label]), label) for label in range(1, votes.shape[1]) if votes[row, label] > 0]
+        named = self.class_table.name if self.class_table is not None else "class {}".format
+        return {named(label): count for count, label in sorted(cast, key=lambda entry: (-entry[0], entry[1]))}
+
+    def _normal(self, row: int) -> np.ndarray:
+        """(3,) unit normal of a point, estimated if the cloud has none."""
+        if "normals" in self.cloud.point:
+            normal = self.cloud.point.normals[row].cpu().numpy().astype(np.float64)
+            if np.isfinite(normal).all() and normal.any():
+                return normal / np.linalg.norm(normal)
+        count, rows, _ = self._tree.search_knn_vector_3d(self._points[row] - self._points[0], NORMAL_NEIGHBORS)
+        point = self._points[row][None]
+        if count < 3:
+            return np.array([0.0, 0.0, 1.0])
+        normal = estimate_normals(self._points[np.asarray(rows)], np.arange(count)[None])[:1]
+        return orient_normals(point, normal, np.array([view.centre for view in self.views]))[0]
+
+    @cached_property
+    def _tree(self) -> o3d.geometry.KDTreeFlann:
+        return o3d.geometry.KDTreeFlann(np.ascontiguousarray((self._points - self._points[0]).T))
+
+    @cached_property
+    def _votes(self) -> np.ndarray | None:
+        return read_votes(self.cloud)
+
+    @cached_property
+    def _voxel_size(self) -> float:
+        return self._given_voxel_size or 2 * spacing_of(self._points)
+
+    @cached_property
+    def _surface(self) -> RayTarget:
+        logger.info("preparing the surface, to find out which photos see a point ...")
+        normals = self.cloud.point.normals.cpu().numpy() if "normals" in self.cloud.point else None
+        return read_surface(self._mesh, self._points, normals, local_origin(self.views))
+
+
+def photos_that_see(point: np.ndarray, normal: np.ndarray, views: Sequence[View], surface: RayTarget, voxel_size: float) -> list[str]:
+    """Names of the photos in which a point lies on the first surface, by the rule that fusion uses.
+
+    point, normal: (3,) world, the normal towards the outside; voxel_size: tolerance, world units. One ray is cast per photo.
+    """
+    return [view.name for view in views if _sees(view, point[None], normal[None], surface, voxel_size)]
+
+
+def _sees(view: View, points: np.ndarray, normals: np.ndarray, surface: RayTarget, voxel_size: float) -> bool:
+    pixels, _ = project(view, points)
+    if not in_image(view, pixels)[0]:
+        return False
+    directions, ray_z = rays(view, np.floor(pixels) + 0.5)  # of the pixel's centre, as in a picture of the whole surface
+    distance, incidence = surface.cast(view, (directions @ view.cam_from_world[:3, :3].T).astype(np.float32))
+    everywhere = (np.broadcast_to(values[:1].astype(np.float32), (view.height, view.width)) for values in (distance, incidence, ray_z))
+    return len(see_points(view, points, normals, FirstSurface(*everywhere), voxel_size).points) > 0
+
+
+def point_on_ray(points: np.ndarray, origin: np.ndarray, direction: np.ndarray, size: float) -> int | None:
+    """Row of the point that a click shows: the one nearest to the ray among the first points that it passes.
+
+    points: (N, 3); origin, direction: (3,) in the same frame; size: side of a drawn point, in the units of the points
+    returns: None if the ray passes no point within `size`
+    """
+    direction = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+    offsets = np.asarray(points, np.float64) - origin
+    along = offsets @ direction
+    across = np.sqrt(np.maximum(np.einsum("ij,ij->i", offsets, offsets) - along**2, 0))
+    passed = np.flatnonzero((along > 0) & (across <= size))
+    if not len(passed):
+        return None
+    first = passed[along[passed] <= along[passed].min() + 2 * size]
+    return int(first[np.argmin(across[first])])
