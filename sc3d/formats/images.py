@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from PIL import Image
 
-FORMATS = ("JPEG", "MPO", "PNG", "TIFF")  # Pillow knows many more, of which one runs a program
+FORMATS = ("JPEG", "PNG", "TIFF")  # JPEG holds MPO as well; Pillow knows many more, of which one runs a program
 MAX_PIXELS = 160_000_000  # the largest cameras of drones have 151 megapixels; what a few bytes can announce must fit into the memory
 MAX_SIDE = 100_000
 END_OF_IMAGE, START_OF_SCAN = b"\xff\xd9", 0xDA
@@ -51,7 +51,6 @@ def _check_size(path: Path, size: tuple[int, int], what: str) -> None:
 def _pillow() -> ModuleType:
     from PIL import Image
 
-    Image.init()  # knows all of FORMATS only then
     warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # MAX_PIXELS decides, not half of Pillow's own limit
     return Image
 
