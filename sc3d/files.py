@@ -60,6 +60,17 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def discard(folder: Path) -> None:
+    """Remove a folder in one step, so that no part of it can be taken for the whole; of a link, not what it leads to."""
+    if folder.is_symlink():
+        folder.unlink()
+    elif folder.is_dir():
+        hidden = folder.with_name(temporary_name(folder.name))
+        remove(hidden)
+        folder.rename(hidden)
+        remove(hidden)
+
+
 def remove_leftovers(folder: Path) -> None:
     """Remove what killed processes of this machine, or of others more than a day ago, left unfinished in a folder. Linked folders are let alone."""
     if folder.is_symlink() or not folder.is_dir():

@@ -167,9 +167,10 @@ def _read_geometry(path: Path, reader: str, suffixes: set[str]):  # noqa: ANN202
         with redirect_stdout(told):
             geometry = getattr(o3d.t.io, reader)(str(path))
     except (RuntimeError, ValueError, IndexError) as error:
-        told.write(f" failed: {error}")
-    if re.search(r"\bfailed\b|\bunable to\b", told.getvalue().replace(str(path), ""), re.IGNORECASE):
-        raise InputError(f"cannot read {path}: it is damaged")
+        told.write(f"failed: {error}")
+    failure = re.search(r"\b(?:failed|unable to)\b[^\n\x1b]*", told.getvalue().replace(str(path), "the file"), re.IGNORECASE)
+    if failure:
+        raise InputError(f"cannot read {path}: Open3D says {failure[0].rstrip('. ')!r}; write or copy it again")
     return geometry
 
 

@@ -18,6 +18,7 @@ from tqdm import tqdm
 from sc3d.georeferencing.alignment import Similarity, main_plane
 from sc3d.georeferencing.control_points import ControlPoints, align_to_control_points, transform
 from sc3d.errors import InputError, Sc3dError
+from sc3d.files import temporary_name
 from sc3d.georeferencing.focal import anchor_focal, tells_focal
 from sc3d.georeferencing.georeference import Georeference, from_origin
 from sc3d.georeferencing.gps import Flight, place, read_flight, residuals
@@ -50,7 +51,7 @@ def reconstruct(images: Path, names: list[str], sparse: Path, settings: Reconstr
     if settings.matching == "spatial" and flight is None:
         raise InputError("--matching spatial needs GPS in the photos' EXIF: use exhaustive or sequential")
     sparse.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".work-", dir=sparse.parent) as folder:
+    with tempfile.TemporaryDirectory(prefix=temporary_name("work"), dir=sparse.parent) as folder:
         work = Path(folder)
         database = work / "database.db"
         _extract(database, images, names, settings)

@@ -100,5 +100,5 @@ def test_other_files_are_refused_with_a_reason(tmp_path):
         Gaussians.load(tmp_path / "cloud.ply")
     random_gaussians(5, 0).save(tmp_path / "short.ply")
     (tmp_path / "short.ply").write_bytes((tmp_path / "short.ply").read_bytes()[:-7])
-    with pytest.raises(InputError, match="ends early"):
+    with pytest.raises(InputError, match="truncated"):
         Gaussians.load(tmp_path / "short.ply")

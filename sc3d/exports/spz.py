@@ -9,7 +9,7 @@ import open3d as o3d
 
 from sc3d.exports import splats
 from sc3d.exports.placement import chosen_classes, find_placement
-from sc3d.io import write_geometry
+from sc3d.io import atomic_path
 from sc3d.scene import Scene
 from sc3d.settings import Export
 from sc3d.splatting.gaussians import Gaussians
@@ -30,7 +30,10 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
         labelled = splats.read_splats(splats.outputs(scene, settings)[0], scene.class_table())
     else:
         labelled = splats.label_splats(scene, settings).only(chosen)
-    write_geometry(outputs(scene, settings)[0], splat_cloud(labelled.gaussians))
+    path = outputs(scene, settings)[0]
+    with atomic_path(path) as temporary:
+        if not o3d.t.io.write_point_cloud(str(temporary), splat_cloud(labelled.gaussians)):
+            raise OSError(f"could not write {path}: is the disk full?")
     return splats.figures(labelled, placement)
 
 

@@ -29,7 +29,7 @@ NOT_RIGID = 0.01  # largest error of R R^T: text models are rounded
 
 
 class _Damage(ValueError):
-    """Completes "<file>"."""
+    """Completes "<file> of the COLMAP model in <folder>"."""
 
 
 def load_model(folder: Path) -> pycolmap.Reconstruction:
@@ -41,7 +41,7 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
         model = pycolmap.Reconstruction(str(folder))
         images = [model.image(image_id) for image_id in model.reg_image_ids()]
         names = [image.name for image in images]
-        poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
+        poses = [image.cam_from_world() for image in images]
     except Exception as error:  # pycolmap raises bare RuntimeError, ValueError, IndexError, MemoryError and UnicodeDecodeError for broken files
         raise InputError(f"cannot read the COLMAP model in {folder}: {(str(error).splitlines() or [type(error).__name__])[0]}") from None
     if not images:
@@ -61,14 +61,15 @@ def _check_camera(camera: pycolmap.Camera, folder: Path) -> None:
         raise InputError(f"{where} has parameters that are not finite numbers, or a focal length that is not positive")
 
 
-def _check_poses(poses: np.ndarray, names: list[str], folder: Path) -> None:
-    """poses: (M, 3, 4) cam_from_world."""
-    rotations = poses[:, :, :3]
+def _check_poses(poses: list[pycolmap.Rigid3d], names: list[str], folder: Path) -> None:
+    """poses: cam_from_world."""
+    matrices = np.array([pose.matrix() for pose in poses])
     with np.errstate(all="ignore"):
-        stretch = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
-        wrong = ~((stretch < NOT_RIGID) & (np.abs(poses[:, :, 3]) < FARTHEST).all(axis=1))
-    if wrong.any():
-        raise InputError(f"{folder}: the pose of photo {names[int(np.argmax(wrong))]!r} is not a rotation and a finite position")
+        length = np.linalg.norm([pose.rotation.quat for pose in poses], axis=1)
+        error = np.abs(matrices[:, :, :3] @ matrices[:, :, :3].transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        right = (error < NOT_RIGID) & (length > 0.5) & (np.abs(matrices[:, :, 3]) < FARTHEST).all(axis=1)
+    if not right.all():
+        raise InputError(f"{folder}: the pose of photo {names[int(np.argmin(right))]!r} is not a rotation and a finite position")
 
 
 def check_counts(folder: Path) -> None:
@@ -84,7 +85,7 @@ def check_counts(folder: Path) -> None:
             _check_file(file, walks[name])
         except (_Damage, struct.error) as error:
             what = str(error) if isinstance(error, _Damage) else "is cut off"
-            raise InputError(f"{file} {what}: it is damaged, write or copy the model again") from None
+            raise InputError(f"{file.name} of the COLMAP model in {folder} {what}: it is damaged, write or copy it again") from None
 
 
 def _check_file(file: Path, walk: Callable[[mmap.mmap, int], int]) -> None:
@@ -143,6 +144,8 @@ def _walk_points(data: mmap.mmap, count: int) -> int:
 
 
 def _walk_records(data: mmap.mmap, count: int, fields: np.ndarray) -> int:
+    if not count:
+        return 8
     from sc3d.formats import kernels  # loads numba
 
     view = np.frombuffer(data, np.uint8)

@@ -6,6 +6,7 @@ do not exist, and leaves what it could not read uninitialised without an error. 
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -212,21 +213,21 @@ def _field(entry: Property, element: str, num_vertices: int) -> tuple[int, int, 
 
 def _check_text(path: Path, header: Header) -> None:
     """Words of a text PLY: numbers, as many as announced, within their types."""
-    import warnings
-
-    with path.open("rb") as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of words that are no numbers: then not all are read
+    with path.open("rb") as file:
         file.seek(header.size)
-        data = np.fromfile(file, np.float64, sep=" ")
-        if file.seek(0, 1) < path.stat().st_size and file.read(PADDING).strip(b" \t\r\n\0"):
-            raise InputError(f"{path}: after {len(data)} numbers there is something else; write or copy it again")
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", DeprecationWarning)  # how older numpy says that not all could be read
+                data = np.fromfile(file, np.float64, sep=" ")
+        except (ValueError, DeprecationWarning):
+            raise InputError(f"{path} has words that are not numbers; write or copy it again") from None
     position = 0
     for element in header.elements:
         end = _skip(path, header, element, data, position)
         if end > len(data):
             raise InputError(f"{path} is truncated: {end} numbers are announced, {len(data)} are there; write or copy it again")
         if not element.has_lists:
-            _check_types(path, element, data[position:end].reshape(element.rows, -1))
+            _check_types(path, element, data[position:end].reshape(element.rows, len(element.properties)))
         position = end
     if position < len(data):
         raise InputError(f"{path} has {len(data) - position} numbers more than its header announces: it is damaged, write or copy it again")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-import shutil
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from sc3d.classes import ClassTable
 from sc3d.errors import InputError
+from sc3d.files import discard
 from sc3d.io import atomic_path, image_size, read_index_image, write_image
 from sc3d.scene import match_masks
 from sc3d.segmentation.imports.checks import Mask
@@ -49,8 +49,8 @@ def import_masks(
         _check_target(confidence, scene_confidence)
     if maps:
         _copy(maps, confidence, scene_confidence)
-    elif scene_confidence is not None and scene_confidence.is_dir() and not in_place:
-        shutil.rmtree(scene_confidence)
+    elif scene_confidence is not None and not in_place:
+        discard(scene_confidence)
     if not in_place:  # in place, they are already there and checked
         _draw(masks, scene_masks)
     return sorted(masks)

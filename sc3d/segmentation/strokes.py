@@ -149,7 +149,8 @@ def deal(strokes: np.ndarray, codes: np.ndarray, num_parts: int) -> np.ndarray:
     for code in np.unique(codes):
         names, sizes = np.unique(strokes[codes == code], return_counts=True)
         filled = np.zeros(num_parts, np.int64)
-        for index in np.argsort(-sizes, kind="stable") if len(names) > 1 else ():
+        shuffled = np.random.default_rng(0).permutation(len(names))  # else the columns of a grid would go to one part each
+        for index in shuffled[np.argsort(-sizes[shuffled], kind="stable")] if len(names) > 1 else ():
             part = int(filled.argmin())
             filled[part] += sizes[index]
             folds[(codes == code) & (strokes == names[index])] = part

@@ -14,6 +14,7 @@ import torch
 from tqdm import tqdm
 
 from sc3d.errors import Sc3dError
+from sc3d.files import temporary_name
 from sc3d.geometry.cameras import View
 from sc3d.geometry.neighbors import orient_normals
 from sc3d.geometry.raycast import FirstSurface, Surface, first_surface
@@ -64,7 +65,7 @@ class DepthViews:
 
 def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -> Surfaces:
     """Fuse the rendered depth of all views; raises Sc3dError where the views show or share no surface."""
-    with tempfile.TemporaryDirectory(prefix="sc3d-depth-") as folder:
+    with tempfile.TemporaryDirectory(prefix=temporary_name("sc3d-depth")) as folder:
         maps = _DepthMaps(Path(folder), data)
         footprint = maps.render(gaussians)
         voxel_size = settings.voxel_size or _default_voxel_size(gaussians, footprint)

@@ -190,6 +190,8 @@ def _numbered(name: str, count: int) -> list[str]:
 
 def _read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
     """Structured (N,) table of the element "vertex", which comes first, and the comments."""
+    if not path.is_file():
+        raise InputError(f"{path} does not exist")
     header = check_ply(path)
     if header.order != "<":
         raise InputError(f"{path} is not a binary little endian PLY")

@@ -14,6 +14,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.io import atomic_path
 from sc3d.splatting import densify, losses
+from sc3d.splatting.checkpoint import check_state
 from sc3d.splatting.data import TrainingData
 from sc3d.splatting.densify import DensifyLimits, Statistics
 from sc3d.splatting.device import pick_device
@@ -119,6 +120,8 @@ class Trainer:
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
             matches = all(state[name] == value for name, value in self._identity().items())
+            if matches:
+                check_state(state, self.optimiser.parameters, self.data.views, str(path))
         except Exception as error:  # torch raises many types for broken files
             raise InputError(f"{path} is not a readable checkpoint ({type(error).__name__}): delete it to start over") from None
         if not matches:

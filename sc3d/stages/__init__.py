@@ -9,26 +9,30 @@ Stages never import one another; `execute` below is what they share: skip finish
 
 from __future__ import annotations
 
+import errno
 import importlib
-import json
 import logging
 import os
 import platform
 import resource
+import tempfile
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 
 import sc3d
-from sc3d.errors import InputError
-from sc3d.io import digest, write_json
+from sc3d.errors import InputError, Sc3dError
+from sc3d.files import remove_leftovers, require_inside, temporary_name
+from sc3d.io import digest, read_json, write_json
 from sc3d.scene import Scene
 
 logger = logging.getLogger(__name__)
 
 PACKAGES = ("open3d", "numpy", "scipy", "torch", "numba", "pycolmap", "opencv-python-headless")
+MAX_SIDECAR = 64 << 20  # bytes: names of all photos may be in it
 
 
 def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) -> dict[str, object]:
@@ -43,22 +47,64 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
     if previous is not None and not overwrite:
         logger.info("%s: up to date (--overwrite runs it again)", name)
         return previous["summary"]
+    _prepare(scene, outputs)
     started = time.perf_counter()
     reset_peak_memory()
-    kept = {sidecar(output): sidecar(output).read_bytes() for output in outputs if sidecar(output).exists()}
-    for path in kept:  # an output that is being replaced must not pass for finished
-        path.unlink()
-    try:
+    with _replacing(outputs), _room(scene):
         summary = _plain(stage.run(scene, settings))
-    except InputError:  # raised before anything is written
-        for path, content in kept.items():
-            path.write_bytes(content)
-        raise
     record |= {"versions": versions(), "seconds": round(time.perf_counter() - started, 2), "peak_memory_mb": peak_memory_mb(), "summary": summary}
-    for output in outputs:
-        write_json(sidecar(output), record)
+    with _room(scene):
+        for output in outputs:
+            write_json(sidecar(output), record)
     _report(name, record, outputs)
     return summary
+
+
+def _prepare(scene: Scene, outputs: list[Path]) -> None:
+    """Refuse outputs that would be written through a link to elsewhere; remove what killed runs left behind."""
+    for output in outputs:
+        require_inside(scene.path, output)
+    for folder in {scene.path, Path(tempfile.gettempdir()), *outputs, *(output.parent for output in outputs)}:
+        remove_leftovers(folder)
+
+
+@contextmanager
+def _replacing(outputs: list[Path]) -> Iterator[None]:
+    """Hide the sidecars: an output that is being replaced must not pass for finished. They come back if the block fails and no output has changed."""
+    before = [_identity(output) for output in outputs]
+    hidden = {path: path.with_name(f"{temporary_name(path.name)}.before") for path in map(sidecar, outputs) if path.is_file()}
+    for path, aside in hidden.items():
+        path.rename(aside)
+    try:
+        yield
+    except BaseException:  # Ctrl-C too
+        if [_identity(output) for output in outputs] == before:
+            for path, aside in hidden.items():
+                aside.rename(path)
+        raise
+    finally:
+        for aside in hidden.values():
+            aside.unlink(missing_ok=True)
+
+
+def _identity(path: Path) -> tuple[int, ...] | None:
+    """Changes whenever a file is replaced, or anything in a folder."""
+    with suppress(OSError):
+        found = path.lstat()
+        return found.st_ino, found.st_mtime_ns, found.st_size
+    return None
+
+
+@contextmanager
+def _room(scene: Scene) -> Iterator[None]:
+    """Say that the disk is full where it is, in whatever words a library puts it."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        if getattr(error, "errno", None) not in (errno.ENOSPC, errno.EDQUOT) and "disk is full" not in str(error):
+            raise
+        place = getattr(error, "filename", None) or scene.path
+        raise Sc3dError(f"no space left to write {place}: make room and run the same command again; finished work is kept") from error
 
 
 def sidecar(output: Path) -> Path:
@@ -102,8 +148,10 @@ def _finished(record: dict, outputs: list[Path]) -> dict | None:
     found = None
     for output in outputs:
         try:
-            found = json.loads(sidecar(output).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            found = read_json(sidecar(output), MAX_SIDECAR)
+        except InputError:
+            return None
+        if not isinstance(found, dict) or not isinstance(found.get("summary"), dict):
             return None
         if not output.exists() or any(found.get(key) != value for key, value in record.items()):
             return None

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
-import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from sc3d.classes import ClassTable
 from sc3d.errors import InputError
+from sc3d.files import discard, remove_leftovers
 from sc3d.io import atomic_path, digest, find_photos, read_json, write_image, write_json
 from sc3d.scene import Scene, photo_sizes
 from sc3d.settings import Segment
+
+if TYPE_CHECKING:
+    from sc3d.segmentation.run import Folders
 
 logger = logging.getLogger(__name__)
 
@@ -36,8 +41,7 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
     class_table = scene.class_table()
     if settings.refine:
         return _refine(scene, settings)
-    if scene.confidence_refined.is_dir():  # it belongs to the masks that are replaced
-        shutil.rmtree(scene.confidence_refined)
+    discard(scene.confidence_refined)  # it belongs to the masks that are replaced
     if settings.backend == "files":
         return _import(scene, settings, class_table)
     from sc3d.segmentation.run import Folders, segment_photos
@@ -47,11 +51,12 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
     folders = Folders(scene.masks, scene.confidence, scene.instances)
     # Masks of an interrupted run are gone on with if they were made with the same settings; others are set aside.
     marker, state = scene.path / "segment.unfinished.json", _state(scene, settings, class_table)
-    unfinished = marker.exists() and read_json(marker) == state
-    if unfinished:
-        _remove_leftovers(folders.masks, folders.confidence, folders.instances)
+    unfinished = marker.exists()
+    if unfinished and read_json(marker) == state:
+        for folder in (folders.masks, folders.confidence, folders.instances):
+            remove_leftovers(folder)
     else:
-        _set_aside(folders.masks, folders.confidence, folders.instances)
+        _set_aside(folders, "unfinished" if unfinished else "before")
     write_json(marker, state)
     summary = segment_photos(find_photos(scene.images), folders, segmenter, class_table)
     marker.unlink()
@@ -61,27 +66,22 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
 
 
 def _state(scene: Scene, settings: Segment, class_table: ClassTable) -> object:
-    """What decides the masks, as JSON: everything but where the models lie and run."""
+    """What decides the masks, as JSON: everything but where the models lie and run. Photos are told by size and time, as they are read often."""
     decisive = replace(settings, device="auto", download=False, model_dir=None)
     strokes = digest(settings.strokes or scene.strokes) if settings.backend == "strokes" else ""
-    return json.loads(json.dumps([repr(decisive), class_table.as_json(), strokes]))
+    photos = [(str(photo.relative_to(scene.images)), photo.stat().st_size, photo.stat().st_mtime_ns) for photo in find_photos(scene.images)]
+    seen = hashlib.blake2b(repr(photos).encode(), digest_size=16).hexdigest()
+    return json.loads(json.dumps([repr(decisive), class_table.as_json(), strokes, seen]))
 
 
-def _set_aside(*folders: Path) -> None:
-    """Older masks may hold somebody's work: they become `<folder>.before`, in place of still older ones."""
-    for folder in folders:
-        before = folder.with_name(f"{folder.name}.before")
-        if before.is_dir():
-            shutil.rmtree(before)
+def _set_aside(folders: Folders, suffix: str) -> None:
+    """Older masks may hold somebody's work: they become `<folder>.<suffix>`, in place of still older ones. Goes on where it was interrupted."""
+    for folder in (folders.masks, folders.confidence, folders.instances):
+        aside = folder.with_name(f"{folder.name}.{suffix}")
         if folder.is_dir():
-            folder.rename(before)
-            logger.info("%s is now %s", folder, before)
-
-
-def _remove_leftovers(*folders: Path) -> None:
-    """Temporary files that a killed run left behind (see `sc3d.io.atomic_path`)."""
-    for file in (file for folder in folders for file in folder.glob(".*.tmp.*")):
-        file.unlink()
+            discard(aside)
+            folder.rename(aside)
+            logger.info("%s is now %s", folder, aside)
 
 
 def _segmenter(scene: Scene, settings: Segment, class_table: ClassTable):  # noqa: ANN202 - a sc3d.segmentation.run.Segmenter; packages load late
@@ -123,8 +123,8 @@ def _refine(scene: Scene, settings: Segment) -> dict[str, object]:
             folder.mkdir()
             for view in tqdm(masks.views, desc="writing confidence", unit="photo", disable=None):
                 write_image(folder / f"{Path(view.name).stem}.png", refinement.confidence(view, masks.read))
-    elif scene.confidence_refined.is_dir():
-        shutil.rmtree(scene.confidence_refined)
+    else:
+        discard(scene.confidence_refined)
     return {"agreement_before": f"{refinement.before:.2%}", "agreement_after": f"{refinement.after:.2%}", "kept": refinement.helps}
 
 
