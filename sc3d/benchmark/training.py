@@ -21,7 +21,7 @@ from sc3d.stages import peak_memory_mb, reset_peak_memory
 # what the renderer calls for each stage; `loss`, `adam` and `total` are timed around the calls
 FUNCTIONS = {
     "project": [(kernels_project, "project")],
-    "sort and bin": [(render, "_bin")],
+    "sort and bin": [(render, "sort_into_tiles")],
     "forward": [(kernels_raster, "rasterise"), (kernels_raster, "collect_contributions")],
     "backward": [(kernels_unraster, "rasterise_backward")],
     "project backward": [(kernels_backproject, "project_backward")],

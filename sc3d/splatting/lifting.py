@@ -17,7 +17,7 @@ from sc3d.geometry.cameras import View
 from sc3d.splatting import kernels_lift, kernels_project
 from sc3d.splatting.device import has_kernels
 from sc3d.splatting.gaussians import SH_C0, Gaussians
-from sc3d.splatting.render import _bin, _camera_array, _interleaved, render
+from sc3d.splatting.render import camera_array, interleaved, render, sort_into_tiles
 
 SCALE = 1 << 30  # evidence of one whole pixel, in fixed point: 2^63 of it are 8 thousand million pixels
 ReadMask = Callable[[View], tuple[np.ndarray, np.ndarray | None]]
@@ -50,14 +50,14 @@ def _add_view(gaussians: Gaussians, view: View, mask: np.ndarray, weights: np.nd
     if not len(ids) or not len(gaussians):
         return
     arrays = [tensor.detach().contiguous().numpy() for tensor in gaussians.parameters().values()]
-    count, camera = len(gaussians), _camera_array(view)
+    count, camera = len(gaussians), camera_array(view)
     records, depths, radii = np.empty((count, kernels_project.RECORD), np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
-    kernels_project.project(*arrays, 0, camera, _interleaved(-(-count // kernels_project.CHUNK)), records, depths, radii)
-    visible, records, offsets, ranks, instances, starts = _bin(camera, records, depths)
+    kernels_project.project(*arrays, 0, camera, interleaved(-(-count // kernels_project.CHUNK)), records, depths, radii)
+    visible, records, offsets, ranks, instances, starts = sort_into_tiles(camera, records, depths)
     columns = np.full(256, kernels_lift.NONE)
     columns[ids] = np.arange(len(ids))
     contributions = np.zeros((len(ranks), len(ids)), np.float32)
-    kernels_lift.lift(records.reshape(-1), ranks, instances, starts, _interleaved(len(starts) - 1), columns[mask], weights, contributions)
+    kernels_lift.lift(records.reshape(-1), ranks, instances, starts, interleaved(len(starts) - 1), columns[mask], weights, contributions)
     kernels_lift.collect(visible, offsets, contributions, ids, float(SCALE), evidence)
 
 

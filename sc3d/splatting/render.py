@@ -100,7 +100,7 @@ def render(
     statistics = ViewStatistics(*(torch.zeros(count) for _ in range(4)))
     radii = torch.zeros(count)
     shade = np.zeros(3, np.float32) if background is None else background.detach().numpy().astype(np.float32)
-    settings = (_camera_array(view), degree, geometry, shade, radii, statistics)
+    settings = (camera_array(view), degree, geometry, shade, radii, statistics)
     color, normal, plane_distance, alpha = _Render.apply(*parameters, settings)
     return Rendering(color.permute(1, 2, 0), alpha, normal.permute(1, 2, 0), plane_distance, radii, statistics)
 
@@ -125,7 +125,7 @@ def _ray_slopes(view: View) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(column.astype(np.float32)), torch.from_numpy(row.astype(np.float32))
 
 
-def _camera_array(view: View) -> np.ndarray:
+def camera_array(view: View) -> np.ndarray:
     """(25,) float64 as `kernels_project.project` wants it."""
     pose, focal, principal = view.cam_from_world, view.matrix[[0, 1], [0, 1]], view.matrix[:2, 2]
     size = np.array([view.width, view.height], np.float64)
@@ -135,7 +135,7 @@ def _camera_array(view: View) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def _interleaved(count: int) -> np.ndarray:
+def interleaved(count: int) -> np.ndarray:
     """(count,) int64 permutation: 0, 16, 32, ..., 1, 17, ..."""
     return np.concatenate([np.arange(first, count, _STREAMS) for first in range(_STREAMS)])
 
@@ -147,7 +147,7 @@ def _near_to_far(depths: np.ndarray) -> np.ndarray:
     return (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
 
-def _bin(camera: np.ndarray, all_records: np.ndarray, depths: np.ndarray) -> tuple:
+def sort_into_tiles(camera: np.ndarray, all_records: np.ndarray, depths: np.ndarray) -> tuple:
     """Tile lists: visible (M,) ids, records (M, 16) in depth order, offsets (M + 1,), ranks (P,), instances (P,), starts (tiles + 1,)."""
     width, height = int(camera[16]), int(camera[17])
     visible = np.flatnonzero(depths)
@@ -170,11 +170,11 @@ class _Render(torch.autograd.Function):
         arrays = [tensor.detach().contiguous().numpy() for tensor in (means, log_scales, quats, opacity_logits, sh)]
         count, width, height = len(means), int(camera[16]), int(camera[17])
         all_records, depths = np.empty((count, kernels_project.RECORD), np.float32), np.zeros(count, np.float32)
-        chunks = _interleaved(-(-count // kernels_project.CHUNK)) if count else np.empty(0, np.int64)
+        chunks = interleaved(-(-count // kernels_project.CHUNK)) if count else np.empty(0, np.int64)
         kernels_project.project(*arrays, degree, camera, chunks, all_records, depths, radii.numpy())
-        visible, records, offsets, ranks, instances, starts = _bin(camera, all_records, depths)
+        visible, records, offsets, ranks, instances, starts = sort_into_tiles(camera, all_records, depths)
         image = np.empty((kernels_raster.CHANNELS, height, width), np.float32)
-        contributions, order = np.zeros((len(ranks), 2), np.float32), _interleaved(len(starts) - 1)
+        contributions, order = np.zeros((len(ranks), 2), np.float32), interleaved(len(starts) - 1)
         kernels_raster.rasterise(records.reshape(-1), ranks, instances, starts, order, background, geometry, image, contributions)
         kernels_raster.collect_contributions(visible, offsets, contributions, statistics.weight.numpy(), statistics.max_transmittance.numpy())
         outputs = [torch.from_numpy(image[planes]) for planes in (slice(0, 3), slice(3, 6), 6, 7)]
