@@ -87,8 +87,8 @@ def require_inside(folder: Path, path: Path) -> None:
         return
     if path.is_symlink() and path.is_dir():
         raise InputError(f"{path} is a link to {path.resolve()}, which would be overwritten: remove the link")
-    outer = next(parent for parent in path.parents if parent.exists())
-    if not outer.resolve().is_relative_to(folder.resolve()):
+    outer = next((parent for parent in path.parents if parent.exists()), folder)
+    if folder in (outer, *outer.parents) and not outer.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"{outer} is a link that leads out of {folder}: what lies there is not overwritten, remove the link")
 
 

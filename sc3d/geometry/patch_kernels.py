@@ -14,7 +14,7 @@ from sc3d.geometry.voxels import AXIS_BITS, BLOCK, FIXED, SIDES, VOXELS
 
 MIN_POINTS = 3  # in a voxel: never a floater; of a side: enough for a plane of its own
 MIN_SUPPORT = 5  # points in a voxel and the 26 around it; fewer: a floater
-SLACK = 0.0  # planes reach this far beyond their voxel, in voxels, so that no ray slips through between two of them ...
+SLACK = 0.4  # planes reach this far beyond their voxel, in voxels, so that no ray slips through between two of them ...
 MARGIN = 0.25  # ... and this far beyond its outermost points where there is no voxel with points to go on in
 SCATTERED, COPLANAR = 0.3, 0.6  # half width, in voxels, of a point's own patch where normals scatter: leaves, and points in the plane of voxels around (corners)
 MAX_AWAY = 0.15  # from a plane to a point in it, in voxels
