@@ -14,6 +14,7 @@ import numpy as np
 from sc3d.geometry.voxels import AXIS_BITS, BLOCK
 
 NOTHING = -1
+BACK = 9.0
 STILL = 1e-30  # a component of a direction below this is 0: it crosses no face
 NEVER = 1e300  # its inverse
 MIXER = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: multiplicative hashing (Knuth)
@@ -128,6 +129,8 @@ def _hit(grid, ray, voxel, x, y, z):  # noqa: ANN001, ANN202 - numba kernel
         if range_ <= 0.0 or range_ > nearest or (range_ == nearest and abs(slope) >= incidence):
             continue
         hx, hy, hz = px + range_ * ray.dx, py + range_ * ray.dy, pz + range_ * ray.dz
+        if slope > 0 and (min(hx, hy, hz) < BACK or max(hx, hy, hz) > 1.0 - BACK):
+            continue
         if patches[k, 6] <= hx <= patches[k, 9] and patches[k, 7] <= hy <= patches[k, 10] and patches[k, 8] <= hz <= patches[k, 11]:
             nearest, incidence = range_, abs(slope)
     return nearest, incidence

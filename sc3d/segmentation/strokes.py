@@ -14,6 +14,7 @@ from sc3d.errors import InputError, MissingPackageError
 from sc3d.io import read_image
 from sc3d.segmentation.features import pixel_features
 from sc3d.segmentation.guided import fit_lines
+from sc3d.segmentation.novelty import Novelty, learn_novelty
 from sc3d.segmentation.run import Segmentation
 from sc3d.segmentation.stroke_files import BACKGROUND, NOTHING, PhotoStrokes, read_strokes
 
@@ -66,12 +67,13 @@ class _Learned:
 class Strokes:
     """Segmenter that has learned from strokes."""
 
-    def __init__(self, classifier, label_of_code: np.ndarray, settings: StrokesSettings, temperature: float = 1.0) -> None:  # noqa: ANN001 - PixelClassifier
-        """classifier: of codes; label_of_code: (C,) uint8 class id of each, 0 = background"""
+    def __init__(self, classifier, novelty: Novelty | None, label_of_code: np.ndarray, settings: StrokesSettings) -> None:  # noqa: ANN001 - PixelClassifier
+        """classifier: of codes; novelty: of pixels unlike all strokes; label_of_code: (C,) uint8 class id of each code, 0 = background"""
         self._classifier = classifier
+        self._novelty = novelty
         self._label_of_code = label_of_code
         self._settings = settings
-        self.temperature = temperature
+        self.temperature = 1.0  # below 1 sharpens probabilities, above 1 blunts them
 
     @classmethod
     def learn(cls, folder: Path, photos_folder: Path, class_table: ClassTable, settings: StrokesSettings = StrokesSettings()) -> Strokes:
@@ -91,9 +93,10 @@ class Strokes:
         strokes = np.concatenate([part.strokes + (index << 40) for index, part in enumerate(taught)])
         folds = deal(strokes, codes, settings.members)
         samples = Samples(np.concatenate([part.features for part in taught]), codes, folds)
-        learned = cls(train(samples, settings.members, settings.trees, settings.steps, settings.seed), label_of_code.astype(np.uint8), settings)
+        classifier = train(samples, settings.members, settings.trees, settings.steps, settings.seed)
+        learned = cls(classifier, learn_novelty(samples.features, folds), label_of_code.astype(np.uint8), settings)
         learned.temperature = learned._calibrate(drawn, taught, codes, folds)
-        logger.info("learned from %d strokes on %d photos; temperature %.2f", len(np.unique(strokes)), len(drawn), learned.temperature)
+        logger.info("learned from %d strokes on %d photos; temperature %.2f", sum(int(marks.max()) for _, marks in painted), len(drawn), learned.temperature)
         return learned
 
     def segment(self, image: np.ndarray) -> Segmentation:
@@ -107,8 +110,8 @@ class Strokes:
         guide = fine.astype(np.float32) / 255
         best, total = np.zeros(guide.shape[:2], np.float32), np.zeros(guide.shape[:2], np.float32)
         labels = np.zeros(guide.shape[:2], np.uint8)
-        lines = fit_lines(small.astype(np.float32) / 255, self._classifier.probabilities(pixel_features(small)), self._settings.radius, self._settings.smoothing)
-        for label, line in zip(self._label_of_code, lines, strict=True):
+        lines = fit_lines(small.astype(np.float32) / 255, self._planes(pixel_features(small)), self._settings.radius, self._settings.smoothing)
+        for label, line in zip([*self._label_of_code, 0], lines, strict=True):
             weight = self._sharpened(line.apply(guide))
             labels[weight > best] = label
             total += weight
@@ -117,6 +120,12 @@ class Strokes:
         labels[sure < self._settings.unsure] = 0
         confidence = np.where(labels > 0, np.clip(np.rint(255 * sure), 1, 255), 0).astype(np.uint8)
         return Segmentation(*(cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST) for values in (labels, confidence)))
+
+    def _planes(self, features: np.ndarray) -> np.ndarray:
+        """(H, W, C + 1) float32 probabilities of the codes, and of none of them."""
+        probabilities = self._classifier.probabilities(features)
+        unknown = np.zeros(features.shape[:2], np.float32) if self._novelty is None else self._novelty.share(features)
+        return np.concatenate([probabilities * (1 - unknown)[..., None], unknown[..., None]], axis=-1)
 
     def _sharpened(self, plane: np.ndarray) -> np.ndarray:
         return np.clip(plane, _FLOOR, 1) ** np.float32(1 / self.temperature)

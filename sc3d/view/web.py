@@ -38,6 +38,12 @@ PAGE_POINTS, FILE_POINTS, FILE_SPLATS = 1_000_000, 300_000, 200_000  # shown at 
 _TITLE = "sc3d"
 _WINDOW = (1600, 1000)  # px; the start holds the whole scene in a window of this shape
 
+# Chromium starts no worker of viser's from a blob: address in a page from disk; without that address viser uses a data: address, which works.
+_WORKER_FROM_DISK = (
+    "if(location.protocol==='file:'){const make=URL.createObjectURL.bind(URL);"
+    "URL.createObjectURL=blob=>blob instanceof Blob&&blob.type.startsWith('text/javascript')?'':make(blob)}"
+)
+
 
 @dataclass(frozen=True)
 class WebView:
@@ -116,11 +122,16 @@ def write_page(path: Path, view: WebView) -> None:
         CameraLayer(server, views, frustum_depth(views, shown.points) if views else 1.0)
         _start(server, view, shown, views)
         page = server.scene.as_html()
-    legend = legend_html(view.by, shown)
-    style = "position:fixed;left:0;bottom:0;padding:.5em;background:rgba(255,255,255,.85);font-family:sans-serif;z-index:10"
-    page = page.replace("</body>", f"<div style='{style}'>{legend}</div></body>", 1) if legend else page
     with atomic_path(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(_for_disk(page, legend_html(view.by, shown)), encoding="utf-8")
+
+
+def _for_disk(page: str, legend: str) -> str:
+    """viser's page with a legend, and with a worker that starts in pages from disk too: without it splats are not sorted by depth."""
+    style = "position:fixed;left:0;bottom:0;padding:.5em;background:rgba(255,255,255,.85);font-family:sans-serif;z-index:10"
+    head, body = page.index("<head>") + len("<head>"), page.rindex("</body>")
+    added = f"<div style='{style}'>{legend}</div>" if legend else ""
+    return f"{page[:head]}<script>{_WORKER_FROM_DISK}</script>{page[head:body]}{added}{page[body:]}"
 
 
 def load_viser() -> ModuleType:
