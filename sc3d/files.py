@@ -40,7 +40,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
             if not os.path.lexists(temporary):
                 raise OSError(f"nothing was written to {temporary}")
         finally:
-            _require_room(path)
+            require_room(path)
         _sync(temporary)
         _replace(temporary, path)
     finally:
@@ -81,6 +81,17 @@ def remove_leftovers(folder: Path) -> None:
             remove(entry)
 
 
+def require_room(path: Path, num_bytes: int = 0) -> None:
+    """OSError if there is no room for so many bytes, or none at all: some libraries then fail in other words, do not notice, or end the process."""
+    try:
+        found = os.statvfs(path.parent)
+    except OSError:
+        return
+    free = found.f_bfree if os.geteuid() == 0 else found.f_bavail
+    if found.f_blocks and free * found.f_frsize < num_bytes + ROOM:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from None
+
+
 def require_inside(folder: Path, path: Path) -> None:
     """InputError if writing `path`, which lies in `folder` by name, would lead out of it by a link."""
     if folder not in path.parents:
@@ -108,17 +119,6 @@ def _runs(process: int) -> bool:
     except (PermissionError, OverflowError):
         return True
     return True
-
-
-def _require_room(path: Path) -> None:
-    """OSError if the disk is full: some libraries then fail in other words, and some do not notice."""
-    try:
-        found = os.statvfs(path.parent)
-    except OSError:
-        return
-    free = found.f_bfree if os.geteuid() == 0 else found.f_bavail
-    if found.f_blocks and free * found.f_frsize < ROOM:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from None
 
 
 def _replace(temporary: Path, path: Path) -> None:

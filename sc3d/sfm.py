@@ -18,7 +18,7 @@ from tqdm import tqdm
 from sc3d.georeferencing.alignment import Similarity, main_plane
 from sc3d.georeferencing.control_points import ControlPoints, align_to_control_points, transform
 from sc3d.errors import InputError, Sc3dError
-from sc3d.files import temporary_name
+from sc3d.files import require_room, temporary_name
 from sc3d.georeferencing.focal import anchor_focal, tells_focal
 from sc3d.georeferencing.georeference import Georeference, from_origin
 from sc3d.georeferencing.gps import Flight, place, read_flight, residuals
@@ -27,6 +27,7 @@ from sc3d.settings import Reconstruct
 
 logger = logging.getLogger(__name__)
 
+FEATURE_BYTES, PAIR_BYTES = 160, 20_000  # in the database: of a keypoint with its descriptor, of the matches of two photos
 LOOSE = 1.1  # a model is moved onto its GPS if that makes the root mean square distance smaller by this factor
 
 
@@ -51,6 +52,7 @@ def reconstruct(images: Path, names: list[str], sparse: Path, settings: Reconstr
     if settings.matching == "spatial" and flight is None:
         raise InputError("--matching spatial needs GPS in the photos' EXIF: use exhaustive or sequential")
     sparse.parent.mkdir(parents=True, exist_ok=True)
+    require_room(sparse, _database_size(len(names), settings))  # COLMAP's threads would end the process
     with tempfile.TemporaryDirectory(prefix=temporary_name("work"), dir=sparse.parent) as folder:
         work = Path(folder)
         database = work / "database.db"
@@ -73,8 +75,16 @@ def _extract(database: Path, images: Path, names: list[str], settings: Reconstru
     options.sift.max_num_features = settings.max_features
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = settings.camera_model
+    pycolmap.Database.open(database).close()
+    pycolmap.import_images(database, images, pycolmap.CameraMode.AUTO, names, reader)  # else ids follow the threads that are done first
     with _progress(database, "keypoints", len(names), "features", "photo"):
         pycolmap.extract_features(database, images, names, pycolmap.CameraMode.AUTO, reader, options, pycolmap.Device.cpu)
+
+
+def _database_size(num_photos: int, settings: Reconstruct) -> int:
+    """Bytes that the database may take: keypoints with descriptors, matches, and the journal of what is being written."""
+    partners = {"exhaustive": num_photos / 2, "sequential": 10, "spatial": 50}[settings.matching]
+    return int(num_photos * (2 * FEATURE_BYTES * settings.max_features + PAIR_BYTES * min(partners, num_photos)))
 
 
 def _write_priors(database: Path, flight: Flight | None) -> None:
@@ -101,8 +111,10 @@ def _write_priors(database: Path, flight: Flight | None) -> None:
 def _match(database: Path, num_photos: int, settings: Reconstruct) -> None:
     match = {"exhaustive": pycolmap.match_exhaustive, "sequential": pycolmap.match_sequential, "spatial": pycolmap.match_spatial}
     num_pairs = num_photos * (num_photos - 1) // 2 if settings.matching == "exhaustive" else None
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = settings.seed  # for each pair, whichever thread it falls to
     with _progress(database, "two_view_geometries", num_pairs, "matching", "pair"):
-        match[settings.matching](database, device=pycolmap.Device.cpu)
+        match[settings.matching](database, verification_options=verification, device=pycolmap.Device.cpu)
 
 
 def _map(database: Path, images: Path, work: Path, settings: Reconstruct, num_photos: int, has_gps: bool) -> pycolmap.Reconstruction:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,12 +47,13 @@ def import_masks(
     _check_target(source.path, scene_masks)
     if scene_confidence is not None:
         _check_target(confidence, scene_confidence)
-    if maps:
-        _copy(maps, confidence, scene_confidence)
-    elif scene_confidence is not None and not in_place:
-        discard(scene_confidence)
-    if not in_place:  # in place, they are already there and checked
-        _draw(masks, scene_masks)
+    with ExitStack() as folders:  # all is written before anything replaces what is there
+        if maps and confidence.resolve() != scene_confidence.resolve():
+            _copy(maps, folders.enter_context(atomic_path(scene_confidence)))
+        if not in_place:  # in place, they are already there and checked
+            _draw(masks, folders.enter_context(atomic_path(scene_masks)))
+            if not maps and scene_confidence is not None:
+                discard(scene_confidence)
     return sorted(masks)
 
 
@@ -99,19 +100,15 @@ def _check_target(source: Path | None, target: Path) -> None:
         raise InputError(f"{source} lies inside {target}, which would be replaced: move it elsewhere")
 
 
-def _copy(files: dict[str, Path], source: Path, target: Path) -> None:
-    if source.resolve() == target.resolve():
-        return  # already in place, and checked
-    with atomic_path(target) as temporary:
-        temporary.mkdir()
-        for file in files.values():
-            write_image(temporary / file.name, read_index_image(file))
+def _copy(files: dict[str, Path], folder: Path) -> None:
+    folder.mkdir()
+    for file in files.values():
+        write_image(folder / file.name, read_index_image(file))
 
 
-def _draw(masks: dict[str, Mask], target: Path) -> None:
+def _draw(masks: dict[str, Mask], folder: Path) -> None:
     from tqdm import tqdm
 
-    with atomic_path(target) as temporary:
-        temporary.mkdir()
-        for name, mask in tqdm(masks.items(), desc="import", unit="photo", disable=None):
-            write_image(temporary / f"{Path(name).stem}.png", mask.read())
+    folder.mkdir()
+    for name, mask in tqdm(masks.items(), desc="import", unit="photo", disable=None):
+        write_image(folder / f"{Path(name).stem}.png", mask.read())

@@ -11,15 +11,36 @@ from scipy.spatial import cKDTree
 _DIMENSIONS = 6  # principal components: more only make distances more alike
 _QUANTILE = 0.995  # of the distances of held-out strokes that still pass for known
 _STEP = 4  # px between the places looked at
+_NARROW = 5  # such steps: what is narrower is no object
 _MOST = 15_000  # pixels to compare with
 
 
 @dataclass(frozen=True)
-class Novelty:
-    """centre: (F,) mean; projection: (F, 6) to principal components; known: index of pixels under strokes; reach: distance beyond which nothing is known."""
+class _Space:
+    """Where distances are measured: principal components, half whitened because the first say most, and what they leave over.
+
+    centre, scale: (F,) of the features; axes: (6, F) orthonormal; sizes: (6,) divisors; rest: divisor of the remainder
+    """
 
     centre: np.ndarray
-    projection: np.ndarray
+    scale: np.ndarray
+    axes: np.ndarray
+    sizes: np.ndarray
+    rest: float = 1.0
+
+    def place(self, features: np.ndarray) -> np.ndarray:
+        """(N, 7) places of (N, F) features; the last coordinate is the distance from the plane of the components, where strange colours show."""
+        scaled = (features - self.centre) / self.scale
+        components = scaled @ self.axes.T
+        rest = np.sqrt(np.maximum((scaled**2).sum(axis=1) - (components**2).sum(axis=1), 0))
+        return np.concatenate([components / self.sizes, rest[:, None] / self.rest], axis=1)
+
+
+@dataclass(frozen=True)
+class Novelty:
+    """known: places of pixels under strokes; reach: distance from them up to which a pixel is known."""
+
+    space: _Space
     known: cKDTree
     reach: float
 
@@ -30,8 +51,9 @@ class Novelty:
         returns: (H, W) float32: 0 within reach of a stroke's pixel, 1 from twice the reach on
         """
         sparse = features[::_STEP, ::_STEP]
-        distances = self.known.query((sparse.reshape(-1, features.shape[-1]) - self.centre) @ self.projection)[0]
+        distances = self.known.query(self.space.place(sparse.reshape(-1, features.shape[-1])))[0]
         share = np.clip(distances / self.reach - 1, 0, 1).reshape(sparse.shape[:2]).astype(np.float32)
+        share = cv2.morphologyEx(share, cv2.MORPH_OPEN, np.ones((_NARROW, _NARROW), np.uint8))  # windows across an edge are unlike both sides
         return cv2.resize(share, features.shape[1::-1], interpolation=cv2.INTER_LINEAR)
 
 
@@ -43,16 +65,16 @@ def learn_novelty(features: np.ndarray, folds: np.ndarray) -> Novelty | None:
     parts = np.unique(folds[folds >= 0])
     if len(parts) < 2:
         return None
-    centre = features.mean(axis=0)
-    scale = features.std(axis=0) + 1e-3
-    _, sizes, axes = np.linalg.svd((features - centre) / scale, full_matrices=False)
-    sizes = np.sqrt(np.maximum(sizes[:_DIMENSIONS] / np.sqrt(len(features)), 1e-3))  # half whitened: the first components say most
-    projection = (axes[:_DIMENSIONS] / sizes[:, None]).T / scale[:, None]
-    projected = (features - centre) @ projection
+    space = _fit(features)
+    places = space.place(features)
     thinned = slice(None, None, -(-len(features) // _MOST))
-    distances = [_index(projected[folds != part][thinned]).query(projected[folds == part])[0] for part in parts]
-    return Novelty(centre, projection, _index(projected[thinned]), max(float(np.quantile(np.concatenate(distances), _QUANTILE)), 1e-6))
+    distances = [cKDTree(places[folds != part][thinned]).query(places[folds == part])[0] for part in parts]
+    return Novelty(space, cKDTree(places[thinned]), max(float(np.quantile(np.concatenate(distances), _QUANTILE)), 1e-6))
 
 
-def _index(points: np.ndarray) -> cKDTree:
-    return cKDTree(points)
+def _fit(features: np.ndarray) -> _Space:
+    centre, scale = features.mean(axis=0), features.std(axis=0) + 1e-3
+    _, sizes, axes = np.linalg.svd((features - centre) / scale, full_matrices=False)
+    space = _Space(centre, scale, axes[:_DIMENSIONS], np.sqrt(np.maximum(sizes[:_DIMENSIONS] / np.sqrt(len(features)), 1e-3)))
+    rest = space.place(features)[:, -1]
+    return _Space(space.centre, space.scale, space.axes, space.sizes, float(rest.std()) or 1.0)

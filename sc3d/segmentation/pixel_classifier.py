@@ -17,6 +17,7 @@ from sklearn.ensemble import ExtraTreesClassifier
 _CHUNK = 1 << 17  # pixels at once
 _BATCH = 512
 _RATE = 6e-3  # peak of the learning rate
+_SHARPEST = 0.4  # temperature; strokes lie where it is easy, so that all may be right and still say nothing of edges
 _CLIP = 0.05  # the networks see features within these quantiles of the strokes: far outside, they would be sure of anything
 
 
@@ -133,5 +134,5 @@ def best_temperature(probabilities: np.ndarray, codes: np.ndarray) -> float:
         scaled = logarithms / temperature
         return float((np.log(np.exp(scaled - scaled.max(axis=1, keepdims=True)).sum(axis=1)) + scaled.max(axis=1) - scaled[rows, codes]).mean())
 
-    candidates = np.geomspace(0.2, 5, 65)
+    candidates = np.geomspace(_SHARPEST, 5, 65)
     return float(candidates[np.argmin([loss(candidate) for candidate in candidates])])

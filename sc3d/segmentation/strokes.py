@@ -106,7 +106,7 @@ class Strokes:
         returns: (H, W) uint8 class id, 0 = background or unsure; (H, W) uint8 confidence, probability of the class x 255, 0 where unlabelled
         """
         height, width = image.shape[:2]
-        small, fine = _reduced(image, self._settings.max_size), _reduced(image, _FINEST)
+        small, fine = reduced(image, self._settings.max_size), reduced(image, _FINEST)
         guide = fine.astype(np.float32) / 255
         best, total = np.zeros(guide.shape[:2], np.float32), np.zeros(guide.shape[:2], np.float32)
         labels = np.zeros(guide.shape[:2], np.uint8)
@@ -138,7 +138,7 @@ class Strokes:
         found, truth = [np.zeros((0, len(self._label_of_code)), np.float32)], [codes[:0]]
         for index in sorted(range(len(drawn)), key=lambda index: -len(taught[index].labels))[: self._settings.calibration_photos]:
             part = slice(ends[index], ends[index + 1])
-            small = _reduced(read_image(drawn[index].photo), self._settings.max_size)
+            small = reduced(read_image(drawn[index].photo), self._settings.max_size)
             features, guide = pixel_features(small), small.astype(np.float32) / 255
             for member in np.unique(folds[part][folds[part] >= 0]):
                 pixels = taught[index].pixels[folds[part] == member]
@@ -185,7 +185,7 @@ def _teach(photo: PhotoStrokes, labels: np.ndarray, strokes: np.ndarray, setting
     """Pixels under the strokes of a photo, a share of each stroke."""
     random = np.random.default_rng([settings.seed, *photo.photo.stem.encode()])
     rows = np.concatenate([pick(strokes.ravel(), labels.ravel() == label, settings.pixels, random) for label in np.unique(labels[labels != NOTHING])])
-    features = pixel_features(_reduced(read_image(photo.photo), settings.max_size))
+    features = pixel_features(reduced(read_image(photo.photo), settings.max_size))
     return _Learned(features.reshape(-1, features.shape[-1])[rows], labels.ravel()[rows], _pieces(strokes, rows), rows)
 
 
@@ -217,7 +217,8 @@ def _reduced_size(width: int, height: int, max_size: int) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _reduced(image: np.ndarray, max_size: int) -> np.ndarray:
+def reduced(image: np.ndarray, max_size: int) -> np.ndarray:
+    """(h, w, 3) uint8 photo whose longest side is at most `max_size` px."""
     size = _reduced_size(*image.shape[1::-1], max_size)
     return image if size == image.shape[1::-1] else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 

@@ -103,8 +103,8 @@ def _room(scene: Scene) -> Iterator[None]:
     except (OSError, RuntimeError) as error:
         if getattr(error, "errno", None) not in (errno.ENOSPC, errno.EDQUOT) and "disk is full" not in str(error):
             raise
-        place = getattr(error, "filename", None) or scene.path
-        raise Sc3dError(f"no space left to write {place}: make room and run the same command again; finished work is kept") from error
+        name = getattr(error, "filename", None)
+        raise Sc3dError(f"no space left in {Path(name).parent if name else scene.path}: make room and run the same command again; finished work is kept") from error
 
 
 def sidecar(output: Path) -> Path:
