@@ -19,8 +19,8 @@ STAGES: dict[str, type] = {
 }
 # commands with arguments of their own
 COMMANDS: dict[str, type] = {
-    "reconstruct": options.ReconstructCommand, "import": options.ImportCommand, "run": options.Run, "view": options.View, "doctor": options.Doctor,
-    "manual": options.Manual, "benchmark": options.Benchmark,
+    "reconstruct": options.ReconstructCommand, "import": options.ImportCommand, "run": options.Run, "view": options.View, "annotate": options.Annotate,
+    "doctor": options.Doctor, "manual": options.Manual, "benchmark": options.Benchmark,
 }
 MODULES = {"import": "import_project"}  # stage modules that cannot be named like their command
 DESCRIPTIONS = {options.Benchmark: "Measure sc3d on this machine."}  # of commands with subcommands: a union of records has no docstring of its own

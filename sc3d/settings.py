@@ -309,6 +309,17 @@ class View:
 
 
 @dataclass(frozen=True)
+class Annotate:
+    """Draw strokes and polygons per class on photos, on a page in the browser that only this machine can open, and try them out."""
+
+    scene: Annotated[Positional[Path], arg(help="Scene folder with images/ and classes.json.")]
+    port: int = 8000
+    """Port to serve on; the next free one if it is taken."""
+    photo: str | None = None
+    """Name of the photo to show first."""
+
+
+@dataclass(frozen=True)
 class Doctor:
     """Report versions, missing system libraries, Vulkan, CUDA and models found."""
 

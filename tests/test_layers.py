@@ -20,7 +20,7 @@ LAYERS = [
     ["sc3d.georeferencing"],
     ["sc3d.imports", "sc3d.splatting", "sc3d.sfm", "sc3d.segmentation", "sc3d.synthetic", "sc3d.density", "sc3d.verification", "sc3d.voting_kernels", "sc3d.voting", "sc3d.fusion", "sc3d.metrics"],
     ["sc3d.propagation", "sc3d.labelled", "sc3d.labelling"],
-    ["sc3d.view", "sc3d.exports", "sc3d.refinement"],
+    ["sc3d.view", "sc3d.exports", "sc3d.refinement", "sc3d.annotate"],
     ["sc3d.report"],
     ["sc3d.stages", "sc3d.benchmark"],
     ["sc3d.cli"],

@@ -1,0 +1,114 @@
+"""What the annotation page can do to a scene: show photos, read and write strokes, and try them out on a photo. Knows nothing of HTTP."""
+
+from __future__ import annotations
+
+import threading
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sc3d.errors import InputError
+from sc3d.io import digest, find_photos, image_size, read_image, read_json, write_json
+from sc3d.scene import Scene
+from sc3d.segmentation.stroke_files import BACKGROUND, parse_shapes
+from sc3d.segmentation.strokes import Strokes, StrokesSettings, reduced
+
+SHOWN = 4096  # px, longest side of the photo in the browser
+TRIED = 2048  # px, longest side of the mask that is tried out
+# A quick look, with whatever is drawn so far; `sc3d segment` takes its time
+QUICK = StrokesSettings(members=2, trees=40, steps=400, calibration_photos=1, require_all=False)
+_KEPT = ("label", "points", "shape_type", "width")
+
+
+class BusyError(InputError):
+    """Another photo is being tried out."""
+
+
+class Session:
+    """A scene that is being annotated."""
+
+    def __init__(self, scene: Scene, start: str | None = None, settings: StrokesSettings = QUICK) -> None:
+        """start: name or stem of the photo to show first. Raises InputError if the scene lacks it, photos or classes, or holds strokes that cannot be read."""
+        scene.require(scene.classes, scene.images, hint="the page needs classes.json and images/")
+        self._scene = scene
+        self._settings = settings
+        self.class_table = scene.class_table()
+        self.photos = {photo.stem: photo for photo in find_photos(scene.images)}
+        self.sizes = {stem: image_size(photo) for stem, photo in self.photos.items()}
+        self._start = next(iter(self.photos)) if start is None else Path(start).stem
+        if self._start not in self.photos:
+            raise InputError(f"no photo {start!r} in {scene.images}: one of {', '.join(list(self.photos)[:5])} ...")
+        self._trying = threading.Lock()
+        self._learned: tuple[str, Strokes] | None = None
+        self._jpeg = lru_cache(maxsize=4)(self._encode)
+        for stem in self.photos:
+            self.read(stem)
+
+    def describe(self) -> dict[str, object]:
+        """Everything the page shows at its start, as JSON."""
+        classes = [{"name": entry.name, "color": list(entry.color)} for entry in self.class_table]
+        photos = [{"stem": stem, "name": photo.name, "width": self.sizes[stem][0], "height": self.sizes[stem][1], "strokes": len(self.read(stem))}
+                  for stem, photo in self.photos.items()]
+        return {"scene": self._scene.path.resolve().name, "start": self._start, "classes": [*classes, {"name": BACKGROUND, "color": [255, 0, 200]}], "photos": photos}
+
+    def file(self, stem: str) -> Path:
+        """Where the strokes of a photo are kept; KeyError for an unknown photo, so that no name leads out of the folder."""
+        return self._scene.strokes / f"{self.photos[stem].stem}.json"
+
+    def read(self, stem: str) -> list[dict[str, object]]:
+        """The shapes of a photo's LabelMe file, in px of the photo; none if there is no file."""
+        file = self.file(stem)
+        if not file.exists():
+            return []
+        names = {entry.id: entry.name for entry in self.class_table} | {0: BACKGROUND}
+        shapes = parse_shapes(read_json(file), file, self.sizes[stem], self.class_table)
+        return [{"label": names[shape.label], "shape_type": shape.kind, "points": shape.points.tolist()} | ({"width": shape.width} if shape.width else {})
+                for shape in shapes]
+
+    def save(self, stem: str, content: object) -> int:
+        """Check a drawing like the backend does and write it; a file without shapes is removed. Returns the number of shapes.
+
+        content: LabelMe, decoded, in px of the photo; fields that strokes do not need are dropped
+        """
+        parse_shapes(content, "the drawing", self.sizes[stem], self.class_table)
+        shapes = [{key: shape[key] for key in _KEPT if key in shape} | {"group_id": None, "description": "", "flags": {}} for shape in content["shapes"]]
+        width, height = self.sizes[stem]
+        if shapes:
+            head = {"version": "5.5.0", "flags": {}, "imagePath": self.photos[stem].name, "imageData": None, "imageHeight": height, "imageWidth": width}
+            write_json(self.file(stem), head | {"shapes": shapes})
+        else:
+            self.file(stem).unlink(missing_ok=True)
+        return len(shapes)
+
+    def photo(self, stem: str) -> bytes:
+        """The photo as JPEG, as it is stored: LabelMe and browsers would turn it by its EXIF orientation, the cameras do not."""
+        return self._jpeg(stem)
+
+    def try_out(self, stem: str) -> bytes:
+        """Learn from all strokes of the scene, if they have changed, and segment a photo.
+
+        returns: RGBA PNG in the colours of the classes, transparent where there is no label; no larger than needed
+        Raises BusyError while another request does the same.
+        """
+        photo = self.photos[stem]
+        if not self._trying.acquire(blocking=False):
+            raise BusyError("still learning: wait for the last run to end")
+        try:
+            state = digest(self._scene.strokes)
+            if self._learned is None or self._learned[0] != state:
+                self._learned = state, Strokes.learn(self._scene.strokes, self._scene.images, self.class_table, self._settings)
+            labels = self._learned[1].segment(reduced(read_image(photo), TRIED)).labels
+        finally:
+            self._trying.release()
+        return _png(np.dstack([self.class_table.palette[labels][..., ::-1], np.where(labels > 0, 255, 0).astype(np.uint8)]))
+
+    def _encode(self, stem: str) -> bytes:
+        shown = np.ascontiguousarray(reduced(read_image(self.photos[stem]), SHOWN)[..., ::-1])
+        return cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
+
+
+def _png(image: np.ndarray) -> bytes:
+    """PNG of an (H, W, 4) uint8 BGRA image."""
+    return cv2.imencode(".png", image)[1].tobytes()
