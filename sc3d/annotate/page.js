@@ -13,7 +13,8 @@ const canvas = new Canvas($("canvas"), state, refresh);
 // ---- talking to the server
 
 async function ask(path, content) {
-  const options = content === undefined ? {} : { method: "POST", headers: { "Content-Type": "application/json", "X-Token": token }, body: JSON.stringify(content) };
+  const headers = { "Content-Type": "application/json", "X-Token": token };
+  const options = content === undefined ? {} : { method: "POST", headers, body: JSON.stringify(content) };
   const answer = await fetch(path, options).catch(() => { throw new Error("the server does not answer: is `sc3d annotate` still running?"); });
   if (!answer.ok) throw new Error((await answer.json().catch(() => ({}))).error || `the server answers ${answer.status}`);
   return answer.headers.get("Content-Type").startsWith("image/") ? createImageBitmap(await answer.blob()) : answer.json();
@@ -111,15 +112,14 @@ function turn(by) {
 
 function refresh() {
   for (const button of document.querySelectorAll("[data-tool]")) button.setAttribute("aria-pressed", button.dataset.tool === state.tool);
-  for (const [index, button] of [...$("classes").querySelectorAll("button")].entries()) button.setAttribute("aria-pressed", classes[index].name === state.label);
-  for (const [index, button] of [...$("photos").querySelectorAll("button")].entries()) {
-    const photo = photos[index], count = photo.drawing ? photo.drawing.shapes.length : photo.strokes;
+  document.querySelectorAll("#classes button").forEach((button, index) => button.setAttribute("aria-pressed", classes[index].name === state.label));
+  document.querySelectorAll("#photos button").forEach((button, index) => {
+    const photo = photos[index], count = photo.drawing ? photo.drawing.shapes.length : photo.strokes, mark = button.querySelector("small");
     button.setAttribute("aria-pressed", photo === current);
-    const mark = button.querySelector("small");
     mark.textContent = `${count || ""}${photo.drawing?.dirty ? " ●" : ""}`;
     mark.className = photo.drawing?.dirty ? "dirty" : "";
     mark.title = photo.drawing?.dirty ? "not saved yet" : "";
-  }
+  });
   const drawing = current?.drawing;
   $("undo").disabled = !drawing?.past.length;
   $("redo").disabled = !drawing?.future.length;
@@ -151,9 +151,11 @@ function entry(list, name, color, key, action) {
 // ---- keys
 
 const KEYS = {
-  b: () => choose("brush"), p: () => choose("polygon"), e: () => choose("erase"), v: () => choose("move"), f: () => canvas.fit(), r: run, m: () => showMask(!state.maskShown),
+  b: () => choose("brush"), p: () => choose("polygon"), e: () => choose("erase"), v: () => choose("move"),
+  f: () => canvas.fit(), r: run, m: () => showMask(!state.maskShown),
   "[": () => setWidth(Math.min(state.width - 1, state.width / 1.2)), "]": () => setWidth(Math.max(state.width + 1, state.width * 1.2)),
-  ",": () => turn(-1), ".": () => turn(1), "+": () => canvas.zoom(1.25), "=": () => canvas.zoom(1.25), "-": () => canvas.zoom(0.8), escape: () => canvas.cancel(),
+  ",": () => turn(-1), ".": () => turn(1), "+": () => canvas.zoom(1.25), "=": () => canvas.zoom(1.25), "-": () => canvas.zoom(0.8),
+  escape: () => canvas.cancel(),
 };
 
 document.addEventListener("keydown", event => {
@@ -185,7 +187,10 @@ window.addEventListener("beforeunload", event => { if (photos.some(photo => phot
 // ---- start
 
 for (const button of document.querySelectorAll("[data-tool]")) button.addEventListener("click", () => choose(button.dataset.tool));
-const CLICKS = { undo: () => step(false), redo: () => step(true), in: () => canvas.zoom(1.25), out: () => canvas.zoom(0.8), fit: () => canvas.fit(), save, run, toggle: () => showMask(!state.maskShown) };
+const CLICKS = {
+  undo: () => step(false), redo: () => step(true), in: () => canvas.zoom(1.25), out: () => canvas.zoom(0.8), fit: () => canvas.fit(), save, run,
+  toggle: () => showMask(!state.maskShown),
+};
 for (const [id, action] of Object.entries(CLICKS)) $(id).addEventListener("click", action);
 $("width").addEventListener("input", event => setWidth(+event.target.value));
 $("opacity").addEventListener("input", event => {

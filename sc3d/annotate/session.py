@@ -19,7 +19,6 @@ SHOWN = 4096  # px, longest side of the photo in the browser
 TRIED = 2048  # px, longest side of the mask that is tried out
 # A quick look, with whatever is drawn so far; `sc3d segment` takes its time
 QUICK = StrokesSettings(members=2, trees=40, steps=400, calibration_photos=1, require_all=False)
-_KEPT = ("label", "points", "shape_type", "width")
 
 
 class BusyError(InputError):
@@ -30,7 +29,11 @@ class Session:
     """A scene that is being annotated."""
 
     def __init__(self, scene: Scene, start: str | None = None, settings: StrokesSettings = QUICK) -> None:
-        """start: name or stem of the photo to show first. Raises InputError if the scene lacks it, photos or classes, or holds strokes that cannot be read."""
+        """Look at everything first, so that errors come before the page.
+
+        start: name or stem of the photo to show first
+        Raises InputError if the scene lacks photos, classes or that photo, or holds strokes that cannot be read.
+        """
         scene.require(scene.classes, scene.images, hint="the page needs classes.json and images/")
         self._scene = scene
         self._settings = settings
@@ -40,7 +43,7 @@ class Session:
         self._start = next(iter(self.photos)) if start is None else Path(start).stem
         if self._start not in self.photos:
             raise InputError(f"no photo {start!r} in {scene.images}: one of {', '.join(list(self.photos)[:5])} ...")
-        self._trying = threading.Lock()
+        self._trying, self._writing = threading.Lock(), threading.Lock()
         self._learned: tuple[str, Strokes] | None = None
         self._jpeg = lru_cache(maxsize=4)(self._encode)
         for stem in self.photos:
@@ -49,9 +52,12 @@ class Session:
     def describe(self) -> dict[str, object]:
         """Everything the page shows at its start, as JSON."""
         classes = [{"name": entry.name, "color": list(entry.color)} for entry in self.class_table]
-        photos = [{"stem": stem, "name": photo.name, "width": self.sizes[stem][0], "height": self.sizes[stem][1], "strokes": len(self.read(stem))}
-                  for stem, photo in self.photos.items()]
-        return {"scene": self._scene.path.resolve().name, "start": self._start, "classes": [*classes, {"name": BACKGROUND, "color": [255, 0, 200]}], "photos": photos}
+        classes.append({"name": BACKGROUND, "color": [255, 0, 200]})
+        photos = []
+        for stem, photo in self.photos.items():
+            width, height = self.sizes[stem]
+            photos.append({"stem": stem, "name": photo.name, "width": width, "height": height, "strokes": len(self.read(stem))})
+        return {"scene": self._scene.path.resolve().name, "start": self._start, "classes": classes, "photos": photos}
 
     def file(self, stem: str) -> Path:
         """Where the strokes of a photo are kept; KeyError for an unknown photo, so that no name leads out of the folder."""
@@ -60,27 +66,29 @@ class Session:
     def read(self, stem: str) -> list[dict[str, object]]:
         """The shapes of a photo's LabelMe file, in px of the photo; none if there is no file."""
         file = self.file(stem)
-        if not file.exists():
-            return []
-        names = {entry.id: entry.name for entry in self.class_table} | {0: BACKGROUND}
-        shapes = parse_shapes(read_json(file), file, self.sizes[stem], self.class_table)
-        return [{"label": names[shape.label], "shape_type": shape.kind, "points": shape.points.tolist()} | ({"width": shape.width} if shape.width else {})
-                for shape in shapes]
+        return self._plain(read_json(file), file, stem) if file.exists() else []
 
     def save(self, stem: str, content: object) -> int:
         """Check a drawing like the backend does and write it; a file without shapes is removed. Returns the number of shapes.
 
-        content: LabelMe, decoded, in px of the photo; fields that strokes do not need are dropped
+        content: LabelMe, decoded; fields that strokes do not need are dropped
         """
-        parse_shapes(content, "the drawing", self.sizes[stem], self.class_table)
-        shapes = [{key: shape[key] for key in _KEPT if key in shape} | {"group_id": None, "description": "", "flags": {}} for shape in content["shapes"]]
+        shapes = [shape | {"group_id": None, "description": "", "flags": {}} for shape in self._plain(content, "the drawing", stem)]
         width, height = self.sizes[stem]
-        if shapes:
-            head = {"version": "5.5.0", "flags": {}, "imagePath": self.photos[stem].name, "imageData": None, "imageHeight": height, "imageWidth": width}
-            write_json(self.file(stem), head | {"shapes": shapes})
-        else:
-            self.file(stem).unlink(missing_ok=True)
+        head = {"version": "5.5.0", "flags": {}, "imagePath": self.photos[stem].name, "imageData": None, "imageHeight": height, "imageWidth": width}
+        with self._writing:  # two windows may save at once
+            if shapes:
+                write_json(self.file(stem), head | {"shapes": shapes})
+            else:
+                self.file(stem).unlink(missing_ok=True)
         return len(shapes)
+
+    def _plain(self, content: object, origin: Path | str, stem: str) -> list[dict[str, object]]:
+        """The shapes of a LabelMe file, checked, in px of the photo."""
+        names = {entry.id: entry.name for entry in self.class_table} | {0: BACKGROUND}
+        shapes = parse_shapes(content, origin, self.sizes[stem], self.class_table)
+        return [{"label": names[shape.label], "shape_type": shape.kind, "points": shape.points.tolist()} | ({"width": shape.width} if shape.width else {})
+                for shape in shapes]
 
     def photo(self, stem: str) -> bytes:
         """The photo as JPEG, as it is stored: LabelMe and browsers would turn it by its EXIF orientation, the cameras do not."""

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 _DIMENSIONS = 6  # principal components: more only make distances more alike
 _QUANTILE = 0.995  # of the distances of held-out strokes that still pass for known
 _STEP = 4  # px between the places looked at
+_UNIT = 1.0  # of features: a difference that another photo of the same thing may well show, although strokes do not
 _NARROW = 5  # such steps: what is narrower is no object
 _MOST = 15_000  # pixels to compare with
 
@@ -69,12 +70,12 @@ def learn_novelty(features: np.ndarray, folds: np.ndarray) -> Novelty | None:
     places = space.place(features)
     thinned = slice(None, None, -(-len(features) // _MOST))
     distances = [cKDTree(places[folds != part][thinned]).query(places[folds == part])[0] for part in parts]
-    return Novelty(space, cKDTree(places[thinned]), max(float(np.quantile(np.concatenate(distances), _QUANTILE)), 1e-6))
+    return Novelty(space, cKDTree(places[thinned]), max(float(np.quantile(np.concatenate(distances), _QUANTILE)), _UNIT))
 
 
 def _fit(features: np.ndarray) -> _Space:
-    centre, scale = features.mean(axis=0), features.std(axis=0) + 1e-3
+    centre, scale = features.mean(axis=0), features.std(axis=0) + _UNIT
     _, sizes, axes = np.linalg.svd((features - centre) / scale, full_matrices=False)
-    space = _Space(centre, scale, axes[:_DIMENSIONS], np.sqrt(np.maximum(sizes[:_DIMENSIONS] / np.sqrt(len(features)), 1e-3)))
-    rest = space.place(features)[:, -1]
-    return _Space(space.centre, space.scale, space.axes, space.sizes, float(rest.std()) or 1.0)
+    space = _Space(centre, scale, axes[:_DIMENSIONS], np.sqrt(np.maximum(sizes[:_DIMENSIONS] / np.sqrt(len(features)), _UNIT)))
+    rest = max(float(space.place(features)[:, -1].std()), _UNIT)
+    return _Space(space.centre, space.scale, space.axes, space.sizes, rest)
