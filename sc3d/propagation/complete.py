@@ -12,14 +12,14 @@ from sc3d.fusion import LOCKED, PROPAGATED, SEED, UNLOCKED, Labels
 from sc3d.geometry.graph import Graph, build_graph
 from sc3d.propagation.front import grow, vote_nearest
 from sc3d.propagation.potts import mean_field, softmax
-from sc3d.propagation.rater import MIN_SKILL, Raters, relief_features
+from sc3d.propagation.rater import MIN_EXAMPLES, MIN_SKILL, Raters, relief_features
 from sc3d.settings import Propagate
 
 logger = logging.getLogger(__name__)
 
 MAX_EVIDENCE = 5.0  # a point's votes count as at most this many
 SMOOTHING = 0.25  # added to the votes of each class
-TRUST = 0.3  # weight of the votes beside the raters, which see what the views' shared errors hide
+TRUST = 0.5  # weight of the votes beside the raters, which see what the views' shared errors hide
 AGREED_VIEWS, AGREED_SHARE = 3, 0.9  # seeds to learn from: seen by so many views, this share of their votes
 SURE = 0.95  # later rounds learn from points of this probability
 IMPLAUSIBLE = np.log(0.5)  # a seed whose class the raters give less is a conflict
@@ -48,8 +48,15 @@ class Evidence:
 
     @property
     def agreed(self) -> np.ndarray:
-        """(N,) bool seeds that many views agree on."""
-        return (self.seeds.state == SEED) & (self.start > 0) & (self.seeds.num_views >= AGREED_VIEWS) & (self.seeds.confidence >= AGREED_SHARE)
+        """(N,) bool seeds that many views agree on; fewer views, where some class would have too few examples: to the raters it would not exist."""
+        start, views = self.start, self.seeds.num_views
+        sure = (self.seeds.state == SEED) & (start > 0) & (self.seeds.confidence >= AGREED_SHARE)
+        wanted = np.bincount(start[sure], minlength=256) >= MIN_EXAMPLES
+        for least in range(AGREED_VIEWS, 1, -1):
+            examples = sure & (views >= least)
+            if (np.bincount(start[examples], minlength=256)[wanted] >= MIN_EXAMPLES).all():
+                return examples
+        return sure
 
     @property
     def num_classes(self) -> int:

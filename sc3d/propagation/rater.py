@@ -109,6 +109,7 @@ class Raters:
         """(N, C) float32 log-probability of the classes as colour and relief see them; None where there is too little to learn from.
 
         label: (N,) uint8; examples: (N,) bool points to learn from
+        Points of a class without enough examples get zeros: the raters do not contradict what they do not know.
         """
         counts = np.bincount(label[examples], minlength=num_classes + 1)[1:]
         known = counts >= MIN_EXAMPLES
@@ -125,6 +126,7 @@ class Raters:
         result[:, ~known] = -np.inf
         result -= np.logaddexp.reduce(result, axis=1, keepdims=True)
         result[:, ~known] = UNKNOWN
+        result[np.append(False, ~known)[label]] = 0
         return np.maximum(result, np.float32(np.log(1e-4)), out=result)
 
     def skill(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> float:
