@@ -15,14 +15,15 @@ import numpy as np
 from tqdm import tqdm
 
 from sc3d.geometry.cameras import View
-from sc3d.geometry.raycast import Surface, first_surface
-from sc3d.geometry.voxels import VoxelField
+from sc3d.geometry.raycast import RayTarget, first_surface
+from sc3d.geometry.voxels import VoxelField, voxel_origin
 from sc3d.settings import Label
 from sc3d.voting import Ballot, open_ballot
 from sc3d.voting_kernels import SCALE, Picture, Rules
 
 UNSEEN, SEED, LOCKED, PROPAGATED, UNLOCKED = range(5)  # `state` of a point
 DISTANCE_STEPS = 16  # of a pixel
+MIDDLE_STEPS = 1 << 16
 STATE_NAMES = ("unseen", "seed", "locked", "propagated", "unlocked")
 
 AS_PRINTED = {  # the paper's own choices, whatever the defaults are
@@ -33,16 +34,37 @@ Mask = tuple[np.ndarray, np.ndarray | None]  # (h, w) uint8 labels; (h, w) uint8
 
 
 @dataclass(frozen=True)
+class Extent:
+    """Of a whole cloud. low, high: (3,) world, box around the points; middle: (3,) their median along each axis, to 1 / MIDDLE_STEPS of the box."""
+
+    low: np.ndarray
+    high: np.ndarray
+    middle: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray) -> Extent:
+        """points: (N, 3) world."""
+        low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+        return cls(low, high, middle_of(count_steps(points, low, high), low, high))
+
+
+@dataclass(frozen=True)
 class Cloud:
     """What is to be labelled.
 
     points: (N, 3) float64 world; normals: (N, 3) float32 unit, towards the outside, or None
     density: (N,) float32 how much matter there is, for the points' weights inside a voxel, or None = all weigh the same
+    whole: of the cloud that these points are a part of; None = they are all
     """
 
     points: np.ndarray
     normals: np.ndarray | None
     density: np.ndarray | None = None
+    whole: Extent | None = None
+
+    @property
+    def extent(self) -> Extent:
+        return self.whole or Extent.of(self.points)
 
 
 @dataclass(frozen=True)
@@ -69,7 +91,7 @@ class Fusion:
         return self.field.votes[self.cells].astype(np.float32) / SCALE
 
 
-def fuse(cloud: Cloud, views: list[View], read_mask: Callable[[View], Mask], surface: Surface | None, num_ids: int, settings: Label) -> Fusion:
+def fuse(cloud: Cloud, views: list[View], read_mask: Callable[[View], Mask], surface: RayTarget | None, num_ids: int, settings: Label) -> Fusion:
     """Fuse the masks of all views into labels of the cloud.
 
     read_mask: mask of a view, any size of the photo's aspect; masks are streamed
@@ -78,8 +100,9 @@ def fuse(cloud: Cloud, views: list[View], read_mask: Callable[[View], Mask], sur
     """
     if settings.method == "paper":
         settings = replace(settings, **AS_PRINTED)
-    ballot, field = open_ballot(cloud.points, cloud.normals, cloud.density, settings.voxel_size, num_ids)
-    rules = _rules(cloud.points, views, settings)
+    extent = cloud.extent
+    ballot, field = open_ballot(cloud, voxel_origin(extent.low, settings.voxel_size), settings.voxel_size, num_ids)
+    rules = _rules(extent.middle, views, settings)
     pictures = _pictures(views, read_mask, surface if settings.depth_filter else None, settings)
     for view, picture in tqdm(pictures, desc="voting", unit="view", total=len(views), disable=None):
         ballot.cast(view, picture, rules)
@@ -88,14 +111,29 @@ def fuse(cloud: Cloud, views: list[View], read_mask: Callable[[View], Mask], sur
     return Fusion(labels, field, ballot.to_points(ballot.field_cells))
 
 
-def _rules(points: np.ndarray, views: list[View], settings: Label) -> Rules:
-    middle = np.median(points, axis=0)
+def count_steps(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(3, MIDDLE_STEPS) int64 points in each of the steps between low and high (3,) along each axis: counts of parts of a cloud add up to those of the whole."""
+    size = np.maximum(high - low, 1e-300)
+    return np.stack([
+        np.bincount(np.minimum((points[:, axis] - low[axis]) / size[axis] * MIDDLE_STEPS, MIDDLE_STEPS - 1).astype(np.int32), minlength=MIDDLE_STEPS)
+        for axis in range(3)
+    ])
+
+
+def middle_of(counts: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(3,) median position from the counts of `count_steps`."""
+    below = np.cumsum(counts, axis=1)
+    step = (below < (below[:, -1:] + 1) // 2).sum(axis=1)
+    return low + (step + 0.5) / MIDDLE_STEPS * (high - low)
+
+
+def _rules(middle: np.ndarray, views: list[View], settings: Label) -> Rules:
     reference_depth = float(np.median([np.linalg.norm(view.centre - middle) for view in views])) if views else 1.0
     equal = settings.method in ("direct", "majority")
     return Rules(settings.voxel_size, reference_depth, settings.depth_excess, settings.incidence, settings.range, equal, settings.reproject)
 
 
-def _pictures(views: list[View], read_mask: Callable[[View], Mask], surface: Surface | None, settings: Label) -> Iterator[tuple[View, Picture]]:
+def _pictures(views: list[View], read_mask: Callable[[View], Mask], surface: RayTarget | None, settings: Label) -> Iterator[tuple[View, Picture]]:
     """Views in the order of their names, at the size of their masks, with what they say; the next one is prepared meanwhile."""
     ordered = sorted(views, key=lambda view: view.name)
 

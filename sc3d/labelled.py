@@ -16,6 +16,7 @@ from sc3d.geometry.raycast import FirstSurface, RayTarget, Surface, first_surfac
 from sc3d.io import read_cloud, read_mesh
 
 NORMAL_NEIGHBORS = 30
+SPACING_SAMPLE, SPACING_NEIGHBORS = 100_000, 8
 REACH = 4.0  # a pixel shows the label of a cloud point at most this many point spacings away from the surface that it sees
 VOTES = "votes_"  # + class id; PLY has scalar properties only
 
@@ -31,10 +32,15 @@ def point_arrays(cloud: o3d.t.geometry.PointCloud, centres: np.ndarray) -> tuple
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         if np.isfinite(lengths).all() and (lengths > 0).all():
             return points, normals / lengths
-    neighbors, _ = NeighborIndex(points).nearest(points, NORMAL_NEIGHBORS)
+    return points, normals_of(points, centres, points.min(axis=0))
+
+
+def normals_of(points: np.ndarray, centres: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 unit normals of points (N, 3), estimated and turned towards the nearest of the camera centres (M, 3); origin: as in `NeighborIndex`."""
+    neighbors, _ = NeighborIndex(points, origin).nearest(points, NORMAL_NEIGHBORS)
     if neighbors.shape[1] < 3:
         raise InputError(f"the cloud has {len(points)} points: normals need at least 3")
-    return points, orient_normals(points, estimate_normals(points, neighbors), centres)
+    return orient_normals(points, estimate_normals(points, neighbors), centres)
 
 
 def read_surface(mesh: Path, points: np.ndarray, normals: np.ndarray | None, origin: np.ndarray) -> RayTarget:
@@ -102,8 +108,8 @@ def read_votes(cloud: o3d.t.geometry.PointCloud) -> np.ndarray | None:
 
 def spacing_of(points: np.ndarray) -> float:
     """Sampling distance of the (N, 3) points, world units, from at most 100 000 of them; 1 if they coincide."""
-    sample = points[:: max(1, len(points) // 100_000)]
-    return point_spacing(NeighborIndex(points).nearest(sample, 9)[1]) or 1.0
+    sample = points[:: max(1, len(points) // SPACING_SAMPLE)]
+    return point_spacing(NeighborIndex(points, points.min(axis=0)).nearest(sample, SPACING_NEIGHBORS + 1)[1]) or 1.0
 
 
 @dataclass(frozen=True)

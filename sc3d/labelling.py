@@ -17,6 +17,9 @@ from sc3d.labelled import spacing_of
 from sc3d.scene import Scene
 
 
+FOOTPRINT_SAMPLE = 1000
+
+
 @dataclass(frozen=True)
 class Masks:
     """The masks of a scene: files by view name, confidence maps where there are any, and the views that have a mask."""
@@ -59,13 +62,17 @@ def read_given_cloud(scene: Scene, file: Path | None) -> o3d.t.geometry.PointClo
 
 
 def default_voxel_size(points: np.ndarray, masks: Masks) -> float:
-    """2 point spacings, at least 1.5 times the median size of a mask pixel on the cloud."""
-    sample = points[:: max(1, len(points) // 1000)]
+    """`voxel_size_for` a whole cloud (N, 3)."""
+    return voxel_size_for(spacing_of(points), points[:: max(1, len(points) // FOOTPRINT_SAMPLE)], masks)
+
+
+def voxel_size_for(spacing: float, sample: np.ndarray, masks: Masks) -> float:
+    """2 point spacings, at least 1.5 times the median size of a mask pixel on the cloud, of which `sample` (S, 3) are some points."""
     footprints = []
     for view in masks.views:
         focal = view.focal * image_size(masks.files[view.name])[0] / view.width
         footprints.append(np.median(np.linalg.norm(sample - view.centre, axis=1)) / focal)
-    return max(2 * spacing_of(points), 1.5 * float(np.median(footprints)))
+    return max(2 * spacing, 1.5 * float(np.median(footprints)))
 
 
 def point_density(scene: Scene, points: np.ndarray, voxel_size: float) -> np.ndarray:

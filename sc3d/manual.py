@@ -41,9 +41,12 @@ class Command:
 @cache
 def helps(record: type) -> dict[str, str]:
     """The docstring below each field of a settings record."""
-    body = ast.parse(textwrap.dedent(inspect.getsource(record))).body[0].body
-    return {before.target.id: after.value.value for before, after in zip(body, body[1:], strict=False)
-            if isinstance(before, ast.AnnAssign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)}
+    found = {}
+    for part in (kind for kind in reversed(record.__mro__) if is_dataclass(kind)):
+        body = ast.parse(textwrap.dedent(inspect.getsource(part))).body[0].body
+        found |= {before.target.id: after.value.value for before, after in zip(body, body[1:], strict=False)
+                  if isinstance(before, ast.AnnAssign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)}
+    return found
 
 
 def options(record: type) -> list[Option]:

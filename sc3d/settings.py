@@ -121,7 +121,20 @@ class Segment:
 
 
 @dataclass(frozen=True)
-class Label:
+class Resources:
+    """What a stage may use; results do not depend on it."""
+
+    max_memory: str = ""
+    """Memory to stay below, such as 6G; what does not fit is worked on tile by tile, from disk. Half of this machine's memory otherwise. Each worker of
+    a --cluster may use as much."""
+    workers: int = 0
+    """Dask workers to start on this machine; without them all work is done in this process."""
+    cluster: str = ""
+    """Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers see the same files."""
+
+
+@dataclass(frozen=True)
+class Label(Resources):
     """Fuse masks into the voxel label field and the cloud."""
 
     method: Literal["direct", "majority", "conflict-lock", "paper"] = "conflict-lock"
@@ -157,7 +170,7 @@ class Label:
 
 
 @dataclass(frozen=True)
-class Propagate:
+class Propagate(Resources):
     """Complete the labels along the geometry."""
 
     method: Literal["knn", "geometry", "map"] = "map"
@@ -183,7 +196,7 @@ class Propagate:
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Evaluate(Resources):
     """OA, mIoU and IoU per class against truth masks, through the first surface."""
 
     truth: Path | None = None

@@ -6,7 +6,7 @@ Points are sorted by cell once. A thread owns whole blocks of cells, so votes ne
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numba
 import numpy as np
@@ -66,11 +66,18 @@ class Ballot:
         return result
 
 
-def open_ballot(
-    points: np.ndarray, normals: np.ndarray | None, density: np.ndarray | None, voxel_size: float, num_ids: int
-) -> tuple[Ballot, VoxelField]:
-    """Sort the points (N, 3) with normals (N, 3) and density (N,), or None, into cells; no votes yet."""
-    sorting = sort_by_voxel(points, voxel_size)
+class Points(Protocol):
+    """points: (N, 3) world; normals: (N, 3) float32 or None; density: (N,) float32 or None."""
+
+    points: np.ndarray
+    normals: np.ndarray | None
+    density: np.ndarray | None
+
+
+def open_ballot(given: Points, origin: np.ndarray, voxel_size: float, num_ids: int) -> tuple[Ballot, VoxelField]:
+    """Sort the points into cells of a grid with its zero at `origin` (3,) world; no votes yet."""
+    points, normals, density = given.points, given.normals, given.density
+    sorting = sort_by_voxel(points, voxel_size, origin)
     field = VoxelField.over(sorting, num_ids)
     order, cells, field_cells, facing = _cells(sorting, normals, field)
     blocks = np.flatnonzero(np.diff(field_cells // (VOXELS * SIDES), prepend=-1))

@@ -12,7 +12,7 @@ from sc3d.density import FULL, GaussianField, gaussian_density, kernel_density, 
 from sc3d.fusion import LOCKED, Cloud, edge_distance, fuse, picture_of
 from sc3d.geometry.cameras import View, look_at, project
 from sc3d.geometry.raycast import Surface, first_surface, see_points
-from sc3d.geometry.voxels import sort_by_voxel
+from sc3d.geometry.voxels import sort_by_voxel, voxel_origin
 from sc3d.settings import Label
 from sc3d.voting import lens_of, open_ballot
 from sc3d.voting_kernels import GRAZING, MIN_WEIGHT, SCALE, Rules, to_camera, to_pixel
@@ -56,7 +56,7 @@ def noise_masks(views: list[View], seed: int = 1) -> dict:
 
 def slow_votes(cloud: Cloud, views: list[View], masks: dict, surface: Surface, settings: Label) -> np.ndarray:
     """(N, 5) votes of each point's cell, from `see_points` and numpy."""
-    ballot, _ = open_ballot(cloud.points, cloud.normals, None, settings.voxel_size, 5)
+    ballot, _ = open_ballot(cloud, voxel_origin(cloud.points.min(axis=0), settings.voxel_size), settings.voxel_size, 5)
     cells = ballot.to_points(np.arange(len(ballot.votes)))
     facing = ballot.to_points(ballot.cloud.facing)
     votes = np.zeros((len(ballot.votes), 5), np.int64)
@@ -155,7 +155,7 @@ def test_every_weight_is_a_switch(switch):
 
 def test_grazing_sightings_take_no_part_in_the_second_vote():
     (cloud, surface), views = world(), views_of("PINHOLE", 1)
-    ballot, _ = open_ballot(cloud.points, cloud.normals, None, 0.25, 5)
+    ballot, _ = open_ballot(cloud, voxel_origin(cloud.points.min(axis=0), 0.25), 0.25, 5)
     mask = np.ones((120, 160), np.uint8)
     first = first_surface(surface, views[0])
     ballot.cast(views[0], picture_of(mask, None, edge_distance(mask), first.range, Label()), Rules(0.25, 9.0, True, True, True, False, True))

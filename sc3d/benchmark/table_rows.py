@@ -8,12 +8,13 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Literal, get_args, get_origin, get_type_hints
 
 from sc3d.manual import helps
-from sc3d.settings import Label, Propagate
+from sc3d.settings import Label, Propagate, Resources
 
 OURS, DEFAULT = "conflict-lock + geometry", "sc3d as it is by default"
 NO_FILTER = Label(depth_filter=False)
 GEOMETRY = Propagate(method="geometry")
 BASELINES = ("direct", "majority")
+RESOURCES = {field.name for field in fields(Resources)}
 ON_VALUES: dict[tuple[str, str], float] = {}
 """What "on" means for numeric options that are off (0) by default, by stage and option; others are tried at 1."""
 
@@ -93,4 +94,4 @@ def turned(record: Label | Propagate) -> list[tuple[str, Label | Propagate]]:
 
 
 def _is_mechanism(record: type, name: str) -> bool:
-    return name != "voxel_size" and "Path" not in str(get_type_hints(record)[name])
+    return name != "voxel_size" and name not in RESOURCES and "Path" not in str(get_type_hints(record)[name])

@@ -12,14 +12,18 @@ CHUNK = 500_000  # queries per batch: bounds memory, not results
 
 
 class NeighborIndex:
-    """A KD-tree over (N, 3) points, world; N >= 1. Points are shifted to their first point, so UTM positions keep their precision."""
+    """A KD-tree over (N, 3) points, world; N >= 1.
 
-    def __init__(self, points: np.ndarray) -> None:
+    origin: (3,) what the points are shifted by, so that UTM positions keep their precision; None = their first point. The parts of a cloud find the
+    same distances, to the last bit, if their origin is the same.
+    """
+
+    def __init__(self, points: np.ndarray, origin: np.ndarray | None = None) -> None:
         points = np.asarray(points, np.float64)
         if len(points) == 0:
             raise ValueError("an empty cloud has no neighbours")
         self.num_points = len(points)
-        self._origin = points[0].copy()
+        self._origin = np.array(points[0] if origin is None else origin, np.float64)
         self._search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(np.ascontiguousarray(points - self._origin, np.float32)))
         self._search.knn_index()
 

@@ -101,7 +101,7 @@ class VoxelOrder:
 def sort_by_voxel(points: np.ndarray, voxel_size: float, origin: np.ndarray | None = None) -> VoxelOrder:
     """Sort (N, 3) world points by voxel. origin: (3,), None = a little below the points, so that moved or scaled worlds fall into the same voxels."""
     if origin is None:
-        origin = points.min(axis=0) - ORIGIN_SHIFT * voxel_size
+        origin = voxel_origin(points.min(axis=0), voxel_size)
     keys = voxel_keys(points, origin, voxel_size)
     if len(keys) and keys.min() < 0:
         raise ValueError(f"voxels of {voxel_size} are too small for the extent of the points: more than {BLOCK << AXIS_BITS} along an axis")
@@ -109,6 +109,11 @@ def sort_by_voxel(points: np.ndarray, voxel_size: float, origin: np.ndarray | No
     keys = keys[order]
     first = np.flatnonzero(np.diff(keys, prepend=-1))
     return VoxelOrder(np.asarray(origin, np.float64), voxel_size, order, np.append(first, len(keys)), keys[first])
+
+
+def voxel_origin(low: np.ndarray, voxel_size: float) -> np.ndarray:
+    """(3,) world position of the zero of a grid over points whose smallest coordinates are `low` (3,)."""
+    return np.asarray(low, np.float64) - ORIGIN_SHIFT * voxel_size
 
 
 def voxel_keys(points: np.ndarray, origin: np.ndarray, voxel_size: float) -> np.ndarray:

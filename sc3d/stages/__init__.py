@@ -19,7 +19,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from importlib import metadata
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from sc3d.errors import InputError, Sc3dError
 from sc3d.files import remove_leftovers, require_inside, temporary_name
 from sc3d.io import digest, read_json, write_json
 from sc3d.scene import Scene
+from sc3d.settings import Resources
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +42,7 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
     Up to date: every output and its sidecar exist, made by the same settings from inputs of the same content.
     """
     stage = importlib.import_module(f"sc3d.stages.{name}")
-    record = {"stage": name, "settings": _plain(asdict(settings)), "inputs": {str(path): digest(path) for path in stage.inputs(scene, settings)}}
+    record = {"stage": name, "settings": _decisive(settings), "inputs": {str(path): digest(path) for path in stage.inputs(scene, settings)}}
     outputs = stage.outputs(scene, settings)
     previous = _finished(record, outputs)
     if previous is not None and not overwrite:
@@ -105,6 +106,12 @@ def _room(scene: Scene) -> Iterator[None]:
             raise
         name = getattr(error, "filename", None)
         raise Sc3dError(f"no space left in {Path(name).parent if name else scene.path}: make room and run the same command again; finished work is kept") from error
+
+
+def _decisive(settings: object) -> dict[str, object]:
+    """The settings without those that no result depends on."""
+    ignored = {field.name for field in fields(Resources)} if isinstance(settings, Resources) else set()
+    return {name: value for name, value in _plain(asdict(settings)).items() if name not in ignored}
 
 
 def sidecar(output: Path) -> Path:

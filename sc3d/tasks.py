@@ -1,0 +1,85 @@
+"""Where the work on tiles and views runs: in this process, or on Dask workers.
+
+A task is a function at the top of a module and an item; both go to the workers, and what they need beside lies in files that all of them see.
+Its result is small; what is large it writes to a file of its own. A task that is run twice writes the same, so a lost worker costs time only.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Protocol
+
+from tqdm import tqdm
+
+from sc3d.errors import InputError, Sc3dError
+from sc3d.settings import Resources
+
+RETRIES = 3  # of a task whose worker is lost; more, and the task itself is what kills it
+
+
+class Tasks(Protocol):
+    """Runs a function on items; the results come in the order of the items."""
+
+    def run(self, name: str, function: Callable, items: Sequence) -> list: ...
+
+
+class Here:
+    """One after another in this process."""
+
+    def run(self, name: str, function: Callable, items: Sequence) -> list:
+        return [function(item) for item in tqdm(items, desc=name, disable=None)]
+
+
+class OnDask:
+    """On the workers of a Dask cluster."""
+
+    def __init__(self, client: object) -> None:
+        self._client = client
+
+    def run(self, name: str, function: Callable, items: Sequence) -> list:
+        from distributed import as_completed
+        from distributed.scheduler import KilledWorker
+
+        futures = self._client.map(function, list(items), pure=False, retries=RETRIES)
+        try:
+            for future in tqdm(as_completed(futures), desc=name, total=len(futures), disable=None):
+                future.result()
+            return [future.result() for future in futures]
+        except KilledWorker as error:
+            raise Sc3dError(f"{name}: {error}; give the workers more memory, or lower --max-memory") from None
+        finally:
+            self._client.cancel(futures)
+
+
+@contextmanager
+def open_tasks(resources: Resources) -> Iterator[Tasks]:
+    """Here, or the workers that the options ask for. InputError if Dask is missing or the scheduler does not answer."""
+    if not resources.cluster and resources.workers < 1:
+        yield Here()
+        return
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise InputError("--workers and --cluster need Dask: pip install 'sc3d[cluster]'") from None
+    if resources.cluster:
+        try:
+            client = Client(resources.cluster, timeout="20s", set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise InputError(f"no Dask scheduler answers at {resources.cluster}: {error}") from None
+        with client:
+            yield OnDask(client)
+        return
+    threads = max(1, (os.cpu_count() or 1) // resources.workers)
+    environment = {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
+    cluster = partial(LocalCluster, n_workers=resources.workers, threads_per_worker=1, memory_limit=None, host="127.0.0.1", dashboard_address=None)
+    before = {name: os.environ.get(name) for name in environment}
+    os.environ.update(environment)
+    try:
+        with cluster() as local, Client(local, set_as_default=False) as client:
+            yield OnDask(client)
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
