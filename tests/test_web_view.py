@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -85,7 +86,8 @@ def browser() -> Iterator[object]:
     if program is None:
         pytest.skip("the page is tested in Chromium: apt install chromium")
     with api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=program, args=OPTIONS)
+        headless = {name: value for name, value in os.environ.items() if name != "DISPLAY"}  # with a display that does not answer there is no WebGL
+        started = playwright.chromium.launch(executable_path=program, args=OPTIONS, env=headless)
         yield started
         started.close()
 
