@@ -18,6 +18,8 @@ from sc3d.geometry.cameras import View, in_image, look_at, pinhole_view, project
 from sc3d.labelled import LabelledSurface
 from sc3d.view import COLOURINGS, STATES, Style, aerial_view, color_points, draw_points, screenshot, show
 from sc3d.view.aerial import frusta
+from sc3d.view.colors import CONTESTED, color_scale, disagreement, disagreement_colors, shaded
+from sc3d.view.picking import Inspector
 from sc3d.view.renderers import vulkan_works
 
 UTM = np.array([500_000.0, 4_500_000.0, 100.0])
@@ -39,12 +41,14 @@ def make_cloud(points: np.ndarray, **attributes: np.ndarray) -> o3d.t.geometry.P
 
 def full_cloud(num_points: int = 5) -> o3d.t.geometry.PointCloud:
     rng = np.random.default_rng(0)
+    votes = {f"votes_{label}": rng.uniform(0, 3, (num_points, 1)).astype(np.float32) for label in range(5)}
     return make_cloud(
         rng.uniform(-5, 5, (num_points, 3)) + UTM,
         colors=rng.integers(0, 256, (num_points, 3)).astype(np.uint8),
         label=np.resize(np.uint8([0, 1, 4]), num_points)[:, None],
         confidence=np.linspace(0, 1, num_points, dtype=np.float32)[:, None],
         state=np.resize(np.arange(5, dtype=np.uint8), num_points)[:, None],
+        **votes,
     )
 
 
@@ -186,6 +190,41 @@ def test_colours():
         assert colors.dtype == np.uint8 and colors.shape == (5, 3)
 
 
+def test_disagreement_is_what_the_winner_did_not_get():
+    votes = np.float32([[3, 2, 0, 1, 0, 1], [1, 0, 0, 5, 0, 0], [0, 0, 0, 0, 0, 0], [9, 0, 0, 0, 0, 0]])  # column 0 counts views and has no vote
+    assert np.allclose(disagreement(votes), [0.5, 0, np.nan, np.nan], equal_nan=True)
+    assert np.isnan(disagreement(np.zeros((3, 1), np.float32))).all()
+    rng = np.random.default_rng(5)
+    many = rng.uniform(0, 4, (200, 6)).astype(np.float32)
+    losers = [(np.sort(row[1:])[:-1]).sum() / row[1:].sum() for row in many]
+    assert np.allclose(disagreement(many), losers, atol=1e-6)
+
+
+def test_disagreement_colours_rise_and_stop_where_no_class_has_a_majority():
+    colors = disagreement_colors(np.float32([0, 0.2, CONTESTED, 0.9, np.nan])).astype(int)
+    assert np.abs(colors[2] - colors[3]).sum() == 0 and (colors[4] == STATES[0].color).all()
+    assert colors[0, 1] > colors[1, 1] > colors[2, 1]  # green falls: light grey, orange, dark red
+    assert len({tuple(color) for color in colors.tolist()}) == 4
+    cloud = full_cloud(50)
+    votes = np.concatenate([cloud.point[f"votes_{label}"].numpy() for label in range(5)], axis=1)
+    assert np.array_equal(color_points(cloud, "disagreement"), disagreement_colors(disagreement(votes)))
+
+
+@pytest.mark.parametrize("by", ["confidence", "disagreement"])
+def test_scale_is_drawn_below_the_picture(by):
+    picture, scale = screenshot(full_cloud(100), None, (500, 300), Style(by), CLASSES), color_scale(by)
+    strip = picture[300:].reshape(-1, 3)
+    assert len(strip) and all((strip == color).all(axis=1).any() for color in scale.colors[[0, -1]])
+
+
+def test_relief_leaves_level_ground_and_darkens_what_faces_away():
+    normals = np.float32([[0, 0, 1], [-1, 1, 0], [1, -1, 0], [0, 0, 0], [0, 0, 3]])
+    colors = np.tile(np.uint8([[100, 150, 60]]), (5, 1))
+    result = shaded(colors, normals).astype(int)
+    assert (result[[0, 3, 4]] == colors[0]).all()
+    assert (result[1] >= colors[0]).all() and (result[2] < 0.6 * colors[0]).all()
+
+
 @pytest.mark.parametrize("by", COLOURINGS)
 def test_missing_attribute_names_the_stage(by):
     with pytest.raises(InputError, match="sc3d (extract|label)"):
@@ -204,13 +243,26 @@ def test_empty_geometry_is_an_input_error():
         screenshot(make_cloud(np.full((2, 3), np.nan), colors=np.zeros((2, 3), np.uint8)), style=Style("photo"))
 
 
-def test_without_display_the_window_names_the_screenshot(monkeypatch):
+def test_without_display_the_window_names_the_screenshot(monkeypatch, tmp_path):
+    inspector = Inspector(full_cloud(), [], CLASSES, tmp_path / "no_mesh.ply")
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(Sc3dError, match="--screenshot FILE"):
-        show(full_cloud(), [], CLASSES)
+        show(inspector)
     monkeypatch.setenv("DISPLAY", ":4242")
     with pytest.raises(Sc3dError, match="--screenshot FILE"):
-        show(full_cloud(), [], CLASSES)
+        show(inspector)
+
+
+def test_where_nothing_can_render_the_error_names_the_two_packages():
+    script = ("import sys; sys.path.insert(0, {!r}); import test_view; from sc3d.errors import Sc3dError; from sc3d.view import screenshot\n"
+              "try: screenshot(test_view.full_cloud(), None, (64, 64), class_table=test_view.CLASSES)\n"
+              "except Sc3dError as error: sys.exit(str(error))").format(str(Path(__file__).parent))
+    hidden = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent.json"}
+    environment = {name: value for name, value in os.environ.items() if name != "DISPLAY"} | hidden
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=300, check=False)
+    if done.returncode == 0:
+        pytest.skip("another OpenGL driver than that of libglvnd renders here")
+    assert done.returncode == 1 and "apt install libvulkan1 mesa-vulkan-drivers" in done.stderr and "Traceback" not in done.stderr, done.stderr[-2000:]
 
 
 def test_without_any_vulkan_driver_the_other_renderer_is_used():

@@ -86,10 +86,12 @@ def _picture_of_cloud(command: View, scene: Scene, views: list[Camera], photo: C
 
 
 def _open_window(command: View, scene: Scene, views: list[Camera]) -> None:
-    from sc3d.view.shown import class_ids
-    from sc3d.view.window import check_display, show
+    from sc3d.view.display import check_display
 
     check_display()
+    from sc3d.view.shown import class_ids
+    from sc3d.view.window import show
+
     inspector = _inspector(scene, _read_cloud(command, scene, votes=True), views)
     show(inspector, views if command.cameras else [], command.by, class_ids(inspector.class_table, command.classes))
 

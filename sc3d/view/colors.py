@@ -39,7 +39,7 @@ _LIGHT, _AMBIENT = (-0.5, 0.5, 0.7071), 0.45
 _ATTRIBUTES = {"photo": "colors", "label": "label", "confidence": "confidence", "state": "state", "disagreement": "votes_1"}
 _MAKERS = {
     "photo": "the cloud has no photo colours: `sc3d extract SCENE` makes them",
-    "label": "the cloud has no labels: run `sc3d label SCENE` and `sc3d propagate SCENE`",
+    "label": "the cloud has no labels: run `sc3d label SCENE` and `sc3d propagate SCENE`, or look at it with --by photo",
     "confidence": "the cloud has no confidence: run `sc3d label SCENE` and `sc3d propagate SCENE`",
     "state": "the cloud has no label states: run `sc3d label SCENE` and `sc3d propagate SCENE`",
     "disagreement": "the cloud has no votes: run `sc3d label SCENE`, which leaves them in seeds.ply, and pass no other --file",

@@ -154,3 +154,25 @@ def point_on_ray(points: np.ndarray, origin: np.ndarray, direction: np.ndarray, 
         return None
     first = passed[along[passed] <= along[passed].min() + 2 * size]
     return int(first[np.argmin(across[first])])
+
+
+def position_at(depth: np.ndarray, pixel: tuple[int, int], view_matrix: np.ndarray, projection: np.ndarray) -> np.ndarray | None:
+    """(3,) position of what a pixel of a rendered view shows, in the frame of the view's scene; None for the background.
+
+    depth: (H, W), either z (inf = background) or, as Open3D before 0.20 has it, the depth buffer (0 = near plane, 1 = far plane and background)
+    pixel: column, row; view_matrix, projection: (4, 4) of OpenGL, camera looking along -z
+    """
+    column, row = pixel
+    value = float(depth[row, column])
+    right, up = 2 * (column + 0.5) / depth.shape[1] - 1, 1 - 2 * (row + 0.5) / depth.shape[0]
+    projection = np.asarray(projection, np.float64)
+    if np.isinf(depth).any() or depth.max() > 1:
+        if not np.isfinite(value):
+            return None
+        clip_z, clip_w = projection[2:, 2] * -value + projection[2:, 3]
+    elif value >= 1:
+        return None
+    else:
+        clip_z, clip_w = 2 * value - 1, 1.0
+    found = np.linalg.inv(projection @ np.asarray(view_matrix, np.float64)) @ [right * clip_w, up * clip_w, clip_z, clip_w]
+    return found[:3] / found[3]

@@ -67,7 +67,7 @@ def vulkan_works() -> bool:
     except (OSError, subprocess.TimeoutExpired):
         return False
     if probe.returncode:
-        logger.info("Open3D's Vulkan renderer does not work here, OpenGL is used")
+        logger.info("Open3D's Vulkan renderer does not work here (`apt install libvulkan1 mesa-vulkan-drivers`), OpenGL is used")
     return probe.returncode == 0
 
 

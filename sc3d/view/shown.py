@@ -64,8 +64,10 @@ class ShownCloud:
         if relief and (by == "photo" or not self.has_relief):
             return self.colors(by)
         if (by, relief) not in self._colors:
-            colors = shaded(self.colors(by), self.cloud.point.normals.cpu().numpy()[self.rows]) if relief else color_points(self.cloud, by, self.class_table)[self.rows]
-            self._colors[by, relief] = colors
+            if relief:
+                self._colors[by, True] = shaded(self.colors(by), self.cloud.point.normals.cpu().numpy()[self.rows])
+            else:
+                self._colors[by, False] = color_points(self.cloud, by, self.class_table)[self.rows]
         return self._colors[by, relief]
 
     @property

@@ -17,7 +17,7 @@ import numpy as np
 
 from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import View
-from sc3d.io import atomic_path
+from sc3d.files import atomic_path
 from sc3d.scene import Scene
 from sc3d.view.aerial import aerial_view, frustum_depth, without_outliers
 from sc3d.view.colors import Colouring
@@ -96,15 +96,18 @@ def serving(view: WebView, host: str = LOCAL, port: int = 0) -> Iterator[str]:
 
 
 def serve(view: WebView, host: str, port: int) -> None:
-    """Serve the page until Ctrl + C, or SIGTERM."""
+    """Serve the page until Ctrl + C or SIGTERM."""
     ended = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: ended.set())
-    with serving(view, host, port) as address:
-        if host not in (LOCAL, "localhost", "::1"):
-            logger.warning("everybody who can reach this machine can see the scene: there is no password")
-        logger.info("open %s in a browser; Ctrl + C ends", address)
-        with contextlib.suppress(KeyboardInterrupt):
+    before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with serving(view, host, port) as address:
+            if host not in (LOCAL, "localhost", "::1"):
+                logger.warning("everybody who can reach this machine can see the scene: there is no password")
+            logger.info("open %s in a browser; Ctrl + C ends", address)
             ended.wait()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def write_page(path: Path, view: WebView) -> None:

@@ -96,7 +96,8 @@ class CloudLayer:
             rows = start + np.flatnonzero(labels == label)
             if len(rows):
                 handle = self._scene.add_point_cloud(
-                    f"{node.name}/{number:02d}", self._shown.points[rows], colors[rows], point_size=self._point_size(), precision="float32", point_shading="flat",
+                    f"{node.name}/{number:02d}", self._shown.points[rows], colors[rows],
+                    point_size=self._point_size(), precision="float32", point_shading="flat",
                 )
                 handles.append((rows, handle))
         return handles
@@ -187,6 +188,11 @@ class CameraLayer:
         for name, handle in self._handles.items():
             if name in images or handle.image is not None:
                 handle.image = images.get(name)
+
+    def hide(self, hidden: str | None) -> None:
+        """Hide this camera, which would stand before the eyes of who looks through it, and show all others."""
+        for name, handle in self._handles.items():
+            handle.visible = name != hidden
 
     def mark(self, names: Sequence[str]) -> None:
         """Another colour for these cameras, and for no others."""

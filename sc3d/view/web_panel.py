@@ -14,7 +14,7 @@ from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View
 from sc3d.scene import Scene
 from sc3d.view.colors import Colouring, color_scale, legend_entries
-from sc3d.view.photos import photo_pictures, thumbnail
+from sc3d.view.photos import PhotoPictures, jpeg_uri, photo_pictures, thumbnail
 from sc3d.view.picking import Inspector, PickedPoint, point_on_ray
 from sc3d.view.pose import OrbitPose
 from sc3d.view.shown import ShownCloud
@@ -57,7 +57,8 @@ class ShowPanel:
                 self._choose_layers(layers.value)
             self._by = gui.add_dropdown("Colour by", page.shown.colourings, initial_value=by)
             self._legend = gui.add_html(legend_html(by, page.shown))
-            self._relief = gui.add_checkbox("relief", page.shown.has_relief, visible=page.shown.has_relief, hint="light from the north-west; not on photo colours")
+            has_relief = page.shown.has_relief
+            self._relief = gui.add_checkbox("relief", has_relief, visible=has_relief, hint="light from the north-west; not on photo colours")
             for handle in (self._by, self._relief):
                 handle.on_update(lambda _: self._color())
             self._add_classes(gui)
@@ -111,15 +112,14 @@ class PhotoPanel:
     def __init__(self, page: Page, home: OrbitPose) -> None:
         """home: where "Overview" returns to"""
         self._page, self._home, self._views = page, home, {view.name: view for view in page.views}
-        gui, empty = page.server.gui, np.full((2, 2, 3), 255, np.uint8)
+        gui = page.server.gui
         with gui.add_folder("Photo"):
-            gui.add_html("<small style='padding:0 .75em'>click a camera, or choose by name</small>")
+            gui.add_html(_note("click a camera, or choose by name"))
             self._names = gui.add_dropdown("Photo", (_NO_PHOTO, *self._views), initial_value=_NO_PHOTO)
-            self._names.on_update(lambda event: self._show(self._names.value))
-            self._note = gui.add_html("")
-            self._photo, self._mask = (gui.add_image(empty, label=label, format="jpeg", visible=False) for label in ("photo", "mask"))
+            self._names.on_update(lambda _: self._show(self._names.value))
             buttons = gui.add_button_group("View", ("Through it", "Overview"))
             buttons.on_click(lambda event: self._look(event.client, buttons.value))
+            self._pictures = gui.add_html("")
         page.cameras.on_click(lambda name, _: self.choose(name))
 
     def choose(self, name: str) -> None:
@@ -127,24 +127,22 @@ class PhotoPanel:
         self._names.value = name  # calls `_show`
 
     def _show(self, name: str) -> None:
-        if name == _NO_PHOTO:
-            self._photo.visible = self._mask.visible = False
-            self._page.cameras.set_images({})
-            self._note.content = ""
-            return
-        found = photo_pictures(self._page.scene, self._views[name], self._page.shown.class_table, _PHOTO_SIZE)
-        for handle, picture in ((self._photo, found.photo), (self._mask, found.mask)):
-            if picture is not None:
-                handle.image = picture
-            handle.visible = picture is not None
-        self._note.content = f"<small style='padding:0 .75em'>{escape(found.note)}</small>" if found.note else ""
-        self._page.cameras.set_images({} if found.photo is None else {name: thumbnail(found.photo, self._views[name], _THUMBNAIL_SIZE)})
+        self._page.cameras.hide(None)
+        found = None
+        if name != _NO_PHOTO:
+            found = photo_pictures(self._page.scene, self._views[name], self._page.shown.class_table, _PHOTO_SIZE)
+        self._pictures.content = "" if found is None else pictures_html(found)
+        thumbnails = {} if found is None or found.photo is None else {name: thumbnail(found.photo, self._views[name], _THUMBNAIL_SIZE)}
+        self._page.cameras.set_images(thumbnails)
 
     def _look(self, client: viser.ClientHandle | None, where: str) -> None:
+        name = self._names.value
         if client is not None and where == "Overview":
+            self._page.cameras.hide(None)
             self._home.move(client)
-        elif client is not None and self._names.value != _NO_PHOTO:
-            OrbitPose.of(self._views[self._names.value], self._page.shown.middle, upright=False).move(client)
+        elif client is not None and name != _NO_PHOTO:
+            self._page.cameras.hide(name)
+            OrbitPose.of(self._views[name], self._page.shown.middle, upright=False).move(client)
 
 
 class PointPanel:
@@ -153,7 +151,7 @@ class PointPanel:
     def __init__(self, page: Page, panel: ShowPanel) -> None:
         self._page, self._panel, self._busy = page, panel, threading.Lock()
         with page.server.gui.add_folder("Point"):
-            self._text = page.server.gui.add_html(f"<small style='padding:0 .75em'>{_PICK_HINT}</small>")
+            self._text = page.server.gui.add_html(_note(_PICK_HINT))
         page.server.scene.on_click(modifier="cmd/ctrl")(lambda event: self._pick(np.array(event.ray_origin), np.array(event.ray_direction)))
 
     def _pick(self, origin: np.ndarray, direction: np.ndarray) -> None:
@@ -166,7 +164,9 @@ class PointPanel:
             picked = self._page.inspector.look_up(int(shown.rows[rows[found]]))
         self._page.cameras.mark(picked.photos)
         radius = max(2 * shown.spacing_at(layer.count), 0.004 * shown.extent)
-        self._page.server.scene.add_icosphere("/picked", radius=radius, color=_PICKED_COLOR, position=picked.position - shown.origin, cast_shadow=False)
+        self._page.server.scene.add_icosphere(  # without light and shadow, which take seconds where there is no GPU
+            "/picked", radius, _PICKED_COLOR, material="toon3", cast_shadow=False, receive_shadow=False, position=picked.position - shown.origin,
+        )
         self._text.content = point_html(picked)
 
 
@@ -179,14 +179,28 @@ def legend_html(by: Colouring, shown: ShownCloud) -> str:
         return f"<div style='padding:0 .75em;font-size:.8em'>{bar}<span>{escape(scale.low)}</span><span style='float:right'>{escape(scale.high)}</span></div>"
     present = set(shown.class_counts) if by == "label" else None
     swatch = "<span style='display:inline-block;width:.8em;height:.8em;margin-right:.4em;background:{}'></span>{}"
-    entries = [f"<span style='margin-right:1em'>{swatch.format(_css(color), escape(name))}</span>" for name, color in legend_entries(by, shown.class_table, present)]
+    entries = [swatch.format(_css(color), escape(name)) for name, color in legend_entries(by, shown.class_table, present)]
+    entries = [f"<span style='margin-right:1em'>{entry}</span>" for entry in entries]
     return f"<div style='padding:0 .75em;font-size:.8em'>{' '.join(entries)}</div>" if entries else ""
+
+
+def pictures_html(found: PhotoPictures) -> str:
+    """Photo and mask as HTML that holds them: viser's own pictures are loaded from addresses that it withdraws while they load."""
+    pictures = [f"{_note(label)}<img alt='{label}' style='display:block;width:100%' src='{jpeg_uri(picture)}'>"
+                for label, picture in (("photo", found.photo), ("mask", found.mask)) if picture is not None]
+    return f"<div style='padding:.25em .75em'>{''.join(pictures)}</div>{_note(found.note)}"
 
 
 def point_html(picked: PickedPoint) -> str:
     """A picked point as HTML."""
-    rows = "".join(f"<tr><td style='padding-right:1em'>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in picked.facts())
-    return f"<div style='padding:0 .75em;font-size:.8em'><table>{rows}</table>{'<br>'.join(escape(name) for name in picked.photos)}</div>"
+    facts = [*picked.facts(), *([("", ", ".join(picked.photos))] if picked.photos else [])]
+    cell = "<td style='padding-right:1em;vertical-align:top'>{}</td>"
+    rows = "".join(f"<tr>{cell.format(escape(name))}{cell.format(escape(value))}</tr>" for name, value in facts)
+    return f"<div style='padding:0 .75em;font-size:.8em;line-height:1.4'><table>{rows}</table></div>"
+
+
+def _note(text: str) -> str:
+    return f"<small style='padding:0 .75em'>{escape(text)}</small>" if text else ""
 
 
 def _css(color: tuple[int, int, int] | np.ndarray) -> str:

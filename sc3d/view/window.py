@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
-import os
-import sys
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
-from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.view.aerial import frusta, frustum_depth
 from sc3d.view.colors import Colouring, color_points, color_scale, legend_entries
-from sc3d.view.picking import Inspector
+from sc3d.view.display import check_display
+from sc3d.view.picking import Inspector, PickedPoint, position_at
 from sc3d.view.pictures import LINE_COLOR
 from sc3d.view.renderers import vulkan_works
 from sc3d.view.shown import ShownCloud
@@ -47,29 +45,6 @@ def show(inspector: Inspector, views: Sequence[View] = (), by: Colouring = "labe
         show_with_keys(shown, lines, inspector, hidden, by)
 
 
-def check_display() -> None:
-    """Raise Sc3dError that says what to do where no window can be opened."""
-    if not has_display():
-        raise Sc3dError("no display to open a window on: `sc3d view SCENE --screenshot FILE` renders a picture without one, --web shows it in a browser")
-
-
-def has_display() -> bool:
-    """Whether a window can be opened; on Linux an X server (or XWayland) must answer."""
-    if not sys.platform.startswith("linux"):
-        return True
-    if not os.environ.get("DISPLAY"):
-        return False
-    try:
-        x11 = ctypes.CDLL("libX11.so.6")
-    except OSError:
-        return False
-    x11.XOpenDisplay.restype = ctypes.c_void_p
-    display = x11.XOpenDisplay(None)
-    if display:
-        x11.XCloseDisplay(ctypes.c_void_p(display))
-    return bool(display)
-
-
 def _show_with_panel(shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int], by: Colouring) -> None:
     import open3d as o3d
 
@@ -78,6 +53,7 @@ def _show_with_panel(shown: ShownCloud, lines: np.ndarray, inspector: Inspector,
     window = _Window(shown, lines, inspector, hidden)
     window.choose(by)
     application.run()
+    window.forget()
 
 
 class _Window:
@@ -101,6 +77,8 @@ class _Window:
         self._window.add_child(self._scene)
         self._window.add_child(self._panel)
         self._window.set_on_layout(self._lay_out)
+        self._num_redraws = 0
+        self._window.set_on_tick_event(self._on_tick)
         self._add_cameras(lines)
         self._look()
 
@@ -119,7 +97,11 @@ class _Window:
             self._scene.scene.show_geometry(f"class {label}", label not in self._hidden)
         for name, legend in self._legends.items():
             legend.visible = name == by
-        self._window.set_needs_layout()
+        self._redraw()
+
+    def forget(self) -> None:
+        """Let go of the cloud: the panel keeps this object alive, and Open3D takes tensors that outlive the program for leaks and fails."""
+        del self._shown, self._inspector
 
     def _look(self) -> None:
         """From the south, 45 degrees down."""
@@ -210,30 +192,41 @@ class _Window:
         if event.type != gui.MouseEvent.Type.BUTTON_DOWN or not event.is_modifier_down(gui.KeyModifier.CTRL):
             return gui.Widget.EventCallbackResult.IGNORED
         column, row = event.x - self._scene.frame.x, event.y - self._scene.frame.y
-        self._scene.scene.scene.render_to_depth_image(lambda depth: self._pick(np.asarray(depth), column, row))
+        post = self._gui.Application.instance.post_to_main_thread  # the renderer's thread must not touch the panel, nor keep its picture
+        pick = self._scene.scene.scene.render_to_depth_image
+        pick(lambda depth: post(self._window, partial(self._pick, np.array(depth), column, row)))
         return gui.Widget.EventCallbackResult.HANDLED
 
     def _pick(self, depth: np.ndarray, column: int, row: int) -> None:
-        """depth: (H, W) of the 3D view, 1 = nothing; called from the renderer, so the panel is changed later, by the window's own thread."""
-        if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]) or depth[row, column] >= 1:
+        """Describe the point at a pixel of the 3D view. depth: (H, W)"""
+        if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]):
             return
         camera = self._scene.scene.camera
-        position = camera.unproject(column, row, depth[row, column], self._scene.frame.width, self._scene.frame.height).ravel()
-        picked = self._inspector.look_up(self._inspector.nearest(position.astype(np.float64) + self._shown.origin))
-        logger.info("%s", picked)
-        lines = [f"{name}: {value}" for name, value in picked.facts()] + [f"  {name}" for name in picked.photos]
-        self._gui.Application.instance.post_to_main_thread(self._window, lambda: self._describe(picked.position, "\n".join(lines)))
+        position = position_at(depth, (column, row), camera.get_view_matrix(), camera.get_projection_matrix())
+        if position is not None:
+            picked = self._inspector.look_up(self._inspector.nearest(position + self._shown.origin))
+            logger.info("%s", picked)
+            self._describe(picked)
 
-    def _describe(self, position: np.ndarray, text: str) -> None:
+    def _describe(self, picked: PickedPoint) -> None:
         import open3d as o3d
 
-        self._description.text = text
-        mark = o3d.t.geometry.PointCloud(o3d.core.Tensor((position - self._shown.origin).astype(np.float32)[None]))
+        self._description.text = "\n".join([f"{name}: {value}" for name, value in picked.facts()] + [f"  {name}" for name in picked.photos])
+        mark = o3d.t.geometry.PointCloud(o3d.core.Tensor((picked.position - self._shown.origin).astype(np.float32)[None]))
         material = self._rendering.MaterialRecord()
         material.shader, material.point_size, material.base_color = "defaultUnlit", 14.0, [*_PICKED_COLOR, 1.0]
         self._scene.scene.remove_geometry("picked")
         self._scene.scene.add_geometry("picked", mark, material)
+        self._redraw()
+
+    def _redraw(self) -> None:
+        """Lay the panel out and draw it again; twice, as it settles one picture late."""
         self._window.set_needs_layout()
+        self._num_redraws = 3
+
+    def _on_tick(self) -> bool:
+        self._num_redraws -= self._num_redraws > 0
+        return self._num_redraws > 0
 
     def _lay_out(self, _context: object) -> None:
         area, width = self._window.content_rect, _PANEL_EM * self._em

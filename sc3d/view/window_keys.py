@@ -46,6 +46,7 @@ def show_with_keys(shown: ShownCloud, lines: np.ndarray, inspector: Inspector, h
     logger.info("key P: what is known of the point in the middle of the window")
     visualizer.run()
     visualizer.destroy_window()
+    window.forget()
 
 
 class _KeyWindow:
@@ -79,6 +80,10 @@ class _KeyWindow:
         else:
             logger.info("%s", self._inspector.look_up(int(self._shown.rows[rows[found]])))
         return False
+
+    def forget(self) -> None:
+        """Let go of the cloud: the keys keep this object alive, and Open3D takes tensors that outlive the program for leaks and fails."""
+        del self._shown, self._inspector, self._cloud
 
     @property
     def _visible(self) -> np.ndarray:
