@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from tqdm import tqdm
 
-from sc3d.geometry.cameras import View
+from sc3d.geometry.cameras import View, may_see
 from sc3d.geometry.raycast import RayTarget, first_surface
 from sc3d.geometry.voxels import VoxelField, voxel_origin
 from sc3d.settings import Label
@@ -35,7 +35,7 @@ Mask = tuple[np.ndarray, np.ndarray | None]  # (h, w) uint8 labels; (h, w) uint8
 
 @dataclass(frozen=True)
 class Extent:
-    """Of a whole cloud. low, high: (3,) world, box around the points; middle: (3,) their median along each axis, to 1 / MIDDLE_STEPS of the box."""
+    """Of a whole cloud, which decides the voxels and the range at which a vote has full weight. low, high: (3,) world, box around the points; middle: (3,) their median along each axis, to 1 / MIDDLE_STEPS of the box."""
 
     low: np.ndarray
     high: np.ndarray
@@ -103,6 +103,8 @@ def fuse(cloud: Cloud, views: list[View], read_mask: Callable[[View], Mask], sur
     extent = cloud.extent
     ballot, field = open_ballot(cloud, voxel_origin(extent.low, settings.voxel_size), settings.voxel_size, num_ids)
     rules = _rules(extent.middle, views, settings)
+    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
+    views = [view for view in views if may_see(view, low, high)]
     pictures = _pictures(views, read_mask, surface if settings.depth_filter else None, settings)
     for view, picture in tqdm(pictures, desc="voting", unit="view", total=len(views), disable=None):
         ballot.cast(view, picture, rules)

@@ -16,7 +16,7 @@ from sc3d.errors import InputError
 from sc3d.files import atomic_path
 from sc3d.formats import FARTHEST
 from sc3d.formats.images import check_end, open_image
-from sc3d.formats.ply import check_ply
+from sc3d.formats.ply import check_ply, read_header, read_positions
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
@@ -145,6 +145,11 @@ def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
     mesh = _read_geometry(path, "read_triangle_mesh", {".ply"})
     if "positions" not in mesh.vertex or "indices" not in mesh.triangle or not len(mesh.triangle.indices):
         raise InputError(f"{path} holds no triangles")
+    exact = read_positions(path, read_header(path))
+    if exact is not None:  # Open3D reads float32, which has steps of half a metre at UTM size
+        import open3d as o3d
+
+        mesh.vertex.positions = o3d.core.Tensor(exact)
     _check_positions(path, mesh.vertex.positions.numpy(), "repair the mesh first")
     corners = mesh.triangle.indices.numpy()
     if corners.min() < 0 or corners.max() >= len(mesh.vertex.positions):

@@ -27,16 +27,20 @@ def point_arrays(cloud: o3d.t.geometry.PointCloud, centres: np.ndarray) -> tuple
     Missing normals are estimated (eq. 5) and turned towards the nearest of the camera centres (M, 3).
     """
     points = cloud.point.positions.numpy().astype(np.float64)
-    if "normals" in cloud.point:
-        normals = cloud.point.normals.numpy().astype(np.float32)
+    given = cloud.point.normals.numpy() if "normals" in cloud.point else None
+    return points, unit_normals(given, points, centres, points.min(axis=0))
+
+
+def unit_normals(given: np.ndarray | None, points: np.ndarray, centres: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 unit normals of points (N, 3) world: those given (N, 3), if they are all usable, else estimated.
+
+    centres: (M, 3) camera centres, to the nearest of which estimated normals are turned; origin: as in `NeighborIndex`
+    """
+    if given is not None:
+        normals = given.astype(np.float32)
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         if np.isfinite(lengths).all() and (lengths > 0).all():
-            return points, normals / lengths
-    return points, normals_of(points, centres, points.min(axis=0))
-
-
-def normals_of(points: np.ndarray, centres: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 unit normals of points (N, 3), estimated and turned towards the nearest of the camera centres (M, 3); origin: as in `NeighborIndex`."""
+            return normals / lengths
     neighbors, _ = NeighborIndex(points, origin).nearest(points, NORMAL_NEIGHBORS)
     if neighbors.shape[1] < 3:
         raise InputError(f"the cloud has {len(points)} points: normals need at least 3")

@@ -79,6 +79,10 @@ class Scene:
     def votes(self) -> Path:
         return self.path / "votes.npz"
 
+    def votes_of(self, output: Path | None) -> Path:
+        """The voxel field beside an output of `label`: votes.npz, or a name of its own."""
+        return self.votes if output is None else output.with_suffix(".votes.npz")
+
     @property
     def seeds(self) -> Path:
         return self.path / "seeds.ply"

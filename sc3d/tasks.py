@@ -69,7 +69,7 @@ def open_tasks(resources: Resources) -> Iterator[Tasks]:
             client = Client(resources.cluster, timeout="20s", set_as_default=False)
         except (OSError, ValueError) as error:
             raise InputError(f"no Dask scheduler answers at {resources.cluster}: {error}") from None
-        with client:
+        with client, client.as_current():
             yield OnDask(client)
         return
     threads = max(1, (os.cpu_count() or 1) // resources.workers)
@@ -78,7 +78,7 @@ def open_tasks(resources: Resources) -> Iterator[Tasks]:
     before = {name: os.environ.get(name) for name in environment}
     os.environ.update(environment)
     try:
-        with cluster() as local, Client(local, set_as_default=False) as client:
+        with cluster() as local, Client(local, set_as_default=False) as client, client.as_current():
             yield OnDask(client)
     finally:
         for name, value in before.items():

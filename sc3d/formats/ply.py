@@ -178,6 +178,23 @@ def check_ply(path: Path) -> Header:
     return header
 
 
+def read_positions(path: Path, header: Header) -> np.ndarray | None:
+    """(V, 3) float64 x, y, z of the vertices of a checked PLY, which Open3D keeps for clouds only; None unless they are doubles and come first."""
+    vertex = header.elements[0] if header.elements else None
+    names = [] if vertex is None or vertex.name != "vertex" or vertex.has_lists else [entry.name for entry in vertex.properties if entry.dtype == "f8"]
+    if not {"x", "y", "z"} <= set(names):
+        return None
+    if header.order:
+        dtype = np.dtype([(entry.name, header.order + entry.dtype) for entry in vertex.properties])
+        table = np.fromfile(path, dtype, vertex.rows, offset=header.size)
+        return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    with path.open("rb") as file:
+        file.seek(header.size)
+        table = np.fromfile(file, np.float64, vertex.rows * len(vertex.properties), sep=" ").reshape(vertex.rows, -1)
+    columns = [entry.name for entry in vertex.properties]
+    return np.stack([table[:, columns.index(axis)] for axis in "xyz"], axis=1)
+
+
 def _least(entry: Property, order: str) -> int:
     """Smallest number of bytes in the file."""
     return 2 if not order else np.dtype(entry.count or entry.dtype).itemsize

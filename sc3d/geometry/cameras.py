@@ -174,6 +174,13 @@ def in_image(view: View, pixels: np.ndarray) -> np.ndarray:
     return (pixels[:, 0] >= 0) & (pixels[:, 0] < view.width) & (pixels[:, 1] >= 0) & (pixels[:, 1] < view.height)
 
 
+def may_see(view: View, low: np.ndarray, high: np.ndarray) -> bool:
+    """Whether the image may show something of a box; low, high: (3,) world."""
+    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    corners_cam = corners @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
+    return not ((corners_cam @ view.frustum.T > 1e-9 * np.abs(corners_cam).max()).all(axis=0) & view.frustum.any(axis=1)).any()
+
+
 def undistorted(view: View, max_size: int | None = None) -> View:
     """A pinhole view of the same pose, with the largest field of view that has no empty borders, longest side at most `max_size` px."""
     if view.camera.is_undistorted():

@@ -174,20 +174,23 @@ def see_points(view: View, points: np.ndarray, normals: np.ndarray | None, first
     )
 
 
-def surfels(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def surfels(
+    points: np.ndarray, normals: np.ndarray | None, spacing: float | None = None, wanted: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Two triangles per point in its tangent plane.
 
-    points: (N, 3) local frame; normals: (N, 3) or None
+    points: (N, 3) local frame; normals: (N, 3) or None; spacing: of the whole cloud that they are part of, None = their own; wanted: (N,) bool, None = all
     returns: (4 K, 3) vertices and (2 K, 3) triangles of the K <= N points that have support
 
     Half width: FLAT times the distance to the 8th neighbour, which leaves a hole at about 1 of 700 places of a randomly sampled surface;
     SCATTERED times it where the neighbours do not lie in a plane (leaves), so that crowns do not swell and their gaps stay open.
     """
-    neighbors, distances = NeighborIndex(points).nearest(points, SURFEL_NEIGHBORS + 1)
+    neighbors, distances = NeighborIndex(points, np.zeros(3)).nearest(points, SURFEL_NEIGHBORS + 1)
     if normals is None:
         normals = estimate_normals(points, neighbors) if neighbors.shape[1] > 3 else np.tile(np.float32([0, 0, 1]), (len(points), 1))
-    spacing = point_spacing(distances) or 1.0
+    spacing = spacing or point_spacing(distances) or 1.0
     supported = (distances[:, 1:] < 4 * spacing).sum(axis=1) >= min(MIN_SUPPORT, len(points) - 1)
+    supported &= True if wanted is None else wanted
     away = np.abs(np.einsum("nki,ni->nk", points[neighbors[:, 1:]] - points[:, None], normals)).mean(axis=1)
     share = np.where(away > MAX_ROUGHNESS * distances[:, -1], SCATTERED, FLAT)
     half = (share * np.clip(distances[:, -1], spacing, 4 * spacing))[supported, None]

@@ -67,6 +67,15 @@ class VoxelField:
         slots = np.where(found.numpy(), slots.numpy().astype(np.int64), -1)[block_of_key.ravel()]
         return np.where(slots >= 0, (slots * VOXELS + keys % VOXELS) * SIDES, -1)
 
+    def block_positions(self, blocks: np.ndarray) -> np.ndarray:
+        """(B, 3) int32 positions, in blocks from the origin, of packed block keys (B,)."""
+        return _unpack(blocks)
+
+    def block_votes(self, blocks: np.ndarray) -> np.ndarray:
+        """(B, 8, 8, 8, SIDES * C) int32 counts of packed block keys (B,), which must be in the field."""
+        slots, _ = self.grid.hashmap().find(o3d.core.Tensor(_unpack(blocks)))
+        return self.grid.attribute("votes").numpy()[slots.numpy()]
+
     def merge(self, other: VoxelField) -> None:
         """Add the counts of another field of the same origin, voxel size and channels."""
         if (other.voxel_size, other.num_channels) != (self.voxel_size, self.num_channels) or (other.origin != self.origin).any():

@@ -7,13 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.fusion import STATE_NAMES, Cloud, Labels, fuse
+from sc3d.fusion import STATE_NAMES, Cloud, fuse
 from sc3d.geometry.cameras import local_origin
 from sc3d.io import atomic_path, write_geometry
 from sc3d.labelled import point_arrays, read_surface, with_labels
 from sc3d.labelling import Masks, best_confidence, default_voxel_size, point_density, read_given_cloud
 from sc3d.scene import Scene
 from sc3d.settings import Label
+from sc3d.tasks import open_tasks
+from sc3d.tiles.files import CloudFile
+from sc3d.tiles.label import BYTES, label_tiles
+from sc3d.tiles.plan import BASE, TRIANGLE, memory_of, mesh_triangles, num_points
 
 
 def inputs(scene: Scene, settings: Label) -> list[Path]:
@@ -21,10 +25,15 @@ def inputs(scene: Scene, settings: Label) -> list[Path]:
 
 
 def outputs(scene: Scene, settings: Label) -> list[Path]:
-    return [settings.output or scene.seeds, _votes_file(scene, settings)]
+    return [settings.output or scene.seeds, scene.votes_of(settings.output)]
 
 
 def run(scene: Scene, settings: Label) -> dict[str, object]:
+    source = settings.cloud or scene.cloud
+    if not _fits(scene, source, settings):
+        with open_tasks(settings) as tasks:
+            counts, settings, num_views = label_tiles(scene, settings, CloudFile.open(source), tasks)
+        return _summary(counts, settings.voxel_size, num_views)
     masks, cloud = Masks.of(scene, best_confidence(scene) if settings.use_confidence else None), read_given_cloud(scene, settings.cloud)
     views = masks.views
     points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
@@ -33,18 +42,22 @@ def run(scene: Scene, settings: Label) -> dict[str, object]:
     surface = read_surface(scene.mesh, points, normals, local_origin(views)) if settings.depth_filter else None
     density = point_density(scene, points, settings.voxel_size) if settings.density else None
     fusion = fuse(Cloud(points, normals, density), views, masks.read, surface, scene.class_table().num_ids, settings)
-    with atomic_path(_votes_file(scene, settings)) as temporary:
+    with atomic_path(scene.votes_of(settings.output)) as temporary:
         fusion.field.save(temporary)
     write_geometry(settings.output or scene.seeds, with_labels(cloud, normals, fusion.labels, fusion.votes))
-    return _summary(fusion.labels, settings.voxel_size, len(views))
+    return _summary(np.bincount(fusion.labels.state, minlength=len(STATE_NAMES)), settings.voxel_size, len(views))
 
 
-def _votes_file(scene: Scene, settings: Label) -> Path:
-    """votes.npz, or a name of its own beside --output."""
-    return scene.votes if settings.output is None else settings.output.with_suffix(".votes.npz")
+def _fits(scene: Scene, source: Path, settings: Label) -> bool:
+    """Whether cloud and mesh fit into memory as a whole, and nobody asked for workers."""
+    count, triangles = num_points(source), mesh_triangles(scene.mesh)
+    if count is None or not source.exists():
+        return True  # cannot be read in parts
+    return settings.workers < 1 and not settings.cluster and count * BYTES + triangles * TRIANGLE + BASE <= memory_of(settings)
 
 
-def _summary(labels: Labels, voxel_size: float, num_views: int) -> dict[str, object]:
-    shares = np.bincount(labels.state, minlength=len(STATE_NAMES)) / len(labels.state)
+def _summary(counts: np.ndarray, voxel_size: float, num_views: int) -> dict[str, object]:
+    """counts: points in each state."""
+    shares = counts[: len(STATE_NAMES)] / counts.sum()
     states = {name: f"{share:.1%}" for name, share in zip(STATE_NAMES, shares, strict=True) if name != "propagated"}
-    return {"points": len(labels.label), "views": num_views, "voxel_size": round(voxel_size, 5)} | states
+    return {"points": int(counts.sum()), "views": num_views, "voxel_size": round(voxel_size, 5)} | states
