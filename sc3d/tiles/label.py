@@ -120,17 +120,17 @@ def label_tile(job: LabelJob, tile: int) -> None:
         tile, label=labels.label[core], confidence=labels.confidence[core], state=labels.state[core],
         num_views=labels.num_views[core].astype(np.int32), votes=fusion.votes[core], normals=normals[core],
     )
-    keys, votes = _blocks(fusion, points, tile, job)
+    keys, votes = _blocks(fusion, points, core)
     job.results.write(tile, keys=keys, field=votes)
 
 
-def _blocks(fusion: Fusion, points: np.ndarray, tile: int, job: LabelJob) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (B, 3) int32 and counts of the field's blocks whose middle lies in the tile: each block belongs to one tile."""
+def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (B, 3) int32 and counts of the field's blocks whose first point, by row, lies in the tile: each block belongs to one tile."""
     field = fusion.field
-    keys, size = np.unique(sort_by_voxel(points, field.voxel_size, field.origin).keys // VOXELS), BLOCK * field.voxel_size
-    blocks = field.block_positions(keys)
-    mine = job.store.grid.tile_of(field.origin + (blocks + 0.5) * size) == tile
-    return blocks[mine], field.block_votes(keys[mine])
+    sorting = sort_by_voxel(points, field.voxel_size, field.origin)
+    blocks, first_voxel = np.unique(sorting.keys // VOXELS, return_index=True)
+    mine = blocks[core[np.minimum.reduceat(sorting.order, sorting.starts[first_voxel])]]
+    return field.block_positions(mine), field.block_votes(mine)
 
 
 def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndarray:
