@@ -73,8 +73,8 @@ class VoxelField:
 
     def block_votes(self, blocks: np.ndarray) -> np.ndarray:
         """(B, 8, 8, 8, SIDES * C) int32 counts of packed block keys (B,), which must be in the field."""
-        slots, _ = self.grid.hashmap().find(o3d.core.Tensor(_unpack(blocks)))
-        return self.grid.attribute("votes").numpy()[slots.numpy()]
+        votes = self.grid.attribute("votes").numpy()
+        return votes[self.grid.hashmap().find(o3d.core.Tensor(_unpack(blocks)))[0].numpy()] if len(blocks) else votes[:0]
 
     def merge(self, other: VoxelField) -> None:
         """Add the counts of another field of the same origin, voxel size and channels."""
