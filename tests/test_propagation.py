@@ -104,7 +104,7 @@ def graph_of(weights: np.ndarray) -> Graph:
     """A graph of given symmetric weights (N, N), without positions."""
     matrix, count = scipy.sparse.csr_matrix(weights.astype(np.float32)), len(weights)
     nothing = np.zeros(count, np.float32)
-    return Graph(np.arange(count), matrix.indptr.astype(np.int64), matrix.indices.astype(np.int32), matrix.data, 1.0, np.zeros((count, 3), np.float32), nothing, nothing)
+    return Graph(np.arange(count), matrix.indptr.astype(np.int64), matrix.indices.astype(np.int32), matrix.data, np.ones(count, np.float32), np.zeros((count, 3), np.float32), nothing, nothing)
 
 
 def random_problem(seed: int, count: int = 10) -> tuple[np.ndarray, Graph, np.ndarray]:

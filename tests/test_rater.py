@@ -6,7 +6,8 @@ import pytest
 from sc3d.fusion import SEED, UNSEEN, Labels
 from sc3d.geometry.graph import build_graph
 from sc3d.propagation import Evidence, propagate
-from sc3d.propagation.rater import Raters, relief_features
+from sc3d.propagation.rater import Raters
+from sc3d.propagation.relief import relief_features
 from sc3d.settings import Propagate
 
 LAWN, ROOF, ROAD = 1, 2, 3

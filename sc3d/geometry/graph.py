@@ -28,7 +28,7 @@ class Graph:
 
     order: (N,) int64 row of the cloud of each point of the graph
     starts, neighbors, weights: CSR arrays (N + 1,) int64, (E,) int32, (E,) float32; every undirected edge is there twice
-    spacing: median local point spacing, world units
+    spacings: (N,) float32 local point spacing, world units
     normals: (N, 3) float32 unit
     curvature: (N,) float32 of eq. 6; roughness: (N,) float32 mean distance of the neighbours from the tangent plane, over that to the farthest
     """
@@ -37,10 +37,15 @@ class Graph:
     starts: np.ndarray
     neighbors: np.ndarray
     weights: np.ndarray
-    spacing: float
+    spacings: np.ndarray
     normals: np.ndarray
     curvature: np.ndarray
     roughness: np.ndarray
+
+    @property
+    def spacing(self) -> float:
+        """Median local point spacing, world units."""
+        return float(np.median(self.spacings))
 
     def sparse(self) -> scipy.sparse.csr_matrix:
         """(N, N) CSR matrix of the weights, canonical order."""
@@ -48,15 +53,18 @@ class Graph:
 
 
 def build_graph(
-    points: np.ndarray, normals: np.ndarray | None, num_neighbors: int, colors: np.ndarray | None = None, ties: tuple[np.ndarray, ...] = ()
+    points: np.ndarray, normals: np.ndarray | None, num_neighbors: int, colors: np.ndarray | None = None, ties: tuple[np.ndarray, ...] = (),
+    box: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Graph:
     """Neighbour graph with the joint similarity of eq. 7, times that of colours where given.
 
     points: (N, 3) world; normals: (N, 3) unit, oriented, or None = estimated and compared up to sign; colors: (N, 3) uint8 or None
     ties: arrays (N,) that order points of equal position
+    box: lowest and highest corner (3,) of the cloud that the points are a part of, None = of the points: parts of a cloud then have the edges of the whole
     Edges join points closer than RADIUS x the local spacing; a wider gap has no edge. Curvature is over the same neighbours.
     """
-    local = normalised(points)
+    low, high = (points.min(axis=0), points.max(axis=0)) if box is None else box
+    local, scale = normalised(points, low, high), float((high - low).max()) or 1.0
     order = canonical_order(local, ties)
     local, oriented = local[order], normals is not None
     neighbors, distances = _others(local, num_neighbors)
@@ -73,15 +81,12 @@ def build_graph(
     del neighbors
     weights = np.empty(starts[-1], np.float32)
     _weigh(starts, columns, normals, bend, shades, oriented, weights)
-    scale = float(np.ptp(points, axis=0).max()) or 1.0
-    return Graph(order, starts, columns, weights, float(np.median(reach)) / RADIUS * scale, normals, bend, roughness)
+    return Graph(order, starts, columns, weights, (reach / RADIUS * scale).astype(np.float32), normals, bend, roughness)
 
 
-def normalised(points: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 positions in the unit cube: the same for a world in other units or with an offset."""
-    points = np.asarray(points, np.float64)
-    low = points.min(axis=0)
-    return ((points - low) / (float((points.max(axis=0) - low).max()) or 1.0)).astype(np.float32)
+def normalised(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 positions in the unit cube over the box from low to high (3,): the same for a world in other units or with an offset."""
+    return ((np.asarray(points, np.float64) - low) / (float((high - low).max()) or 1.0)).astype(np.float32)
 
 
 def canonical_order(points: np.ndarray, ties: tuple[np.ndarray, ...] = ()) -> np.ndarray:
@@ -114,7 +119,7 @@ def _morton(cells: np.ndarray) -> np.ndarray:
 
 def _others(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The `count` nearest others (N, K) int32 of each point and their distances (N, K) float32: a point need not come first among coinciding ones."""
-    index, count = NeighborIndex(points), min(count, len(points) - 1)
+    index, count = NeighborIndex(points, np.zeros(3)), min(count, len(points) - 1)
     kept = np.empty((len(points), count), np.int32)
     lengths = np.empty(kept.shape, np.float32)
     for start in range(0, len(points), CHUNK):

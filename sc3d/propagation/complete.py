@@ -12,7 +12,8 @@ from sc3d.fusion import LOCKED, PROPAGATED, SEED, UNLOCKED, Labels
 from sc3d.geometry.graph import Graph, build_graph
 from sc3d.propagation.front import grow, vote_nearest
 from sc3d.propagation.potts import mean_field, softmax
-from sc3d.propagation.rater import MIN_EXAMPLES, MIN_SKILL, Raters, relief_features
+from sc3d.propagation.rater import MIN_EXAMPLES, MIN_SKILL, Lesson, Raters, folds_of, skill_of
+from sc3d.propagation.relief import relief_features
 from sc3d.settings import Propagate
 
 logger = logging.getLogger(__name__)
@@ -47,20 +48,36 @@ class Evidence:
         return np.where(np.isin(self.seeds.state, (SEED, UNLOCKED)), self.seeds.label, 0).astype(np.uint8)
 
     @property
+    def sure(self) -> np.ndarray:
+        """(N,) bool seeds with hardly a vote against them."""
+        return (self.seeds.state == SEED) & (self.start > 0) & (self.seeds.confidence >= AGREED_SHARE)
+
+    def agreement(self, core: np.ndarray | None = None) -> np.ndarray:
+        """(AGREED_VIEWS, 256) int64: sure seeds of each class that at least 1, 2, ... views saw; core: (N,) bool points to count, None = all."""
+        sure, start = self.sure if core is None else self.sure & core, self.start
+        return np.stack([np.bincount(start[sure & (self.seeds.num_views >= least)], minlength=256) for least in range(1, AGREED_VIEWS + 1)])
+
+    def agreed_by(self, least: int) -> np.ndarray:
+        """(N,) bool sure seeds that at least so many views saw."""
+        return self.sure & (self.seeds.num_views >= least)
+
+    @property
     def agreed(self) -> np.ndarray:
-        """(N,) bool seeds that many views agree on; fewer views, where some class would have too few examples: to the raters it would not exist."""
-        start, views = self.start, self.seeds.num_views
-        sure = (self.seeds.state == SEED) & (start > 0) & (self.seeds.confidence >= AGREED_SHARE)
-        wanted = np.bincount(start[sure], minlength=256) >= MIN_EXAMPLES
-        for least in range(AGREED_VIEWS, 1, -1):
-            examples = sure & (views >= least)
-            if (np.bincount(start[examples], minlength=256)[wanted] >= MIN_EXAMPLES).all():
-                return examples
-        return sure
+        """(N,) bool seeds that many views agree on."""
+        return self.agreed_by(views_to_agree(self.agreement()))
 
     @property
     def num_classes(self) -> int:
         return (int(self.seeds.label.max(initial=1)) + 1 if self.votes is None else self.votes.shape[1]) - 1
+
+
+def views_to_agree(agreement: np.ndarray) -> int:
+    """How many views must have seen an example: AGREED_VIEWS, or fewer, where some class would have too few examples, as to the raters it would not exist.
+
+    agreement: (AGREED_VIEWS, 256) of the whole cloud
+    """
+    wanted = agreement[0] >= MIN_EXAMPLES
+    return next((least for least in range(AGREED_VIEWS, 1, -1) if (agreement[least - 1][wanted] >= MIN_EXAMPLES).all()), 1)
 
 
 def tie_breakers(evidence: Evidence, normals: np.ndarray | None) -> tuple[np.ndarray, ...]:
@@ -85,20 +102,29 @@ def propagate(graph: Graph, evidence: Evidence, settings: Propagate) -> Labels:
     """
     known = evidence.ordered(graph.order)
     start = known.start
-    raters = _raters(graph, known) if settings.appearance and (settings.method == "map" or settings.verify_seeds) else None
+    learned = _learned(graph, known) if needs_raters(settings) else None
     if settings.method == "map":
-        label, confidence = _map(graph, known, raters, settings)
+        label, confidence = _map(graph, known, learned, settings)
+        label = np.where(reachable(graph, start), label, 0).astype(np.uint8)
     else:
-        if settings.verify_seeds and raters is not None:
-            start = _verified(known, raters)
-        label, confidence = vote_nearest(known.points, start, settings.num_neighbors) if settings.method == "knn" else grow(graph, start)
+        start = start if learned is None else verified(start, learned[0].rate(learned[1], start))
+        label, confidence = spread(graph, known.points, start, settings)
     if settings.fill and (label == 0).any() and (label > 0).any():
         filled, filled_confidence = vote_nearest(known.points, label, 1)
         label, confidence = np.where(label == 0, filled, label), np.where(label == 0, 0.5 * filled_confidence, confidence)
-    return reordered(_labels(known.seeds, start, label, confidence, settings), np.argsort(graph.order))
+    return reordered(final_labels(known.seeds, start, label, confidence, settings), np.argsort(graph.order))
 
 
-def _labels(seeds: Labels, start: np.ndarray, label: np.ndarray, confidence: np.ndarray, settings: Propagate) -> Labels:
+def needs_raters(settings: Propagate) -> bool:
+    return settings.appearance and (settings.method == "map" or settings.verify_seeds)
+
+
+def spread(graph: Graph, points: np.ndarray, start: np.ndarray, settings: Propagate) -> tuple[np.ndarray, np.ndarray]:
+    """Labels and confidences by knn or geometry; points: (N, 3), start: (N,) uint8, both in the order of the graph."""
+    return vote_nearest(points, start, settings.num_neighbors) if settings.method == "knn" else grow(graph, start)
+
+
+def final_labels(seeds: Labels, start: np.ndarray, label: np.ndarray, confidence: np.ndarray, settings: Propagate) -> Labels:
     kept = (start > 0) & (label == start)
     doubted = np.where(np.isin(seeds.state, (SEED, UNLOCKED)) & (label == 0), LOCKED, seeds.state)
     state = np.where(kept, seeds.state, np.where(label > 0, PROPAGATED, doubted))
@@ -106,47 +132,80 @@ def _labels(seeds: Labels, start: np.ndarray, label: np.ndarray, confidence: np.
     return Labels(label.astype(np.uint8), confidence.astype(np.float32), state.astype(np.uint8), seeds.num_views)
 
 
-def _raters(graph: Graph, known: Evidence) -> Raters | None:
-    """Colour and relief as raters, if they do well on agreed points that they have not seen."""
-    raters = Raters.of(relief_features(graph, known.points), known.colors)
-    skill = raters.skill(known.start, known.agreed, known.num_classes)
+def _learned(graph: Graph, known: Evidence) -> tuple[Raters, Lesson] | None:
+    """Colour and relief as raters, and what the agreed points teach, if that does well on agreed points that it has not seen."""
+    raters, start, examples = Raters.of(relief_features(graph, known.points), known.colors), known.start, known.agreed
+    folds = folds_of(known.points, known.points.min(axis=0), known.points.max(axis=0))
+    halves = [raters.lesson(start, examples & (folds == fold), known.num_classes) for fold in (0, 1)]
+    wrong = [raters.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1)]
+    lesson = added(halves)
+    return (raters, lesson) if is_skilled(wrong, lesson) else None
+
+
+def added(lessons: list[Lesson]) -> Lesson:
+    """The lesson of all parts."""
+    return tuple(sum(parts) for parts in zip(*lessons, strict=True))
+
+
+def is_skilled(wrong: list[int | None], lesson: Lesson) -> bool:
+    """Whether the raters do well enough; wrong: their errors on each fold held out."""
+    skill = skill_of(wrong, lesson[0].sum(axis=0))
     logger.info("colour and relief avoid %.0f%% of errors on held-out agreed points%s", 100 * skill, "" if skill >= MIN_SKILL else ": not used")
-    return raters if skill >= MIN_SKILL else None
+    return skill >= MIN_SKILL
 
 
-def _verified(known: Evidence, raters: Raters) -> np.ndarray:
-    """The seeds without those that look like another class: conflicts that all views share."""
-    rating, start = raters.learn(known.start, known.agreed, known.num_classes), known.start
+def verified(start: np.ndarray, rating: np.ndarray) -> np.ndarray:
+    """The seeds (N,) without those that look like another class: conflicts that all views share. rating: (N, C)"""
     given = rating[np.arange(len(start)), np.maximum(start, 1).astype(np.int64) - 1]
     return np.where((start > 0) & (given < IMPLAUSIBLE), 0, start).astype(np.uint8)
 
 
-def _map(graph: Graph, known: Evidence, raters: Raters | None, settings: Propagate) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and confidences of the smallest Potts energy; 0 where no edge leads to a seed."""
-    start, likelihood = known.start, vote_likelihood(known.votes)
-    offered = np.bincount(start, minlength=likelihood.shape[1] + 1)[1:] > 0  # a class without a single seed is not offered
-    if raters is None:
-        likelihood[:, ~offered] = -np.inf
-        grown, _ = grow(graph, start)  # else the votes would take one edge per step to reach points without any
-        belief = softmax(likelihood)
-        silent = np.flatnonzero(~known.votes[:, 1:].any(axis=1) & (grown > 0))
-        belief[silent] = np.eye(likelihood.shape[1], dtype=np.float32)[grown[silent] - 1]
-        evidence, belief = likelihood, mean_field(graph, likelihood, settings.smoothness, belief)
-    else:
-        label, examples = start, known.agreed
-        for turn in range(max(settings.rounds, 1)):
-            rating = raters.learn(label, examples, known.num_classes)
-            if turn and rating is None:
-                break  # too little is sure; what was learned from agreed points stands
-            rating += np.float32(TRUST) * likelihood
-            rating[:, ~offered], evidence = -np.inf, rating
-            belief = mean_field(graph, evidence, settings.smoothness)  # afresh: a sure belief would not move
-            label = (belief.argmax(axis=1) + 1).astype(np.uint8)
-            examples = (belief.max(axis=1) > SURE) & (known.seeds.num_views > 0)
-    label = (belief.argmax(axis=1) + 1).astype(np.uint8)
+def _map(graph: Graph, known: Evidence, learned: tuple[Raters, Lesson] | None, settings: Propagate) -> tuple[np.ndarray, np.ndarray]:
+    """Labels and confidences of the smallest Potts energy."""
+    offered = np.bincount(known.start, minlength=known.num_classes + 1)[1:] > 0
+    if learned is None:
+        evidence, belief = unrated_belief(graph, known, offered, settings)
+        return decided(graph, evidence, belief)
+    (raters, lesson), label = learned, known.start
+    for turn in range(max(settings.rounds, 1)):
+        rating = raters.rate(lesson, label)
+        if turn and rating is None:
+            break  # too little is sure; what was learned from agreed points stands
+        evidence, belief = rated_belief(graph, known, offered, rating, settings)
+        label = (belief.argmax(axis=1) + 1).astype(np.uint8)
+        lesson = raters.lesson(label, examples_in(belief, known), known.num_classes)
+    return decided(graph, evidence, belief)
+
+
+def unrated_belief(graph: Graph, known: Evidence, offered: np.ndarray, settings: Propagate) -> tuple[np.ndarray, np.ndarray]:
+    """Log-evidence and belief (N, C) from the votes alone; offered: (C,) bool, a class without a single seed is not."""
+    likelihood = vote_likelihood(known.votes)
+    likelihood[:, ~offered] = -np.inf
+    grown, _ = grow(graph, known.start)  # else the votes would take one edge per step to reach points without any
+    belief = softmax(likelihood)
+    silent = np.flatnonzero(~known.votes[:, 1:].any(axis=1) & (grown > 0))
+    belief[silent] = np.eye(likelihood.shape[1], dtype=np.float32)[grown[silent] - 1]
+    return likelihood, mean_field(graph, likelihood, settings.smoothness, belief)
+
+
+def rated_belief(graph: Graph, known: Evidence, offered: np.ndarray, rating: np.ndarray, settings: Propagate) -> tuple[np.ndarray, np.ndarray]:
+    """The same from votes and raters; rating: (N, C), overwritten."""
+    rating += np.float32(TRUST) * vote_likelihood(known.votes)
+    rating[:, ~offered] = -np.inf
+    return rating, mean_field(graph, rating, settings.smoothness)  # afresh: a sure belief would not move
+
+
+def examples_in(belief: np.ndarray, known: Evidence) -> np.ndarray:
+    """(N,) bool points that a later round learns from."""
+    return (belief.max(axis=1) > SURE) & (known.seeds.num_views > 0)
+
+
+def decided(graph: Graph, evidence: np.ndarray, belief: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) uint8 labels and (N,) float32 confidences of a belief (N, C); evidence (N, C) is overwritten."""
+    label = belief.argmax(axis=1) + 1
     evidence *= np.float32(CAUTION)
     cautious = mean_field(graph, evidence, SUPPORT, belief, steps=1)
-    return np.where(reachable(graph, start), label, 0).astype(np.uint8), cautious[np.arange(len(label)), label.astype(np.int64) - 1]
+    return label.astype(np.uint8), cautious[np.arange(len(label)), label - 1]
 
 
 def vote_likelihood(votes: np.ndarray) -> np.ndarray:
