@@ -17,7 +17,7 @@ from sc3d.settings import Label
 from sc3d.tasks import open_tasks
 from sc3d.tiles.files import CloudFile
 from sc3d.tiles.label import BYTES, label_tiles
-from sc3d.tiles.plan import BASE, TRIANGLE, memory_of, mesh_triangles, num_points
+from sc3d.tiles.plan import TRIANGLE, fits, mesh_triangles, num_points
 
 
 def inputs(scene: Scene, settings: Label) -> list[Path]:
@@ -53,7 +53,7 @@ def _fits(scene: Scene, source: Path, settings: Label) -> bool:
     count, triangles = num_points(source), mesh_triangles(scene.mesh)
     if count is None or not source.exists():
         return True  # cannot be read in parts
-    return settings.workers < 1 and not settings.cluster and count * BYTES + triangles * TRIANGLE + BASE <= memory_of(settings)
+    return fits(count * BYTES + triangles * TRIANGLE, settings)
 
 
 def _summary(counts: np.ndarray, voxel_size: float, num_views: int) -> dict[str, object]:

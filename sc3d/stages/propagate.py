@@ -13,6 +13,10 @@ from sc3d.labelled import read_labelled, read_votes, with_labels
 from sc3d.propagation import Evidence, complete
 from sc3d.scene import Scene
 from sc3d.settings import Propagate
+from sc3d.tasks import open_tasks
+from sc3d.tiles.files import CloudFile
+from sc3d.tiles.plan import fits, num_points
+from sc3d.tiles.propagate import BYTES, Summary, propagate_tiles
 
 
 def inputs(scene: Scene, settings: Propagate) -> list[Path]:
@@ -25,6 +29,10 @@ def outputs(scene: Scene, settings: Propagate) -> list[Path]:
 
 def run(scene: Scene, settings: Propagate) -> dict[str, object]:
     path = settings.seeds or scene.seeds
+    count = num_points(path)
+    if count is not None and not fits(count * BYTES, settings):
+        with open_tasks(settings) as tasks:
+            return _summary(propagate_tiles(scene, settings, CloudFile.open(path), tasks))
     cloud, seeds = read_labelled(path, "label")
     votes = read_votes(cloud)
     if settings.method == "map" and votes is None:
@@ -36,9 +44,14 @@ def run(scene: Scene, settings: Propagate) -> dict[str, object]:
     evidence = Evidence(points, seeds, votes, cloud.point.colors.numpy() if "colors" in cloud.point else None)
     labels = complete(evidence, normals, settings)
     write_geometry(settings.output or scene.labelled, with_labels(cloud, normals, labels))
+    labelled = labels.label > 0
+    return _summary(Summary(len(labelled), int(labelled.sum()), int((labels.state == PROPAGATED).sum()), float(labels.confidence[labelled].sum(dtype=np.float64))))
+
+
+def _summary(found: Summary) -> dict[str, object]:
     return {
-        "points": len(labels.label),
-        "labelled": f"{(labels.label > 0).mean():.1%}",
-        "propagated": f"{(labels.state == PROPAGATED).mean():.1%}",
-        "mean_confidence": round(float(labels.confidence[labels.label > 0].mean()), 3),
+        "points": found.num_points,
+        "labelled": f"{found.labelled / found.num_points:.1%}",
+        "propagated": f"{found.propagated / found.num_points:.1%}",
+        "mean_confidence": round(found.confidence / max(found.labelled, 1), 3),
     }

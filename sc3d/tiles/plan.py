@@ -36,6 +36,11 @@ def memory_of(resources: Resources) -> int:
     return share
 
 
+def fits(needed: int, resources: Resources) -> bool:
+    """Whether work of so many bytes fits into memory as a whole, and nobody asked for workers."""
+    return resources.workers < 1 and not resources.cluster and needed + BASE <= memory_of(resources)
+
+
 def max_points(resources: Resources, bytes_per_point: int) -> int:
     """Points that a process has room for."""
     return max((memory_of(resources) - BASE) // bytes_per_point, LEAST)

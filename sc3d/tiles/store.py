@@ -155,19 +155,23 @@ class TileStore:
         return sorted(self.counts)
 
     def records(self, tile: int) -> np.ndarray:
-        return np.fromfile(self.folder / f"{tile}.bin", self.dtype)
+        return np.memmap(self.folder / f"{tile}.bin", self.dtype, "r")
 
     def rows(self, tile: int) -> np.ndarray:
         return np.memmap(self.folder / f"{tile}.row", np.int64, "r")
 
     def window(self, tile: int, margin: float) -> Window:
-        """The points of a tile, and those less than `margin` (world units) around it."""
-        parts = [(tile, slice(None))]
-        for other in self.grid.neighbors(tile, margin)[1:]:
-            if other in self.counts:
-                kept = np.flatnonzero(self.grid.within(positions(self.records(other)), tile, margin))
-                if len(kept):
-                    parts.append((other, kept))
+        """The points of a tile, and those less than `margin` (world units) around it; which these are is remembered in a file."""
+        file = self.folder / f"{tile}.margin-{margin:.9g}.npz"
+        if not file.exists():
+            around = {}
+            for other in self.grid.neighbors(tile, margin)[1:]:
+                if other in self.counts:
+                    around[str(other)] = np.flatnonzero(self.grid.within(positions(self.records(other)), tile, margin)).astype(np.int32)
+            with atomic_path(file) as temporary:
+                np.savez(temporary, **around)
+        with np.load(file, allow_pickle=False) as around:
+            parts = [(tile, slice(None)), *((int(other), around[other]) for other in around.files if len(around[other]))]
         rows = np.concatenate([self.rows(other)[kept] for other, kept in parts])
         order = np.argsort(rows)
         core = np.zeros(len(rows), bool)
@@ -201,7 +205,7 @@ class Results:
 
     def around(self, window: Window, name: str) -> np.ndarray:
         """Values of the window's points."""
-        return window.gather(lambda tile: self.read(tile, name))
+        return window.gather(lambda tile: self.read(tile, name, mapped=True))
 
     def in_order(self, names: list[str]) -> Iterator[dict[str, np.ndarray]]:
         """The values of all points in the order of the cloud, CHUNK at a time."""
