@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,8 @@ from sc3d.settings import Propagate
 from sc3d.tiles.files import columns, positions
 from sc3d.tiles.store import Results, TileStore, Window
 
-GRAPH = ("order", "starts", "neighbors", "weights", "spacings", "normals", "curvature", "roughness")
+GRAPH = tuple(field.name for field in fields(Graph))
+KNOWN = ("points", "votes", *(field.name for field in fields(Labels)), "colors")  # of Evidence, in the order of the graph
 
 
 @dataclass(frozen=True)
@@ -49,18 +50,13 @@ class Part:
 
     @classmethod
     def load(cls, job: PropagateJob, tile: int) -> Part:
-        """The graph is built at the first time and read from then on."""
+        """The graph is built at the first time and kept in files, of which a pass reads what it looks at."""
         window = job.store.window(tile, job.margin)
-        evidence, normals = _evidence(job, window)
-        names = [f"graph_{name}" for name in GRAPH]
-        if not job.results.has(tile, names[-1]):
-            colors = evidence.colors if job.settings.color else None
-            box = job.extent.low, job.extent.high
-            graph = build_graph(evidence.points, normals, job.settings.num_neighbors, colors, tie_breakers(evidence, normals), box)
-            job.results.write(tile, **dict(zip(names, (getattr(graph, name) for name in GRAPH), strict=True)))
-        else:
-            graph = Graph(*(np.asarray(job.results.read(tile, name, mapped=True)) for name in names))  # read where a pass looks at it
-        return cls(tile, window, graph, evidence.ordered(graph.order), window.core[graph.order])
+        if not job.results.has(tile, f"part_{KNOWN[-1]}"):
+            _build(job, tile, window)
+        graph, known = Graph(*_mapped(job, tile, GRAPH)), _mapped(job, tile, KNOWN)
+        evidence = Evidence(known[0], Labels(*known[2:-1]), known[1], known[-1] if job.colored else None)
+        return cls(tile, window, graph, evidence, window.core[graph.order])
 
     def own(self, values: np.ndarray) -> np.ndarray:
         """Values of the tile's own points, as `Results` keeps them, from values (N, ...) of the part."""
@@ -92,6 +88,20 @@ def raters_of(cells: np.ndarray) -> Raters:
 def cells_of(raters: Raters) -> np.ndarray:
     """(N, G) int32 cell of each point in each group."""
     return np.stack([group.cell for group in raters.groups], axis=1)
+
+
+def _build(job: PropagateJob, tile: int, window: Window) -> None:
+    evidence, normals = _evidence(job, window)
+    colors, box = evidence.colors if job.settings.color else None, (job.extent.low, job.extent.high)
+    graph = build_graph(evidence.points, normals, job.settings.num_neighbors, colors, tie_breakers(evidence, normals), box)
+    known = evidence.ordered(graph.order)
+    values = (known.points, known.votes, *(getattr(known.seeds, field.name) for field in fields(Labels)), known.colors if job.colored else np.empty(0))
+    for names, arrays in ((GRAPH, [getattr(graph, name) for name in GRAPH]), (KNOWN, values)):
+        job.results.write(tile, **{f"part_{name}": array for name, array in zip(names, arrays, strict=True)})
+
+
+def _mapped(job: PropagateJob, tile: int, names: tuple[str, ...]) -> list[np.ndarray]:
+    return [np.asarray(job.results.read(tile, f"part_{name}", mapped=True)) for name in names]
 
 
 def _evidence(job: PropagateJob, window: Window) -> tuple[Evidence, np.ndarray]:
