@@ -135,7 +135,7 @@ class LabelledSurface:
             raise InputError("the cloud has no labels: run `sc3d label SCENE` and `sc3d propagate SCENE`")
         points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
         surface = read_surface(mesh, points, normals, local_origin(views))
-        return cls(surface, NeighborIndex(points), cloud.point["label"].numpy().ravel(), REACH * spacing_of(points))
+        return cls(surface, NeighborIndex(points, points.min(axis=0)), cloud.point["label"].numpy().ravel(), REACH * spacing_of(points))
 
     def see(self, view: View, size: tuple[int, int], wanted: np.ndarray | None = None) -> tuple[np.ndarray, FirstSurface]:
         """The class at each pixel of a photo, distortion included: that of the cloud point nearest to the first surface.

@@ -9,12 +9,15 @@ import numpy as np
 from tqdm import tqdm
 
 from sc3d.geometry.cameras import View
-from sc3d.geometry.raycast import first_surface, nearest_points
 from sc3d.io import read_index_image, write_json
 from sc3d.labelled import LabelledSurface, read_labelled
 from sc3d.metrics import Confusion, JudgedPixels, depth_edge_band, total
 from sc3d.scene import Scene
 from sc3d.settings import Evaluate
+from sc3d.tasks import open_tasks
+from sc3d.tiles.evaluate import BYTES, TiledSurface, look_by_tiles, read_labels
+from sc3d.tiles.files import CloudFile
+from sc3d.tiles.plan import TRIANGLE, fits, mesh_triangles, num_points
 
 SOURCES = ("labels", "masks", "labels_near_edges", "labels_elsewhere")  # order of the figures
 
@@ -32,8 +35,15 @@ def run(scene: Scene, settings: Evaluate) -> dict[str, object]:
     scene.require(settings.truth or scene.truth, hint="pass --truth FOLDER with manual masks")
     truth_files = scene.mask_files(settings.truth or scene.truth, class_table)
     mask_files = scene.mask_files(scene.masks, class_table) if scene.masks.is_dir() else {}
-    cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
-    surface = LabelledSurface.build(cloud, scene.model.views, scene.mesh)
+    path = settings.labelled or scene.labelled
+    count = num_points(path) if path.exists() else None
+    if count is None or fits(count * BYTES + mesh_triangles(scene.mesh) * TRIANGLE, settings):
+        cloud, labels = read_labelled(path, "propagate")
+        surface = LabelledSurface.build(cloud, scene.model.views, scene.mesh)
+    else:
+        labels = read_labels(CloudFile.open(path))
+        with open_tasks(settings) as tasks:
+            surface = look_by_tiles(scene, settings, CloudFile.open(path), tasks)
     views = [view for view in scene.model.views if view.name in truth_files]
     per_photo, pixels = {}, []
     for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
@@ -47,14 +57,15 @@ def run(scene: Scene, settings: Evaluate) -> dict[str, object]:
     believed = JudgedPixels.joined(pixels).reliability(labels.label, labels.confidence).summary() if pixels else {}
     metrics = {"photos": [view.name for view in views], "classes": [entry.name for entry in class_table]} | totals
     write_json(settings.output or scene.metrics, metrics | {"reliability": believed, "per_photo": photos})
+    if isinstance(surface, TiledSurface):
+        surface.parts.remove()
     return _summary(totals) | ({"calibration_error": round(believed["ece"], 4)} if believed else {})
 
 
-def _judged(surface: LabelledSurface, view: View, truth: np.ndarray, band: float) -> JudgedPixels:
+def _judged(surface: LabelledSurface | TiledSurface, view: View, truth: np.ndarray, band: float) -> JudgedPixels:
     """The pixels of a photo that have truth, and the cloud point that each shows."""
-    sized = view.resized(*truth.shape[::-1])
-    first = first_surface(surface.surface, sized)
-    return JudgedPixels.of(truth, nearest_points(first, sized, surface.index, surface.reach, truth > 0), depth_edge_band(first.range, band))
+    rows, first = surface.rows(view, truth.shape[::-1], truth > 0)
+    return JudgedPixels.of(truth, rows, depth_edge_band(first.range, band))
 
 
 def _confusions(pixels: JudgedPixels, label: np.ndarray, num_ids: int) -> dict[str, Confusion]:
