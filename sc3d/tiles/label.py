@@ -72,7 +72,9 @@ def label_tiles(scene: Scene, settings: Label, cloud: CloudFile, tasks: Tasks) -
 
 def _ranges(scene: Scene, masks: Masks, store: TileStore, spacing: float, settings: Label, parts: Parts, tasks: Tasks) -> RangeMaps:
     origin = local_origin(masks.views)
-    if scene.mesh.exists():
+    if settings.surface == "voxels":
+        raise InputError("--surface voxels needs the cloud in memory as a whole: take surfels, or allow more with --max-memory")
+    if scene.mesh.exists() and settings.surface == "auto":
         mesh = split_mesh(scene.mesh, parts.subfolder("surface"), origin, memory_of(settings))
     elif {"nx", "ny", "nz"} <= set(store.dtype.names):
         mesh = split_surfels(store, spacing, parts.subfolder("surface"), origin)
