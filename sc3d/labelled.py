@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import open3d as o3d
@@ -13,10 +14,12 @@ from sc3d.fusion import STATE_NAMES, Labels
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, orient_normals, point_spacing
 from sc3d.geometry.raycast import FirstSurface, RayTarget, Surface, first_surface, nearest_points
+from sc3d.geometry.traversal import VoxelSurface
 from sc3d.io import read_cloud, read_mesh
 
 NORMAL_NEIGHBORS = 30
 SPACING_SAMPLE, SPACING_NEIGHBORS = 100_000, 8
+SURFACE_VOXEL = 2.5  # of the grid that blocks rays where there is no mesh, in point spacings
 REACH = 4.0  # a pixel shows the label of a cloud point at most this many point spacings away from the surface that it sees
 VOTES = "votes_"  # + class id; PLY has scalar properties only
 
@@ -47,15 +50,17 @@ def unit_normals(given: np.ndarray | None, points: np.ndarray, centres: np.ndarr
     return orient_normals(points, estimate_normals(points, neighbors), centres)
 
 
-def read_surface(mesh: Path, points: np.ndarray, normals: np.ndarray | None, origin: np.ndarray) -> RayTarget:
-    """The surface that rays hit: the mesh file if there is one, else surfels at the points.
+def read_surface(mesh: Path, points: np.ndarray, normals: np.ndarray | None, origin: np.ndarray, kind: Literal["auto", "surfels", "voxels"] = "auto") -> RayTarget:
+    """The surface that rays hit, `Label.surface`: the mesh file if there is one and nothing else is wanted, else that of the points.
 
     points: (N, 3) float64 world; normals: (N, 3) float32 unit or None = estimated; origin: (3,) world, shift of the frame for float32
     """
-    if mesh.exists():
+    if kind == "auto" and mesh.exists():
         read = read_mesh(mesh)
         return Surface.from_mesh(read.vertex.positions.numpy().astype(np.float64), read.triangle.indices.numpy(), origin)
-    return Surface.from_cloud(points, normals, origin)
+    if kind == "surfels":
+        return Surface.from_cloud(points, normals, origin)
+    return VoxelSurface.from_cloud(points, normals, SURFACE_VOXEL * spacing_of(points))
 
 
 def with_labels(cloud: o3d.t.geometry.PointCloud, normals: np.ndarray, labels: Labels, votes: np.ndarray | None = None) -> o3d.t.geometry.PointCloud:

@@ -142,6 +142,9 @@ class Label(Resources):
     disagreement and the paper's weights, whatever the other options say."""
     depth_filter: bool = True
     """Only the first surface along each ray is labelled; --no-depth-filter lets labels penetrate."""
+    surface: Literal["auto", "surfels", "voxels"] = "auto"
+    """What hides the points behind it. auto: mesh.ply if there is one, else as voxels; voxels: the grid of the cloud's own points, traversed coarse to fine;
+    surfels: a square around every point (more memory), which clouds in tiles have instead of voxels."""
     consensus: float = 0.66
     """Share of the votes that the winning class needs, else the voxel is locked (conflict-lock)."""
     voxel_size: float = 0.0

@@ -39,7 +39,7 @@ def run(scene: Scene, settings: Label) -> dict[str, object]:
     points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=default_voxel_size(points, masks))
-    surface = read_surface(scene.mesh, points, normals, local_origin(views)) if settings.depth_filter else None
+    surface = read_surface(scene.mesh, points, normals, local_origin(views), settings.surface) if settings.depth_filter else None
     density = point_density(scene, points, settings.voxel_size) if settings.density else None
     fusion = fuse(Cloud(points, normals, density), views, masks.read, surface, scene.class_table().num_ids, settings)
     with atomic_path(scene.votes_of(settings.output)) as temporary:

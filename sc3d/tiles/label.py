@@ -50,6 +50,8 @@ class LabelJob:
 
 def label_tiles(scene: Scene, settings: Label, cloud: CloudFile, tasks: Tasks) -> tuple[np.ndarray, Label, int]:
     """Label a cloud tile by tile and write it; returns the number of points in each state, the settings with the voxel size, and the number of views."""
+    if settings.surface == "voxels" and settings.depth_filter:
+        raise InputError("--surface voxels needs the cloud in memory as a whole: take surfels, or allow more with --max-memory")
     confidence = best_confidence(scene) if settings.use_confidence else None
     masks = Masks.of(scene, confidence)
     output = settings.output or scene.seeds
@@ -72,7 +74,7 @@ def label_tiles(scene: Scene, settings: Label, cloud: CloudFile, tasks: Tasks) -
 
 def _ranges(scene: Scene, masks: Masks, store: TileStore, spacing: float, settings: Label, parts: Parts, tasks: Tasks) -> RangeMaps:
     origin = local_origin(masks.views)
-    if scene.mesh.exists():
+    if scene.mesh.exists() and settings.surface == "auto":
         mesh = split_mesh(scene.mesh, parts.subfolder("surface"), origin, memory_of(settings))
     elif {"nx", "ny", "nz"} <= set(store.dtype.names):
         mesh = split_surfels(store, spacing, parts.subfolder("surface"), origin)
