@@ -141,8 +141,13 @@ def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported 
 
 
 def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
-    """Read a triangle mesh; InputError if it is damaged, empty or has vertices that are not finite or too far away, or triangles of other vertices."""
-    mesh = _read_geometry(path, "read_triangle_mesh", {".ply"})
+    """Read a triangle mesh; InputError if it is damaged, empty or has vertices that are not finite or too far away, or triangles of other vertices.
+
+    By Open3D's older reader: the newer one rounds vertices to float32, which is half a metre at UTM northings.
+    """
+    import open3d as o3d
+
+    mesh = o3d.t.geometry.TriangleMesh.from_legacy(_read_geometry(path, "read_triangle_mesh", {".ply"}), vertex_dtype=o3d.core.float64)
     if "positions" not in mesh.vertex or "indices" not in mesh.triangle or not len(mesh.triangle.indices):
         raise InputError(f"{path} holds no triangles")
     exact = read_positions(path, read_header(path))
@@ -157,7 +162,7 @@ def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
     return mesh
 
 
-def _read_geometry(path: Path, reader: str, suffixes: set[str]):  # noqa: ANN202 - what Open3D's reader returns
+def _read_geometry(path: Path, reader: str, suffixes: set[str]):  # noqa: ANN202 - a tensor PointCloud, or an older TriangleMesh
     """Open3D tells of files that it could not read to the end on Python's standard output only."""
     import open3d as o3d
 
@@ -170,7 +175,7 @@ def _read_geometry(path: Path, reader: str, suffixes: set[str]):  # noqa: ANN202
     told = io.StringIO()
     try:
         with redirect_stdout(told):
-            geometry = getattr(o3d.t.io, reader)(str(path))
+            geometry = getattr(o3d.io if reader == "read_triangle_mesh" else o3d.t.io, reader)(str(path))
     except (RuntimeError, ValueError, IndexError) as error:
         told.write(f"failed: {error}")
     failure = re.search(r"\b(?:failed|unable to)\b[^\n\x1b]*", told.getvalue().replace(str(path), "the file"), re.IGNORECASE)

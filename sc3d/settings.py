@@ -420,9 +420,27 @@ class BenchmarkSurface:
     """JSON file for the figures; a Markdown table is written beside it."""
 
 
+@dataclass(frozen=True)
+class BenchmarkCity:
+    """Make a synthetic city to measure on: sites of the generator side by side, with cloud, mesh, cameras, masks and truth, but without photos."""
+
+    scene: Annotated[Positional[Path], arg(help="Scene folder to write; it must not exist, or be empty.")]
+    sites: tuple[int, int] = (6, 5)
+    """Sites from west to east and from south to north, each of 120 m by 120 m."""
+    points_per_site: int = 1_000_000
+    """Points of the cloud on each site."""
+    views: int = 200
+    """Number of views over the whole city: 60 % look straight down, the others obliquely from the four sides."""
+    width: int = 1600
+    """Width of the masks, px; the height follows at 3:2."""
+    seed: int = 0
+    """Fixes the city, the flight and the mask errors."""
+
+
 Benchmark = (
     Annotated[BenchmarkSpeed, subcommand("speed")] | Annotated[BenchmarkTables, subcommand("tables")]
     | Annotated[BenchmarkFusionSpeed, subcommand("fusion-speed")] | Annotated[BenchmarkSurface, subcommand("surface")]
+    | Annotated[BenchmarkCity, subcommand("city")]
 )
 
 

@@ -1,4 +1,4 @@
-"""Measurements: `sc3d benchmark speed`, `tables`, `fusion-speed` and `surface`."""
+"""Measurements: `sc3d benchmark speed`, `tables`, `fusion-speed`, `surface` and `city`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ RUNS = {
     settings.BenchmarkTables: ("tables", "run_tables"),
     settings.BenchmarkFusionSpeed: ("fusion_speed", "run_fusion_speed"),
     settings.BenchmarkSurface: ("surface_page", "run_surface"),
+    settings.BenchmarkCity: ("city", "run_city"),
 }
 
 

@@ -13,6 +13,7 @@ from sc3d.synthetic.mesh import GRASS, GROUND, MeshBuilder
 HALF_ROAD = 3.0  # carriageway, m from the centre line
 HALF_PAVED = 4.5  # including pavements
 RASTER_STEP = 0.5
+RIM, EDGE = 15.0, 3.0  # m inside of level edges: the hills end over the first, whatever is left (pads, kerbs) over the second
 DRIVEWAY, PARKING = 0, 1
 
 
@@ -25,6 +26,7 @@ class Ground:
     half: half the side of the rasters, m
     rects: (R, 7) float64 paved rectangles: x, y, cos yaw, sin yaw, half length, half width, DRIVEWAY or PARKING
     pads: levelled building plots: x, y, yaw, half length, half width, height
+    level_edges: the ground comes down to height 0 at the edges of the site, so that sites fit together
     """
 
     extent: float
@@ -34,6 +36,7 @@ class Ground:
     hills: np.ndarray
     rects: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
     pads: list[tuple[float, ...]] = field(default_factory=list)
+    level_edges: bool = False
 
     def road_offsets(self, xy: np.ndarray) -> np.ndarray:
         """(N, roads) signed distance of (N, 2) points to each centre line, m."""
@@ -46,7 +49,7 @@ class Ground:
             outside = rect_distance(xy, (x, y, np.cos(yaw), np.sin(yaw), half_length + 1.0, half_width + 1.0))
             weight = _fade(outside, 0.0, 4.0) * (1.0 - on_road)
             height = height + weight * (level - height)
-        return height
+        return height * self._inside(xy, EDGE)
 
     def _graded_height(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         height, on_road = self._hill_height(xy), np.zeros(len(xy))
@@ -72,7 +75,11 @@ class Ground:
 
     def _hill_height(self, xy: np.ndarray) -> np.ndarray:
         phase = xy @ self.hills[:, :2].T + self.hills[:, 2]
-        return np.sin(phase) @ self.hills[:, 3]
+        return np.sin(phase) @ self.hills[:, 3] * self._inside(xy, RIM)
+
+    def _inside(self, xy: np.ndarray, width: float) -> np.ndarray | float:
+        """(N,) 0 at level edges and beyond, 1 from `width` m inside on; 1 everywhere without level edges."""
+        return 1.0 - _fade(self.extent / 2 - np.abs(xy).max(1), 0.0, width) if self.level_edges else 1.0
 
     def _sample(self, layer: int, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bilinear samples of two neighbouring raster layers."""
@@ -89,7 +96,7 @@ class Ground:
         return out[0], out[1]
 
 
-def plan_ground(extent: float, rng: np.random.Generator) -> Ground:
+def plan_ground(extent: float, rng: np.random.Generator, level_edges: bool = False) -> Ground:
     """Hills, a curved road from west to east and a straight one that crosses it."""
     reach = 3.0 * extent
     wave = rng.uniform(0.07, 0.10) * extent
@@ -108,7 +115,7 @@ def plan_ground(extent: float, rng: np.random.Generator) -> Ground:
     grid = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
     layers = [layer for line in lines for layer in _road_coordinates(line, grid)]
     rasters = np.stack(layers).reshape(2 * len(lines), len(ticks), len(ticks)).astype(np.float32)
-    return Ground(extent, rasters, half, lines, hills)
+    return Ground(extent, rasters, half, lines, hills, level_edges=level_edges)
 
 
 def add_ground(builder: MeshBuilder, ground: Ground) -> None:

@@ -32,14 +32,14 @@ class World:
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """First hits of rays (N, 3): (N,) float32 range in units of the direction, inf = none; (N,) int64 triangle, -1 = none."""
-        hits = self.scene.cast_rays(_ray_tensor(origins, directions), nthreads=0)
+        hits = self.scene.cast_rays(ray_tensor(origins, directions), nthreads=0)
         triangles = hits["primitive_ids"].numpy()
         triangles = np.where(triangles == o3d.t.geometry.RaycastingScene.INVALID_ID, -1, triangles.astype(np.int64))
         return hits["t_hit"].numpy(), triangles
 
     def hidden(self, origins: np.ndarray, directions: np.ndarray, far: float = float("inf")) -> np.ndarray:
         """(N,) bool: rays (N, 3) that hit anything before `far` times their direction."""
-        return self.scene.test_occlusions(_ray_tensor(origins, directions), tnear=0.0, tfar=far).numpy()
+        return self.scene.test_occlusions(ray_tensor(origins, directions), tnear=0.0, tfar=far).numpy()
 
     def labels(self, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         """(N,) uint8 labels of surface points (N, 3) on triangles (N,); 0 = other objects, sky, anything outside the site."""
@@ -61,10 +61,10 @@ class World:
         return normals
 
 
-def build_world(settings: SynthesizeSettings) -> World:
-    """Build the site of `settings.seed` and `settings.extent`: ground, roads, buildings, plants, cars."""
+def build_world(settings: SynthesizeSettings, level_edges: bool = False) -> World:
+    """Build the site of `settings.seed` and `settings.extent`: ground, roads, buildings, plants, cars. level_edges: as in `Ground`."""
     streams = np.random.default_rng([settings.seed, 1]).spawn(6)
-    ground = plan_ground(settings.extent, streams[0])
+    ground = plan_ground(settings.extent, streams[0], level_edges)
     buildings = place_buildings(ground, streams[1])
     builder = MeshBuilder()
     add_ground(builder, ground)
@@ -79,7 +79,8 @@ def build_world(settings: SynthesizeSettings) -> World:
     return World(settings.seed, ground, buildings, corners, floats, ints, scene)
 
 
-def _ray_tensor(origins: np.ndarray, directions: np.ndarray) -> o3d.core.Tensor:
+def ray_tensor(origins: np.ndarray, directions: np.ndarray) -> o3d.core.Tensor:
+    """(N, 6) float32 rays from origins (N, 3) along directions (N, 3), as Open3D takes them."""
     table = np.empty((len(directions), 6), np.float32)
     table[:, :3], table[:, 3:] = origins, directions
     return o3d.core.Tensor(table)

@@ -1,0 +1,143 @@
+"""A synthetic city: sites of the generator side by side, made one after the other, so that no cloud of more than one site is ever in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+from tqdm import tqdm
+
+from sc3d.geometry.cameras import View, pixel_centres, rays
+from sc3d.io import write_image, write_json
+from sc3d.scene import Scene
+from sc3d.settings import BenchmarkCity
+from sc3d.synthetic.city_files import CloudFile, MeshFile, open_cloud, open_mesh, write_cameras
+from sc3d.synthetic.city_flight import fly_over
+from sc3d.synthetic.cloud import truth_cloud
+from sc3d.synthetic.generate import CLASSES
+from sc3d.synthetic.masks import noisy_mask
+from sc3d.synthetic.mesh import OTHER
+from sc3d.synthetic.settings import SynthesizeSettings
+from sc3d.synthetic.shading import surface_labels
+from sc3d.synthetic.world import World, build_world, ray_tensor
+
+OFFSET = np.array([500_000.0, 5_500_000.0, 0.0])  # of the city's middle in the world, m: coordinates of the size of UTM's
+EXTENT = 120.0  # side of a site, m; a multiple of 15 m, so that cells of the ground end at its edges
+RAYS = 1 << 19  # cast at a time
+
+
+@dataclass(frozen=True)
+class Site:
+    """One site. number: from 0, row by row from the south-west; middle: (3,) float64 in the city's frame, whose origin is the city's middle."""
+
+    number: int
+    middle: np.ndarray
+    world: World
+
+    @property
+    def own(self) -> np.ndarray:
+        """(K,) triangles of the world that reach into the site; the others are its surroundings, which a city replaces by other sites."""
+        low, high = self.world.corners[:, :, :2].min(1), self.world.corners[:, :, :2].max(1)
+        return np.flatnonzero(((low < EXTENT / 2) & (high > -EXTENT / 2)).all(1))
+
+
+@dataclass
+class City:
+    """What rays need of all sites: `scene` in the city's frame, whose geometry ids are the numbers of `sites`."""
+
+    scene: o3d.t.geometry.RaycastingScene
+    sites: list[SiteLabels]
+
+    def add(self, site: Site) -> None:
+        """Append the next site."""
+        own = site.own
+        corners = (site.world.corners[own] + site.middle).astype(np.float32).reshape(-1, 3)
+        self.scene.add_triangles(o3d.core.Tensor(corners), o3d.core.Tensor(np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)))
+        ground = site.world.ground
+        self.sites.append(SiteLabels(site.middle, site.world.ints[own], ground.half, ground.rasters, ground.rects))
+
+    def label(self, view: View) -> np.ndarray:
+        """(H, W) uint8 true label of the pixels of a view in the city's frame; 0 = other objects, nothing there."""
+        band = max(1, RAYS // view.width)
+        parts = [self._label_rows(view, row, min(row + band, view.height)) for row in range(0, view.height, band)]
+        return np.concatenate(parts).reshape(view.height, view.width)
+
+    def _label_rows(self, view: View, first: int, last: int) -> np.ndarray:
+        directions, _ = rays(view, pixel_centres(view.width, last - first) + [0.0, first])
+        hits = self.scene.cast_rays(ray_tensor(np.broadcast_to(view.centre, directions.shape), directions))
+        distance, triangles, numbers = (hits[name].numpy() for name in ("t_hit", "primitive_ids", "geometry_ids"))
+        label = np.full(len(directions), OTHER, np.uint8)
+        for number in np.unique(numbers[np.isfinite(distance)]):
+            rows = np.flatnonzero(numbers == number)
+            points = view.centre + directions[rows] * distance[rows, None]
+            label[rows] = self.sites[number].labels(points, triangles[rows].astype(np.int64))
+        return label
+
+
+@dataclass(frozen=True)
+class SiteLabels:
+    """What tells the label of a place on a site: (3,) middle; (K, 3) material, label and object of its triangles; the plan of its ground."""
+
+    middle: np.ndarray
+    ints: np.ndarray
+    half: float
+    rasters: np.ndarray
+    rects: np.ndarray
+
+    def labels(self, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+        """(N,) uint8 of surface points (N, 3), city's frame, on triangles (N,) of the site."""
+        local = (points - self.middle).astype(np.float32)
+        return surface_labels(local, triangles, self.ints, self.half, EXTENT / 2, self.rasters, self.rects)
+
+
+def make_sites(settings: BenchmarkCity) -> Iterator[Site]:
+    """The sites, each built when it is asked for; level at their edges, so that they meet."""
+    columns, rows = settings.sites
+    for number in range(columns * rows):
+        middle = np.array([(number % columns - (columns - 1) / 2) * EXTENT, (number // columns - (rows - 1) / 2) * EXTENT, 0.0])
+        yield Site(number, middle, build_world(SynthesizeSettings(seed=1000 * settings.seed + number, extent=EXTENT), level_edges=True))
+
+
+def synthesize_city(settings: BenchmarkCity) -> dict[str, object]:
+    """Write cloud.ply (a link to truth.ply, which has the true labels), mesh.ply, sparse/0, truth/, masks/, confidence/ and classes.json.
+
+    returns: points, views, triangles, mask_accuracy (over pixels with truth != 0)
+    """
+    scene, city = Scene(settings.scene), City(o3d.t.geometry.RaycastingScene(), [])
+    columns, rows = settings.sites
+    with ExitStack() as files:
+        cloud = files.enter_context(open_cloud(scene.path / "truth.ply", columns * rows * settings.points_per_site))
+        mesh = files.enter_context(open_mesh(scene.mesh))
+        for site in tqdm(make_sites(settings), total=columns * rows, desc="building", unit="site", disable=None):
+            _write_site(site, settings, cloud, mesh)
+            city.add(site)
+    views = fly_over((columns * EXTENT, rows * EXTENT), settings)
+    write_cameras(scene.sparse, [view.shifted(-OFFSET) for view in views])
+    accuracy = _write_masks(scene, city, views, settings.seed)
+    scene.cloud.symlink_to("truth.ply")
+    write_json(scene.classes, CLASSES)
+    return {"points": cloud.rows, "views": len(views), "triangles": mesh.triangles, "mask_accuracy": accuracy}
+
+
+def _write_site(site: Site, settings: BenchmarkCity, cloud: CloudFile, mesh: MeshFile) -> None:
+    made = truth_cloud(site.world, settings.points_per_site, np.random.default_rng([settings.seed, 5, site.number]))
+    names = ("normals", "colors", "label")
+    cloud.append(made.point.positions.numpy() + site.middle + OFFSET, **{name: made.point[name].numpy() for name in names})
+    mesh.append(site.world.corners[site.own].astype(np.float64) + site.middle + OFFSET)
+
+
+def _write_masks(scene: Scene, city: City, views: list[View], seed: int) -> float:
+    """True and noisy masks of all views; returns the share of the labelled pixels that the noisy ones have right."""
+    right = labelled = 0
+    for number, view in enumerate(tqdm(views, desc="masks", unit="view", disable=None)):
+        truth = city.label(view)
+        mask, confidence = noisy_mask(truth, SynthesizeSettings.mask_noise, np.random.default_rng([seed, 4, number]))
+        right += int(((mask == truth) & (truth != OTHER)).sum())
+        labelled += int((truth != OTHER).sum())
+        for folder, image in ((scene.truth, truth), (scene.masks, mask), (scene.confidence, confidence)):
+            write_image(folder / f"{Path(view.name).stem}.png", image)
+    return right / max(labelled, 1)
