@@ -16,8 +16,10 @@ from sc3d.errors import InputError
 from sc3d.files import atomic_path
 from sc3d.formats import FARTHEST
 from sc3d.formats.images import check_end, open_image
+from sc3d.formats.pcd import check_pcd
 from sc3d.formats.ply import check_ply
 
+CHECKS = {".ply": check_ply, ".pcd": check_pcd}
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
 
@@ -160,12 +162,13 @@ def _read_geometry(path: Path, reader: str, suffixes: set[str]):  # noqa: ANN202
         raise InputError(f"{path} is missing")
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{path}: {', '.join(sorted(suffixes))} can be read")
-    if path.suffix.lower() == ".ply":
-        check_ply(path)
+    if path.suffix.lower() in CHECKS:
+        CHECKS[path.suffix.lower()](path)
     told = io.StringIO()
     try:
         with redirect_stdout(told):
             geometry = getattr(o3d.t.io, reader)(str(path))
+            names = list(geometry.point) if hasattr(geometry, "point") else list(geometry.vertex)  # noqa: F841 - fails for names that are no text
     except (RuntimeError, ValueError, IndexError) as error:
         told.write(f"failed: {error}")
     failure = re.search(r"\b(?:failed|unable to)\b[^\n\x1b]*", told.getvalue().replace(str(path), "the file"), re.IGNORECASE)
