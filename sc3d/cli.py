@@ -28,7 +28,8 @@ def main(arguments: list[str] | None = None) -> None:
     if name not in STAGES and name not in COMMANDS:
         sys.exit(_fail(f"unknown command {name!r}: one of {', '.join(sorted(STAGES | COMMANDS))}"))
     command = parse(name, arguments[1:])
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    logging.basicConfig(format="%(message)s", stream=sys.stderr)
+    logging.getLogger("sc3d").setLevel(logging.INFO)  # of other packages, warnings only
     logging.captureWarnings(True)
     try:
         _dispatch(name, command)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from hostile_files import LITTLE, Reader, exif, labelled_ply, mesh_ply, picture, splats_ply, tracked_model
+from PIL import Image
 from scenes import CLASSES
 
 HERE = Path(__file__).parent
@@ -175,15 +176,65 @@ def _read_weights(folder: Path) -> object:
 
 
 def _read_mask_files(folder: Path) -> object:
-    from sc3d.classes import parse_classes
     from sc3d.segmentation.imports.source import MaskFiles, read_masks
 
-    names = ["building", "house", "wall", "road", "car", "tree", "grass", "water"]
-    table = parse_classes([{"id": 1 + row, "name": name, "color": [row, 0, 0]} for row, name in enumerate(names)], "test")
+    table = _many_classes()
     file = next(path for path in sorted(folder.iterdir()) if path.suffix in (".json", ".xml") and path.name != "mapping.json")
     mapping = folder / "mapping.json"
     masks = read_masks(MaskFiles(file, "auto", mapping if mapping.exists() else None), {f"DJI_000{i}.jpg": (64, 48) for i in (1, 2)}, table)
     return [mask.read() for mask in masks.values()]
+
+
+def _build_colored(folder: Path) -> None:
+    colors = np.zeros((48, 64, 3), np.uint8)
+    colors[:20], colors[30:, :30] = [4, 0, 0], [1, 0, 0]  # of `_read_mask_files`
+    folder.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(colors).save(folder / "DJI_0001.png")
+    palette = Image.fromarray(colors[::2, ::2, 0])
+    palette.putpalette([value for index in range(256) for value in (index, 255 - index, 9)])
+    palette.save(folder / "DJI_0002.png")
+    Image.fromarray(colors[..., 0]).save(folder / "DJI_0003.png")
+
+
+def _read_colored(folder: Path) -> object:
+    """A folder of colours, then one of ids, as `segment --format` takes them."""
+    from sc3d.segmentation.imports.pngs import is_colored
+    from sc3d.segmentation.imports.source import MaskFiles, read_masks
+
+    found, table = [], _many_classes()
+    for number in range(1, 4):
+        file = folder / f"DJI_000{number}.png"
+        kind = "color" if is_colored(file) else "index"
+        ids = folder.parent / f"{folder.name}-{kind}"
+        ids.mkdir(exist_ok=True)
+        shutil.copyfile(file, ids / "DJI_0001.png")
+        found += [mask.read() for mask in read_masks(MaskFiles(ids, kind), {"DJI_0001.jpg": (64, 48)}, table).values()]
+    return found
+
+
+def _build_strokes(folder: Path) -> None:
+    shapes = [{"label": "road", "shape_type": kind, "points": [[3.5 + row, 4], [20, 9.25], [30, 28], [9, 20]][:count], "width": width}
+              for row, (kind, count, width) in enumerate([("linestrip", 3, 5), ("polygon", 4, 0), ("point", 1, 9), ("rectangle", 2, 0), ("circle", 2, 0)])]
+    shapes.append({"label": "_background_", "shape_type": "line", "points": [[1, 1], [38, 29]]})
+    labelme = {"version": "5.5.0", "imagePath": "a.jpg", "imageWidth": 40, "imageHeight": 30, "imageData": None, "shapes": shapes}
+    colors = np.zeros((30, 40, 3), np.uint8)
+    colors[:9] = [4, 0, 0]
+    _write(folder, a__json=json.dumps(labelme))
+    Image.fromarray(colors).save(folder / "b.png")
+    _write(folder / "photos", a__jpg=picture("JPEG"), b__jpg=picture("JPEG"))
+
+
+def _read_strokes(folder: Path) -> object:
+    from sc3d.segmentation.stroke_files import read_strokes
+
+    return [strokes.paint(20, 15) for strokes in read_strokes(folder, folder / "photos", _many_classes())]
+
+
+def _many_classes():  # noqa: ANN202
+    from sc3d.classes import parse_classes
+
+    names = ["building", "house", "wall", "road", "car", "tree", "grass", "water"]
+    return parse_classes([{"id": 1 + row, "name": name, "color": [1 + row, 0, 0]} for row, name in enumerate(names)], "test")
 
 
 def _copy_mask_file(name: str):  # noqa: ANN202
@@ -302,6 +353,8 @@ READERS: dict[str, Reader] = {
     "coco": Reader(_copy_mask_file("coco.json"), _read_mask_files, ("coco.json", "mapping.json")),
     "coco-compressed": Reader(_copy_mask_file("coco_compressed.json"), _read_mask_files, ("coco_compressed.json",)),
     "labelme": Reader(_copy_mask_file("labelme/DJI_0001.json"), _read_mask_files, ("DJI_0001.json",)),
+    "masks-colour": Reader(_build_colored, _read_colored, tuple(f"DJI_000{number}.png" for number in range(1, 4))),
+    "strokes": Reader(_build_strokes, _read_strokes, ("a.json", "b.png")),
     "cvat": Reader(_copy_mask_file("cvat.xml"), _read_mask_files, ("cvat.xml",)),
     **{kind: Reader(_build_project(kind), _read_project, files) for kind, files in PROJECT_FILES.items()},
     "las": Reader(_build_las("las"), _read_geometries, ("cloud.las",)),

@@ -13,6 +13,7 @@ from sc3d.formats.las import check_las
 from sc3d.io import read_cloud, read_mesh
 
 if TYPE_CHECKING:
+    import laspy
     import open3d as o3d
 
 CLOUDS = {".ply", ".las", ".laz", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts", ".txt", ".csv", ".asc"}
@@ -79,10 +80,14 @@ def _read_las(path: Path) -> Geometry:
     check_las(path)
     try:
         file = laspy.read(path, laz_backend=(laspy.LazBackend.LazrsParallel, laspy.LazBackend.Lazrs))  # not laszip, which ends the process for broken files
-    except KeyboardInterrupt:
+        return _las_geometry(file, path)
+    except (KeyboardInterrupt, InputError):
         raise
     except BaseException as error:  # laspy raises many kinds for broken files; a panic of lazrs is no Exception
         raise InputError(f"cannot read {path}: {str(error).splitlines()[0] if str(error) else type(error).__name__}") from None
+
+
+def _las_geometry(file: laspy.LasData, path: Path) -> Geometry:
     names = set(file.point_format.dimension_names)
     attributes = {"classification": np.asarray(file.classification, np.uint8)}
     attributes |= {name: np.asarray(file[name]) for name in LAS_EXTRAS if name in names and np.any(file[name])}
