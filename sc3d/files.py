@@ -95,6 +95,16 @@ def require_room(path: Path, num_bytes: int = 0) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from None
 
 
+@contextmanager
+def telling_of_full_disk(path: Path) -> Iterator[None]:
+    """Errors in the block become `OSError` (ENOSPC) if there is no room beside `path`, in whatever words a library puts them."""
+    try:
+        yield
+    except Exception:
+        require_room(path)
+        raise
+
+
 def require_inside(folder: Path, path: Path) -> None:
     """InputError if writing `path`, which lies in `folder` by name, would lead out of it by a link."""
     if folder not in path.parents:

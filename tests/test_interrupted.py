@@ -17,7 +17,7 @@ from scenes import write_bare_scene
 
 from sc3d import files
 from sc3d.cli import main
-from sc3d.files import atomic_path, remove_leftovers, temporary_name
+from sc3d.files import atomic_path, remove_leftovers, telling_of_full_disk, temporary_name
 
 OUTPUTS = ("seeds.ply", "votes.npz", "labelled.ply")
 LABELS = (["label"], ["propagate", "--method", "knn"])
@@ -184,6 +184,16 @@ def test_full_disk_is_said_and_earlier_outputs_stay(finished, small_disk, capsys
         assert {name: after.get(name) for name in before} == before and not hidden(scene)
     else:
         assert free
+
+
+def test_full_disk_in_other_words(small_disk):
+    """pycolmap says "No registered database factory succeeded"."""
+    disk, fill = small_disk
+    with pytest.raises(RuntimeError, match="factory"), telling_of_full_disk(disk / "database.db"):
+        raise RuntimeError("No registered database factory succeeded.")
+    fill(0)
+    with pytest.raises(OSError, match="No space left"), telling_of_full_disk(disk / "database.db"):
+        raise RuntimeError("No registered database factory succeeded.")
 
 
 # ---- atomic_path

@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 import random
+import re
 import resource
 import shutil
 import signal
@@ -171,16 +172,10 @@ def guided(name: str, rest: list[str]) -> None:
     """libFuzzer chooses a target by the first byte and the content by the rest; its arguments, such as -runs=10000, are passed on."""
     import atheris
 
-    with atheris.instrument_imports(include=["sc3d"]):
-        import readers  # noqa: F401 - and with it the code under test, as far as it is loaded at once
-        import sc3d.formats.colmap
-        import sc3d.formats.ply
-        import sc3d.imports.clouds
-        import sc3d.imports.project
-        import sc3d.io
-        import sc3d.segmentation.imports.source  # noqa: F401
-    fixture = Fixture(name)
-    fixture.reader.read(fixture.folder)
+    compiled = [".".join(file.relative_to(ROOT).with_suffix("").parts) for file in (ROOT / "sc3d").rglob("*.py") if re.search("@numba|@intrinsic", file.read_text())]
+    with atheris.instrument_imports(include=["sc3d"], exclude=compiled):  # numba cannot compile what atheris has changed
+        fixture = Fixture(name)
+        fixture.reader.read(fixture.folder)  # loads the code under test
     corpus = fixture.folder.parent / "corpus"
     corpus.mkdir()
     for row, (target, content) in enumerate(fixture.contents.items()):
@@ -194,7 +189,7 @@ def guided(name: str, rest: list[str]) -> None:
         if result == "foreign":
             raise RuntimeError(told)
 
-    atheris.Setup([sys.argv[0], "-rss_limit_mb=3000", "-timeout=20", "-max_len=20000", *rest, str(corpus)], once)
+    atheris.Setup([sys.argv[0], "-rss_limit_mb=3000", "-timeout=20", "-max_len=20000", "-len_control=0", "-reduce_inputs=0", *rest, str(corpus)], once)
     atheris.Fuzz()
 
 
