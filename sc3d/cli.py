@@ -18,7 +18,7 @@ from sc3d.errors import InputError, Sc3dError
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run one command and exit: 0 done, 1 failed, 2 bad input."""
+    """Run one command and exit: 0 done, 1 failed, 2 bad input, 130 interrupted by Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `sc3d ... | head` ends quietly
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -28,7 +28,8 @@ def main(arguments: list[str] | None = None) -> None:
     if name not in STAGES and name not in COMMANDS:
         sys.exit(_fail(f"unknown command {name!r}: one of {', '.join(sorted(STAGES | COMMANDS))}"))
     command = parse(name, arguments[1:])
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    logging.basicConfig(format="%(message)s", stream=sys.stderr)
+    logging.getLogger("sc3d").setLevel(logging.INFO)  # of other packages, warnings only
     logging.captureWarnings(True)
     try:
         _dispatch(name, command)
@@ -39,7 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
     except (Sc3dError, OSError, MemoryError) as error:
         sys.exit(_fail(f"{error or type(error).__name__}", status=1))
     except KeyboardInterrupt:
-        sys.exit(_fail("interrupted; finished work is kept, run the same command again to go on", status=1))
+        sys.exit(_fail("interrupted; finished work is kept, run the same command again to go on", status=128 + signal.SIGINT))
 
 
 def usage() -> str:

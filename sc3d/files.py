@@ -16,7 +16,9 @@ from sc3d.errors import InputError
 
 HOST = re.sub(r"\W+", "_", platform.node(), flags=re.ASCII)[:32] or "host"
 LEFTOVER = re.compile(r"\..*\.(?P<host>\w+)-(?P<process>\d+)\.tmp")
+STARTED = time.time()
 OLD = 24 * 3600  # s: temporary files of other machines are dead after that
+MARGIN = 60  # s: what is this much older than this process was made by another one of the same number
 ROOM = 1 << 16  # bytes; with less left on the disk, what was written may not be whole, which not every library notices
 
 
@@ -35,6 +37,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     except (PermissionError, NotADirectoryError, FileExistsError):
         raise InputError(f"cannot write to {path.parent}: check its permissions or choose another folder") from None
     try:
+        remove(temporary)  # of a killed process that had the same number, as all have in containers
         try:
             yield temporary
             if not os.path.lexists(temporary):
@@ -92,6 +95,16 @@ def require_room(path: Path, num_bytes: int = 0) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from None
 
 
+@contextmanager
+def telling_of_full_disk(path: Path) -> Iterator[None]:
+    """Errors in the block become `OSError` (ENOSPC) if there is no room beside `path`, in whatever words a library puts them."""
+    try:
+        yield
+    except Exception:
+        require_room(path)
+        raise
+
+
 def require_inside(folder: Path, path: Path) -> None:
     """InputError if writing `path`, which lies in `folder` by name, would lead out of it by a link."""
     if folder not in path.parents:
@@ -107,7 +120,8 @@ def _is_dead(host: str, process: int, entry: Path) -> bool:
     if host == HOST and process != os.getpid() and not _runs(process):
         return True
     with suppress(OSError):
-        return process != os.getpid() and time.time() - entry.lstat().st_mtime > OLD
+        changed = entry.lstat().st_mtime
+        return changed < STARTED - OLD if process != os.getpid() else changed < STARTED - MARGIN
     return False
 
 

@@ -16,8 +16,10 @@ from sc3d.errors import InputError
 from sc3d.files import atomic_path
 from sc3d.formats import FARTHEST
 from sc3d.formats.images import check_end, open_image
+from sc3d.formats.pcd import check_pcd
 from sc3d.formats.ply import check_ply, read_header, read_positions
 
+CHECKS = {".ply": check_ply, ".pcd": check_pcd}
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
 
@@ -141,13 +143,8 @@ def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported 
 
 
 def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
-    """Read a triangle mesh; InputError if it is damaged, empty or has vertices that are not finite or too far away, or triangles of other vertices.
-
-    By Open3D's older reader: the newer one rounds vertices to float32, which is half a metre at UTM northings.
-    """
-    import open3d as o3d
-
-    mesh = o3d.t.geometry.TriangleMesh.from_legacy(_read_geometry(path, "read_triangle_mesh", {".ply"}), vertex_dtype=o3d.core.float64)
+    """Read a triangle mesh; InputError if it is damaged, empty or has vertices that are not finite or too far away, or triangles of other vertices."""
+    mesh = _read_geometry(path, "read_triangle_mesh", {".ply"})
     if "positions" not in mesh.vertex or "indices" not in mesh.triangle or not len(mesh.triangle.indices):
         raise InputError(f"{path} holds no triangles")
     exact = read_positions(path, read_header(path))
@@ -162,7 +159,7 @@ def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
     return mesh
 
 
-def _read_geometry(path: Path, reader: str, suffixes: set[str]):  # noqa: ANN202 - a tensor PointCloud, or an older TriangleMesh
+def _read_geometry(path: Path, reader: str, suffixes: set[str]):  # noqa: ANN202 - what Open3D's reader returns
     """Open3D tells of files that it could not read to the end on Python's standard output only."""
     import open3d as o3d
 
@@ -170,12 +167,13 @@ def _read_geometry(path: Path, reader: str, suffixes: set[str]):  # noqa: ANN202
         raise InputError(f"{path} is missing")
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{path}: {', '.join(sorted(suffixes))} can be read")
-    if path.suffix.lower() == ".ply":
-        check_ply(path)
+    if path.suffix.lower() in CHECKS:
+        CHECKS[path.suffix.lower()](path)
     told = io.StringIO()
     try:
         with redirect_stdout(told):
-            geometry = getattr(o3d.io if reader == "read_triangle_mesh" else o3d.t.io, reader)(str(path))
+            geometry = getattr(o3d.t.io, reader)(str(path))
+            names = list(geometry.point) if hasattr(geometry, "point") else list(geometry.vertex)  # noqa: F841 - fails for names that are no text
     except (RuntimeError, ValueError, IndexError) as error:
         told.write(f"failed: {error}")
     failure = re.search(r"\b(?:failed|unable to)\b[^\n\x1b]*", told.getvalue().replace(str(path), "the file"), re.IGNORECASE)

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from sc3d.georeferencing.alignment import Similarity, main_plane
 from sc3d.georeferencing.control_points import ControlPoints, align_to_control_points, transform
 from sc3d.errors import InputError, Sc3dError
-from sc3d.files import require_room, temporary_name
+from sc3d.files import require_room, telling_of_full_disk, temporary_name
 from sc3d.georeferencing.focal import anchor_focal, tells_focal
 from sc3d.georeferencing.georeference import Georeference, from_origin
 from sc3d.georeferencing.gps import Flight, place, read_flight, residuals
@@ -56,10 +56,11 @@ def reconstruct(images: Path, names: list[str], sparse: Path, settings: Reconstr
     with tempfile.TemporaryDirectory(prefix=temporary_name("work"), dir=sparse.parent) as folder:
         work = Path(folder)
         database = work / "database.db"
-        _extract(database, images, names, settings)
-        _write_priors(database, flight)
-        _match(database, len(names), settings)
-        model = _map(database, images, work, settings, len(names), flight is not None)
+        with telling_of_full_disk(database):
+            _extract(database, images, names, settings)
+            _write_priors(database, flight)
+            _match(database, len(names), settings)
+            model = _map(database, images, work, settings, len(names), flight is not None)
         free = settings.focal == "refine" or (settings.focal == "auto" and tells_focal(model))
         focal = {} if free else anchor_focal(model, images, flight)
         georeference = _georeference(model, flight, control_points, settings)

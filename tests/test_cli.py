@@ -63,7 +63,7 @@ def test_usage_and_unknown_command(capsys):
 
 def test_scripts_in_tools_are_the_commands():
     tools = Path(__file__).parent.parent / "tools"
-    assert {file.stem for file in tools.glob("*.py")} == {*STAGES, *COMMANDS}
+    assert {file.stem for file in tools.glob("*.py")} - {"fuzz_readers"} == {*STAGES, *COMMANDS}
     result = subprocess.run([sys.executable, str(tools / "label.py"), "--help"], capture_output=True, text=True, env=os.environ)
     assert "usage: sc3d label" in result.stdout
 

@@ -1,12 +1,17 @@
 """TSDF fusion of exact depth maps: sphere, deep scene, off-centre principal point."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import open3d as o3d
 import pytest
 
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.geometry.raycast import Surface, first_surface
-from sc3d.geometry.surface import DepthFusion, drop_small_parts, near_mesh, pixel_squares
+from sc3d.geometry.surface import DepthFusion, cloud_in_order, drop_small_parts, mesh_in_order, near_mesh, pixel_squares
 
 VOXEL = 0.05
 
@@ -108,3 +113,70 @@ def test_pixel_squares_cover_exactly_the_wanted_pixels_at_their_depth():
     assert (facing > 0).all()
     empty, none = pixel_squares(view, depth, np.zeros((60, 80, 3), np.uint8), np.zeros((60, 80), bool))
     assert len(empty.triangle.indices) == 0 and len(none.point.positions) == 0
+
+
+def test_order_is_that_of_positions_and_says_the_same():
+    """A mesh whose vertices and triangles are shuffled comes out as the same bytes, with the same corners, sense and colours."""
+    rng = np.random.default_rng(3)
+    mesh = o3d.t.geometry.TriangleMesh.create_sphere(1.0, 12)
+    vertices, triangles = mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy()
+    colors = rng.random(vertices.shape).astype(np.float32)
+    found = []
+    for _ in range(2):
+        order = rng.permutation(len(vertices))
+        turned = np.stack([np.roll(row, rng.integers(3)) for row in np.argsort(order)[rng.permutation(triangles)]])
+        shuffled = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(vertices[order]), o3d.core.Tensor(turned))
+        shuffled.vertex.colors = o3d.core.Tensor(colors[order])
+        found.append(mesh_in_order(shuffled))
+    one, other = found
+    assert all((one.vertex[name].numpy() == other.vertex[name].numpy()).all() for name in ("positions", "colors"))
+    assert (one.triangle.indices.numpy() == other.triangle.indices.numpy()).all()
+    keys = one.vertex.positions.numpy()[:, ::-1].tolist()
+    assert keys == sorted(keys)
+    described = np.concatenate([one.vertex.positions.numpy(), one.vertex.colors.numpy()], axis=1)[one.triangle.indices.numpy()]
+    before = np.concatenate([vertices, colors], axis=1)[triangles]
+    assert _corner_set(described) == _corner_set(before)
+
+
+def _corner_set(corners: np.ndarray) -> list:
+    """Triangles without regard to their order or first corner, but to their sense."""
+    return sorted(min(tuple(map(tuple, np.roll(triangle, turn, axis=0))) for turn in range(3)) for triangle in corners)
+
+
+def test_cloud_order_keeps_every_point_with_its_values():
+    rng = np.random.default_rng(4)
+    points, order = rng.integers(0, 4, (60, 3)).astype(np.float32) + rng.random((60, 3)).astype(np.float32), rng.permutation(60)
+    clouds = []
+    for rows in (np.arange(60), order):
+        cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points[rows]))
+        cloud.point.colors = o3d.core.Tensor(np.arange(60, dtype=np.uint8)[rows, None])
+        clouds.append(cloud_in_order(cloud))
+    for name in ("positions", "colors"):
+        np.testing.assert_array_equal(clouds[0].point[name].numpy(), clouds[1].point[name].numpy())
+    np.testing.assert_array_equal(clouds[0].point.positions.numpy(), points[clouds[0].point.colors.numpy()[:, 0]])
+
+
+FUSE = """
+import hashlib, os, sys
+os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(sys.argv[1])])
+import numpy as np
+from sc3d.geometry.cameras import look_at, pinhole_view
+from sc3d.geometry.surface import DepthFusion
+fusion, rng = DepthFusion(0.1, 4000), np.random.default_rng(0)
+for x in range(4):
+    view = pinhole_view("a", (160, 120), (150, 150, 80, 60), look_at(np.array([x, 0.0, 9.0]), np.array([0.0, 0, 0])))
+    fusion.integrate(view, (9 + rng.random((120, 160)) * 0.3).astype(np.float32), rng.integers(0, 255, (120, 160, 3), np.uint8), 20.0)
+mesh, cloud, state = fusion.mesh(), fusion.cloud(), hashlib.md5()
+for values in (mesh.vertex.positions, mesh.vertex.colors, mesh.triangle.indices, cloud.point.positions, cloud.point.colors, cloud.point.normals):
+    assert len(values) > 5000
+    state.update(np.ascontiguousarray(values.numpy()).tobytes())
+print(state.hexdigest())
+"""
+
+
+def test_one_core_and_all_cores_give_the_same_bytes():
+    def digest(cores: int) -> str:
+        environment = os.environ | {"OMP_NUM_THREADS": str(cores), "PYTHONPATH": str(Path(__file__).parent.parent)}
+        return subprocess.run([sys.executable, "-c", FUSE, str(cores)], env=environment, capture_output=True, text=True, check=True).stdout
+
+    assert digest(1) == digest(2) == digest(2)

@@ -22,8 +22,8 @@ from sc3d.formats.images import MAX_PIXELS, MAX_SIDE
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")  # rigs and frames only in newer models
 LARGEST = 1 << 62  # count of a list: bounded by the size of the file alone
-POINT = np.array([[0, 43, 0, 0], [8, 8, LARGEST, 0]])  # id, position, colour, error; track of photo and keypoint
-FRAME = np.array([[0, 64, 0, 0], [4, 16, LARGEST, 0]])  # id, rig, rotation, translation; sensor and photo
+POINT = np.array([[0, 43, 0, 0, 0], [8, 8, 0, LARGEST, 0]])  # id, position, colour, error; track of photo and keypoint
+FRAME = np.array([[0, 64, 0, 0, 0], [4, 16, 0, LARGEST, 0]])  # id, rig, rotation, translation; sensor and photo
 MAX_NAME = 4096  # bytes of a photo name
 NOT_RIGID = 0.01  # largest error of R R^T: text models are rounded
 

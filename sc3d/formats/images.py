@@ -34,8 +34,10 @@ def open_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
         with pillow.open(path, formats=FORMATS) as image:
             _check_size(path, image.size, what)
             yield image
-    except (InputError, MemoryError):
+    except InputError:
         raise
+    except MemoryError:
+        raise InputError(f"the {what} {path} does not fit into the memory: scale it down") from None
     except pillow.DecompressionBombError:
         raise InputError(f"the {what} {path} has more than {MAX_PIXELS // 10**6} megapixels, which is refused: scale it down") from None
     except Exception:  # Pillow raises OSError, ValueError, SyntaxError, struct.error, KeyError, TypeError and more for damaged files

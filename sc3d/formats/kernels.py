@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 # what a walk may end with, instead of a position
-CUT_OFF, TOO_LONG, OUT_OF_RANGE = -1, -2, -3
+CUT_OFF, WRONG_LENGTH, OUT_OF_RANGE = -1, -2, -3
 
 
 @numba.njit(cache=True)
@@ -14,8 +14,8 @@ def walk_bytes(data: np.ndarray, start: int, count: int, fields: np.ndarray, big
     """Skip records in binary data.
 
     data: (B,) uint8; start: position of the first record; count: number of records
-    fields: (F, 4) int64 per field of a record: bytes of the count in front of a list, 0 for no list; bytes of the field, or of an item of the list;
-        largest count that is allowed; items must be smaller than this, 0 = not looked at
+    fields: (F, 5) int64 per field of a record: bytes of the count in front of a list, 0 for no list; bytes of the field, or of an item of the list;
+        smallest and largest count that are allowed; items must be smaller than this, 0 = not looked at
     returns: position behind the last record, or a negative code; number of whole records
     """
     position, size = start, len(data)
@@ -27,14 +27,14 @@ def walk_bytes(data: np.ndarray, start: int, count: int, fields: np.ndarray, big
                     return CUT_OFF, row
                 items = _whole_number(data, position, fields[field, 0], big_endian)
                 position += fields[field, 0]
-                if items < 0 or items > fields[field, 2]:
-                    return TOO_LONG, row
+                if items < fields[field, 2] or items > fields[field, 3]:
+                    return WRONG_LENGTH, row
             if items > (size - position) // width:
                 return CUT_OFF, row
-            if fields[field, 3] > 0:
+            if fields[field, 4] > 0:
                 for item in range(items):
                     value = _whole_number(data, position + item * width, width, big_endian)
-                    if value < 0 or value >= fields[field, 3]:
+                    if value < 0 or value >= fields[field, 4]:
                         return OUT_OF_RANGE, row
             position += items * width
     return position, count
@@ -52,15 +52,15 @@ def walk_numbers(data: np.ndarray, start: int, count: int, fields: np.ndarray) -
                     return CUT_OFF, row
                 stated = data[position]
                 position += 1
-                if not (0 <= stated <= fields[field, 2]) or stated != np.floor(stated):
-                    return TOO_LONG, row
+                if not (fields[field, 2] <= stated <= fields[field, 3]) or stated != np.floor(stated):
+                    return WRONG_LENGTH, row
                 items = int(stated)
             if items > size - position:
                 return CUT_OFF, row
-            if fields[field, 3] > 0:
+            if fields[field, 4] > 0:
                 for item in range(items):
                     value = data[position + item]
-                    if not (0 <= value < fields[field, 3]) or value != np.floor(value):
+                    if not (0 <= value < fields[field, 4]) or value != np.floor(value):
                         return OUT_OF_RANGE, row
             position += items
     return position, count

@@ -117,6 +117,8 @@ def _count(word: str) -> int:
 
 
 def _property(words: list[str]) -> Property:
+    if "\ufffd" in words[-1]:  # no text
+        raise ValueError(words[-1])
     if words[1] != "list":
         return Property(words[2], TYPES[words[1]])
     count = TYPES[words[2]]
@@ -211,21 +213,21 @@ def _skip(path: Path, header: Header, element: Element, data: np.ndarray, start:
     fields = np.array([_field(entry, element.name, vertex.rows if vertex else 0) for entry in element.properties], np.int64)
     found = kernels.walk_numbers(data, start, element.rows, fields) if text else kernels.walk_bytes(data, start, element.rows, fields, header.order == ">")
     if found[0] < 0:
-        what = {kernels.CUT_OFF: "the file is truncated", kernels.TOO_LONG: f"a list has more than {MAX_CORNERS} entries, or a negative number of them",
-                kernels.OUT_OF_RANGE: "it names a vertex that does not exist"}[found[0]]
+        what = {kernels.CUT_OFF: "the file is truncated", kernels.OUT_OF_RANGE: "it names a vertex that does not exist",
+                kernels.WRONG_LENGTH: f"a list has more than {MAX_CORNERS} entries, a negative number of them, or fewer than a face has"}[found[0]]
         raise InputError(f"{path}: in row {found[1]} of {element.name!r} {what}; write or copy it again")
     return found[0]
 
 
-def _field(entry: Property, element: str, num_vertices: int) -> tuple[int, int, int, int]:
+def _field(entry: Property, element: str, num_vertices: int) -> tuple[int, int, int, int, int]:
     """As the kernels want it; what is signed must not be negative."""
     width = np.dtype(entry.dtype).itemsize
     if not entry.count:
-        return 0, width, 0, 0
-    limit = 0
+        return 0, width, 0, 0, 0
+    length, longest = np.dtype(entry.count).itemsize, min(MAX_CORNERS, np.iinfo(entry.count).max)
     if element == "face" and entry.name in CORNERS:
-        limit = min(max(num_vertices, 1), np.iinfo(entry.dtype).max + entry.dtype.startswith("u"))
-    return np.dtype(entry.count).itemsize, width, min(MAX_CORNERS, np.iinfo(entry.count).max), limit
+        return length, width, 3, longest, min(max(num_vertices, 1), np.iinfo(entry.dtype).max + entry.dtype.startswith("u"))
+    return length, width, 0, longest, 0
 
 
 def _check_text(path: Path, header: Header) -> None:

@@ -47,7 +47,7 @@ class DepthFusion:
         mesh = self._grid.extract_triangle_mesh(min_weight)
         if "colors" in mesh.vertex:  # interpolation overshoots a little
             mesh.vertex.colors = mesh.vertex.colors.clip(0, 1)
-        return mesh
+        return mesh_in_order(mesh)
 
     def cloud(self, min_weight: float = 0.5) -> o3d.t.geometry.PointCloud:
         """Points where the zero level set crosses the grid's edges: positions, colors uint8, unit normals out of the surface."""
@@ -60,7 +60,27 @@ class DepthFusion:
         if "normals" in cloud.point:
             normals = cloud.point.normals.numpy()
             cloud.point.normals = o3d.core.Tensor(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12).astype(np.float32))
-        return cloud
+        return cloud_in_order(cloud)
+
+
+def cloud_in_order(cloud: o3d.t.geometry.PointCloud) -> o3d.t.geometry.PointCloud:
+    """The same points ordered by z, y, x: Open3D's hash maps return them in an order that depends on the threads."""
+    return cloud.select_by_index(o3d.core.Tensor(np.lexsort(cloud.point.positions.numpy().T)))
+
+
+def mesh_in_order(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleMesh:
+    """The same for a mesh: vertices by z, y, x, triangles by their vertices, each from its first one on in the sense that it had."""
+    order = np.lexsort(mesh.vertex.positions.numpy().T)
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    triangles = place[mesh.triangle.indices.numpy()]
+    first = triangles.argmin(axis=1)[:, None]
+    triangles = np.take_along_axis(triangles, (first + [0, 1, 2]) % 3, axis=1)
+    sorted_mesh = o3d.t.geometry.TriangleMesh()
+    for name, values in mesh.vertex.items():
+        sorted_mesh.vertex[name] = o3d.core.Tensor(np.ascontiguousarray(values.numpy()[order]))
+    sorted_mesh.triangle.indices = o3d.core.Tensor(np.ascontiguousarray(triangles[np.lexsort(triangles.T)]))
+    return sorted_mesh
 
 
 def pixel_squares(view: View, depth: np.ndarray, color: np.ndarray, wanted: np.ndarray) -> Part:

@@ -87,8 +87,14 @@ class VoxelField:
         self.grid.attribute("votes").numpy()[slots] += theirs
 
     def save(self, path: Path) -> None:
-        """Write the grid with `VoxelBlockGrid.save` (npz)."""
-        self.grid.save(str(path))
+        """Write an npz that `VoxelBlockGrid.load` reads, blocks ordered by position. Not by `VoxelBlockGrid.save`, which ends the process if the disk is full."""
+        slots = self.grid.hashmap().active_buf_indices().numpy()
+        keys = self.grid.hashmap().key_tensor().numpy()[slots]
+        order = np.lexsort(keys.T)
+        np.savez(path, **{
+            "value_000": self.grid.attribute("votes").numpy()[slots[order]], "key": keys[order], "attr_name_votes": np.zeros(1, np.int32),
+            "CPU:0": np.uint8(0), "block_resolution": np.int64([BLOCK]), "voxel_size": np.float32([self.voxel_size]),
+        })
 
 
 @dataclass(frozen=True)

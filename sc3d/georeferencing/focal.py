@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from sc3d.formats.images import open_image
 from sc3d.georeferencing.geotags import read_dji_xmp
 from sc3d.georeferencing.gps import Flight
 
@@ -29,9 +30,7 @@ def exif_focal(photo: Path) -> float | None:
 
     The 35 mm equivalent is that of the whole sensor. Photos of 16:9 are crops of 4:3 sensors, whose diagonal is 5/4 of the width.
     """
-    from PIL import Image
-
-    with Image.open(photo) as image:
+    with open_image(photo) as image:
         (width, height), exif = image.size, image.getexif().get_ifd(EXIF_BLOCK)
     calibrated, original = read_dji_xmp(photo).get("CalibratedFocalLength", 0.0), _number(exif.get(EXIF_WIDTH)) or width
     if calibrated > 0:

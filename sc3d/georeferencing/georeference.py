@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+LARGEST = (90.0, 180.0, 1e6)  # latitude, longitude, degrees; height, m
 CHUNK = 1_000_000  # points per call of PROJ
 IDENTITY = tuple(tuple(float(row == column) for column in range(4)) for row in range(4))
 
@@ -142,7 +143,9 @@ def read_georeference(scene: Scene) -> Georeference | None:
         georeference = Georeference(**known | {"epsg": int(known["epsg"]), "altitude_offset": float(known.get("altitude_offset", 0.0))})
         if not np.linalg.det(np.asarray(georeference.local_from_world)[:3, :3]) > 0:
             raise ValueError("local_from_world is not a similarity")
-    except (TypeError, ValueError, KeyError) as error:
+        if georeference.origin is not None and (np.abs(georeference.origin) > LARGEST).any():
+            raise ValueError("origin is not latitude, longitude and height")
+    except (TypeError, ValueError, KeyError, OverflowError) as error:
         raise InputError(f'{path} cannot be used ({error!r}): {{"epsg": 32615, "offset": [e, n, h]}} is the least it holds') from None
     projected_crs(georeference.epsg)
     return georeference

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.errors import InputError
+from sc3d.formats.images import open_image
 from sc3d.georeferencing.georeference import geodetic_to_enu
 
 STANDARD_DEVIATION = (1.0, 1.0, 1.0)  # m, of GPS that states none: what positions of one flight are worth against one another
@@ -48,13 +48,8 @@ def read_geotags(folder: Path, names: list[str]) -> dict[str, Geotag]:
 
 def read_geotag(photo: Path) -> Geotag | None:
     """The geotag of a photo; None without a usable latitude, longitude and altitude. InputError if the file is not an image."""
-    from PIL import Image
-
-    try:
-        with Image.open(photo) as image:
-            exif = image.getexif().get_ifd(GPS_BLOCK)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        raise InputError(f"cannot read the image {photo}: it is missing, damaged or not an image") from None
+    with open_image(photo) as image:
+        exif = image.getexif().get_ifd(GPS_BLOCK)
     xmp = read_dji_xmp(photo)
     latitude = _angle(exif.get(LATITUDE), exif.get(LATITUDE_REF), "S")
     longitude = _angle(exif.get(LONGITUDE), exif.get(LONGITUDE_REF), "W")

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.formats.las import check_las
 from sc3d.io import read_cloud, read_mesh
 
 if TYPE_CHECKING:
+    import laspy
     import open3d as o3d
 
 CLOUDS = {".ply", ".las", ".laz", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts", ".txt", ".csv", ".asc"}
@@ -75,10 +77,17 @@ def to_open3d(geometry: Geometry) -> o3d.t.geometry.PointCloud | o3d.t.geometry.
 def _read_las(path: Path) -> Geometry:
     import laspy
 
+    check_las(path)
     try:
-        file = laspy.read(path)
-    except Exception as error:  # laspy and lazrs raise many kinds for broken files
+        file = laspy.read(path, laz_backend=(laspy.LazBackend.LazrsParallel, laspy.LazBackend.Lazrs))  # not laszip, which ends the process for broken files
+        return _las_geometry(file, path)
+    except (KeyboardInterrupt, InputError):
+        raise
+    except BaseException as error:  # laspy raises many kinds for broken files; a panic of lazrs is no Exception
         raise InputError(f"cannot read {path}: {str(error).splitlines()[0] if str(error) else type(error).__name__}") from None
+
+
+def _las_geometry(file: laspy.LasData, path: Path) -> Geometry:
     names = set(file.point_format.dimension_names)
     attributes = {"classification": np.asarray(file.classification, np.uint8)}
     attributes |= {name: np.asarray(file[name]) for name in LAS_EXTRAS if name in names and np.any(file[name])}
@@ -139,7 +148,7 @@ def _read_obj(path: Path) -> Geometry:
                     corners = [corner - 1 if corner > 0 else len(vertices) + corner for corner in corners]
                     faces += [[corners[0], corners[place], corners[place + 1]] for place in range(1, len(corners) - 1)]
         table, triangles = np.array(vertices, np.float64), np.array(faces, np.int64).reshape(-1, 3)
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path} cannot be read as OBJ: {error}") from None
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(table):
         raise InputError(f"{path} holds no triangles, or triangles of vertices that it does not hold")

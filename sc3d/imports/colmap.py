@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sc3d.errors import InputError
+from sc3d.formats.colmap import load_model
 from sc3d.geometry.cameras import View
 from sc3d.imports.project import Project
 from sc3d.settings import Import
@@ -25,10 +25,7 @@ def files(path: Path) -> list[Path]:
 
 def read(path: Path, settings: Import) -> Project:
     folder = _folder(path)
-    try:
-        model = pycolmap.Reconstruction(str(folder))
-    except Exception as error:  # pycolmap raises bare RuntimeError, ValueError and IndexError for broken files
-        raise InputError(f"cannot read the COLMAP model in {folder}: {str(error).splitlines()[0]}") from None
+    model = load_model(folder)
     images = sorted((model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name)
     cameras = {camera_id: pycolmap.Camera(model.camera(camera_id).todict()) for camera_id in model.cameras}
     rows = {point_id: row for row, point_id in enumerate(sorted(model.point3D_ids()))}
@@ -38,7 +35,7 @@ def read(path: Path, settings: Import) -> Project:
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().matrix()
         views.append(View(image.name, cameras[image.camera_id], pose))
-        seen = image.get_observation_points2D()
+        seen = [point for point in image.get_observation_points2D() if point.point3D_id in rows]
         observations.append((np.array([rows[point.point3D_id] for point in seen], int), np.array([point.xy for point in seen]).reshape(-1, 2)))
     xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in points], np.uint8).reshape(-1, 3)

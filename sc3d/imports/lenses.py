@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 
 from sc3d.errors import InputError
+from sc3d.formats.images import MAX_PIXELS, MAX_SIDE
 
 NUM_RADII = 400  # samples along the image diagonal on which a lens is compared with its replacement
 
@@ -64,6 +65,8 @@ def to_camera(lens: Lens, tolerance: float, where: str) -> pycolmap.Camera:
     values = np.array([lens.width, lens.height, *lens.focal, *lens.principal, *lens.radial, *lens.tangential, lens.skew, *lens.prism])
     if not np.isfinite(values).all() or min(lens.width, lens.height, *lens.focal) <= 0:
         raise InputError(f"{where}: size and focal length must be positive, all parameters finite numbers")
+    if max(lens.width, lens.height) > MAX_SIDE or lens.width * lens.height > MAX_PIXELS:
+        raise InputError(f"{where} is {lens.width}x{lens.height}: sizes up to {MAX_PIXELS // 10**6} megapixels are possible")
     lens = replace(lens, radial=tuple(np.trim_zeros(lens.radial, "b")))
     lost = abs(lens.skew) * max(lens.principal[1], lens.height - lens.principal[1]) / lens.focal[1]
     if lost > tolerance:

@@ -109,7 +109,7 @@ def _points(points: dict, file: Path) -> tuple[np.ndarray, np.ndarray, dict[str,
         colors = np.array([point.get("color", (128, 128, 128)) for point in points.values()], np.float64).reshape(-1, 3)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file} has points that cannot be used ({error!r})") from None
-    kept = np.isfinite(positions).all(axis=1)
+    kept, colors = np.isfinite(positions).all(axis=1), np.nan_to_num(colors)
     names = [name for name, keep in zip(points, kept) if keep]
     return positions[kept], np.clip(np.rint(colors[kept]), 0, 255).astype(np.uint8), {str(name): row for row, name in enumerate(names)}
 
@@ -119,7 +119,7 @@ def _observations(file: Path, views: list[View], rows: dict[str, int]) -> list[t
     if not file.is_file():
         return None
     seen: dict[str, tuple[list[int], list[tuple[float, float]]]] = {view.name: ([], []) for view in views}
-    with file.open(encoding="utf-8") as lines:
+    with file.open(encoding="utf-8", errors="replace") as lines:
         for line in lines:
             words = line.rstrip("\n").split("\t")
             if len(words) >= 8 and words[1] in rows and words[0] in seen:

@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 
 from sc3d.errors import InputError
+from sc3d.formats import FARTHEST
 from sc3d.geometry.cameras import View
 from sc3d.georeferencing.georeference import Georeference, read_georeference
 from sc3d.scene import Scene
@@ -47,7 +48,10 @@ class Project:
 
 def read_project(path: Path, settings: Import) -> Project:
     """Read a project with the importer that `settings.source` names, or the first that knows the path. InputError if none does."""
-    project = find_importer(path, settings.source).read(path, settings)
+    try:
+        project = find_importer(path, settings.source).read(path, settings)
+    except (AttributeError, TypeError, LookupError, ValueError, ArithmeticError, np.linalg.LinAlgError) as error:  # other values than the importer looks for
+        raise InputError(f"{path} is damaged or of another layout: {type(error).__name__}, {str(error)[:200]}") from error
     if not project.views:
         raise InputError(f"{path} has no photo with a position: orient the photos first")
     folder = path if path.is_dir() else path.parent
@@ -74,6 +78,8 @@ def find_importer(path: Path, source: str) -> ModuleType:
 
 def rigid(rotation: np.ndarray, centre: np.ndarray, where: str) -> np.ndarray:
     """(4, 4) cam_from_world of a camera at `centre` (3,); `rotation` (3, 3) cam from world up to rounding. InputError if it is none."""
+    if not np.isfinite(rotation).all() or not (np.abs(centre) < FARTHEST).all():
+        raise InputError(f"{where}: orientation or position is not made of finite numbers, or is more than {FARTHEST:g} from the origin")
     left, stretch, right = np.linalg.svd(np.asarray(rotation, np.float64))
     if not np.isfinite(stretch).all() or abs(stretch - 1).max() > 0.01 or np.linalg.det(rotation) < 0:
         raise InputError(f"{where}: the orientation is no rotation")

@@ -10,6 +10,7 @@ from pathlib import Path
 from sc3d.classes import ClassTable
 from sc3d.errors import InputError
 from sc3d.files import discard
+from sc3d.formats.images import open_image
 from sc3d.io import atomic_path, image_size, read_index_image, write_image
 from sc3d.scene import match_masks
 from sc3d.segmentation.imports.checks import Mask
@@ -67,11 +68,9 @@ def check_masks(
 
 def warn_of_turned(photos: list[Path]) -> None:
     """Warn of photos with an EXIF orientation: annotation programs turn them, COLMAP and sc3d take the pixels as they are stored."""
-    from PIL import Image
-
     turned = []
     for photo in photos:
-        with suppress(OSError, ValueError, SyntaxError, KeyError), Image.open(photo) as image:
+        with suppress(InputError), open_image(photo) as image:
             if image.getexif().get(0x0112, 1) != 1:
                 turned.append(photo)
     if turned:

@@ -17,6 +17,7 @@ import numpy as np
 
 from sc3d.classes import ClassTable
 from sc3d.errors import InputError
+from sc3d.formats.images import open_image
 from sc3d.io import find_photos, image_size, read_json
 from sc3d.scene import check_mask_aspect
 
@@ -145,14 +146,9 @@ def _photo_of(file: Path, content: object, photos: dict[str, Path]) -> Path:
 
 def _read_picture(file: Path, size: tuple[int, int], class_table: ClassTable) -> np.ndarray:
     """(H, W) int16 class ids of a PNG in the colours of the class table, NOTHING where it is black or transparent."""
-    from PIL import Image
-
     check_mask_aspect(file, image_size(file), size)
-    try:
-        with Image.open(file) as image:
-            rgba = np.array(image.convert("RGBA"))
-    except (OSError, ValueError, SyntaxError):
-        raise InputError(f"cannot read the strokes {file}: the image is damaged") from None
+    with open_image(file, "picture of strokes") as image:
+        rgba = np.array(image.convert("RGBA"))
     codes = (rgba[..., :3].astype(np.int32) * [65536, 256, 1]).sum(axis=-1)
     codes[rgba[..., 3] == 0] = 0
     values, places = np.unique(codes, return_inverse=True)

@@ -12,7 +12,7 @@ from sc3d.splatting.gaussians import Gaussians
 
 
 def check_state(state: dict, parameters: dict[str, torch.Tensor], views: list[View], path: str) -> None:
-    """Raise ValueError, KeyError or InputError unless a state has the shapes and ranges of one that `Trainer.save` wrote.
+    """Raise ValueError, KeyError, RuntimeError or InputError unless a state has the shapes and ranges of one that `Trainer.save` wrote.
 
     state: as loaded, with tensors and plain values only; parameters: as a fresh run has them; views: all of them
     """
@@ -26,6 +26,7 @@ def check_state(state: dict, parameters: dict[str, torch.Tensor], views: list[Vi
     _check_adam(state["exposure_optimiser"], exposure)
     _check_tensors(state["statistics"], {field.name: (size,) for field in fields(Statistics)})
     _check_tensors(state["depths"], {index: (views[index].height, views[index].width) for index in state["depths"]})
+    torch.Generator().set_state(state["generator"])  # RuntimeError for a state that cannot be
     numbers = [state["iteration"], state["optimiser"]["count"], state["exposure_optimiser"]["count"], *state["queue"], *state["depths"]]
     if not all(type(number) is int and number >= 0 for number in numbers) or any(index >= len(views) for index in [*state["queue"], *state["depths"]]):
         raise ValueError("counts or views that do not exist")

@@ -18,7 +18,7 @@ from sc3d.files import temporary_name
 from sc3d.geometry.cameras import View
 from sc3d.geometry.neighbors import orient_normals
 from sc3d.geometry.raycast import FirstSurface, Surface, first_surface
-from sc3d.geometry.surface import DepthFusion, Part, drop_small_parts, near_mesh, pixel_squares
+from sc3d.geometry.surface import DepthFusion, Part, cloud_in_order, drop_small_parts, near_mesh, pixel_squares
 from sc3d.settings import Extract
 from sc3d.splatting.consistency import blocking, consistent, pixel_rays
 from sc3d.splatting.evaluation import depth_map
@@ -121,7 +121,7 @@ def _complete(maps: _DepthMaps, mesh: o3d.t.geometry.TriangleMesh, voxel_size: f
         first, depth = first_surface(surface, view), maps.read(row).numpy()
         before = depth < (1 - MARGIN) * first.range * first.ray_z  # where nothing is hit, or only something far behind
         squares, centres = pixel_squares(view, depth, data.image(row), before & accept(maps, row, first))
-        parts.append((squares, centres.voxel_down_sample(voxel_size) if len(centres.point.positions) else centres))
+        parts.append((squares, cloud_in_order(centres.voxel_down_sample(voxel_size)) if len(centres.point.positions) else centres))
     return _joined(parts)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.formats.images import open_image
 from sc3d.io import image_size, read_index_image
 from sc3d.segmentation.imports.checks import Checks, Mask
 from sc3d.segmentation.imports.mapping import UNKNOWN, Classes
@@ -47,42 +48,29 @@ def is_colored(file: Path) -> bool:
 
     A damaged file decides nothing here: it is reported later, with all others.
     """
-    from PIL import Image
-
     try:
-        image_size(file)
+        with open_image(file) as image:
+            return image.mode in COLORED
     except InputError:
         return True
-    with Image.open(file) as image:
-        return image.mode in COLORED
 
 
 def _read_ids(file: Path, classes: Classes) -> np.ndarray:
     """(H, W) uint8 or uint16."""
-    from PIL import Image
-
-    with Image.open(file) as image:
+    with open_image(file, "mask") as image:
         if image.mode not in SIXTEEN_BIT:
             return read_index_image(file)
         if classes.mapping is None:
             raise InputError(f"{file} is a 16-bit PNG: its ids need a --mapping to the classes of the table")
-        try:
-            return np.array(image).astype(np.uint16)
-        except (OSError, ValueError, SyntaxError):
-            raise InputError(f"cannot read the mask {file}: it is missing, damaged or not an image") from None
+        return np.array(image).astype(np.uint16)
 
 
 def _read_colors(file: Path) -> np.ndarray:
     """(H, W) int32 0xRRGGBB; transparent pixels are black."""
-    from PIL import Image
-
-    try:
-        with Image.open(file) as image:
-            if image.mode in SIXTEEN_BIT:
-                raise InputError(f"{file} is a 16-bit grey PNG and has no colours: --format index is for ids")
-            channels = np.array(image.convert("RGBA"))
-    except (OSError, ValueError, SyntaxError):
-        raise InputError(f"cannot read the mask {file}: it is missing, damaged or not an image") from None
+    with open_image(file, "mask") as image:
+        if image.mode in SIXTEEN_BIT:
+            raise InputError(f"{file} is a 16-bit grey PNG and has no colours: --format index is for ids")
+        channels = np.array(image.convert("RGBA"))
     codes = channels[..., 0].astype(np.int32) << 16
     codes |= channels[..., 1].astype(np.int32) << 8
     codes |= channels[..., 2]
