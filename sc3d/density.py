@@ -44,9 +44,9 @@ def gaussian_density(points: np.ndarray, gaussians: GaussianField, voxel_size: f
     return result
 
 
-def kernel_density(points: np.ndarray, voxel_size: float) -> np.ndarray:
-    """(N,) float32 for clouds without Gaussians: a Gaussian of half a voxel around the mean of the (N, 3) points in each voxel."""
-    sorting = sort_by_voxel(points, voxel_size)
+def kernel_density(points: np.ndarray, voxel_size: float, origin: np.ndarray | None = None) -> np.ndarray:
+    """(N,) float32 for clouds without Gaussians: a Gaussian of half a voxel around the mean of the (N, 3) points in each voxel; origin: of `sort_by_voxel`."""
+    sorting = sort_by_voxel(points, voxel_size, origin)
     result = np.empty(len(points), np.float32)
     _around_mean(np.ascontiguousarray(points, np.float64), sorting.order, sorting.starts, voxel_size, result)
     return result

@@ -75,10 +75,10 @@ def voxel_size_for(spacing: float, sample: np.ndarray, masks: Masks) -> float:
     return max(2 * spacing, 1.5 * float(np.median(footprints)))
 
 
-def point_density(scene: Scene, points: np.ndarray, voxel_size: float) -> np.ndarray:
-    """(N,) density of the Gaussians at the points, or of the points themselves where there are none."""
+def point_density(scene: Scene, points: np.ndarray, voxel_size: float, origin: np.ndarray | None = None) -> np.ndarray:
+    """(N,) density of the Gaussians at the points, or of the points themselves where there are none; origin: (3,) of the label voxels, None = the points' own."""
     if not scene.gaussians.exists():
-        return kernel_density(points, voxel_size)
+        return kernel_density(points, voxel_size, origin)
     from sc3d.splatting.pictures import load_gaussians  # loads torch
 
     gaussians, origin = load_gaussians(scene)

@@ -19,7 +19,7 @@ from sc3d.scene import Scene
 from sc3d.settings import Evaluate
 from sc3d.tasks import Tasks
 from sc3d.tiles.files import CloudFile, positions
-from sc3d.tiles.label import MARGIN, sample_spacing
+from sc3d.tiles.label import sample_spacing
 from sc3d.tiles.plan import Parts, max_points, memory_of
 from sc3d.tiles.ranges import RangeMaps
 from sc3d.tiles.store import Results, Survey, TileStore
@@ -65,8 +65,8 @@ def look_by_tiles(scene: Scene, settings: Evaluate, cloud: CloudFile, tasks: Tas
     views = [view for view in scene.model.views if view.name in truth]
     parts = Parts(settings.output or scene.metrics, "evaluate", [scene.sparse, scene.mesh, settings.truth or scene.truth, cloud.path], settings)
     survey = Survey.of(cloud)
-    store = TileStore.build(cloud, survey.grid(max_points(settings, BYTES), lambda side: MARGIN * side), parts.subfolder("tiles"))
-    spacing, _ = sample_spacing(store, survey.extent, cloud.num_points)
+    store = TileStore.build(cloud, survey.grid(max_points(settings, BYTES), REACH * survey.spacing), parts.subfolder("tiles"))
+    spacing, _ = sample_spacing(store, survey)
     origin = local_origin(scene.model.views)
     mesh = split_mesh(scene.mesh, parts.subfolder("surface"), origin, memory_of(settings)) if scene.mesh.exists() else \
         split_surfels(store, spacing, parts.subfolder("surface"), origin)

@@ -22,12 +22,13 @@ from sc3d.tasks import Tasks
 from sc3d.tiles.files import CloudFile, columns, positions, write_ply
 from sc3d.tiles.plan import Parts, max_points, memory_of
 from sc3d.tiles.ranges import RangeMaps
-from sc3d.tiles.store import Grid, Results, Survey, TileStore
+from sc3d.tiles.store import Results, Survey, TileStore
 from sc3d.tiles.surfaces import RangeJob, compute_ranges, split_mesh, split_surfels
 from sc3d.tiles.votes import write_field
 
 BYTES = 420  # of a point while its tile votes
-MARGIN = 0.06  # of a tile's side that the choice of tiles allows for
+VOXEL = 2.2  # of a label voxel, in point spacings, while neither is known exactly
+SAMPLE_MARGIN = 20.0  # around a tile whose spacing is measured, point spacings
 BLOCKS = 2  # margin of a tile: the rest of a block that its border cuts, and the block beyond, which verification looks at
 
 
@@ -57,14 +58,13 @@ def label_tiles(scene: Scene, settings: Label, cloud: CloudFile, tasks: Tasks) -
     output = settings.output or scene.seeds
     parts = Parts(output, "label", [scene.sparse, scene.classes, scene.masks, *([confidence] if confidence else []), scene.mesh, cloud.path], settings)
     survey = Survey.of(cloud)
-    grid = survey.grid(max_points(settings, BYTES), lambda side: MARGIN * side)
-    store = TileStore.build(cloud, grid, parts.subfolder("tiles"))
-    spacing, sample = sample_spacing(store, survey.extent, cloud.num_points)
+    margin = BLOCKS * BLOCK * (settings.voxel_size or VOXEL * survey.spacing)
+    store = TileStore.build(cloud, survey.grid(max_points(settings, BYTES), margin), parts.subfolder("tiles"))
+    spacing, sample = sample_spacing(store, survey)
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=voxel_size_for(spacing, sample, masks))
     maps = _ranges(scene, masks, store, spacing, settings, parts, tasks) if settings.depth_filter else None
     job = LabelJob(scene.path, settings, survey.extent, store, Results(parts.subfolder("results"), store), maps, confidence)
-    _require_margin(grid, job.margin)
     tasks.run("voting", partial(label_tile, job), store.tiles)
     write_field(job.results, store.tiles, settings.voxel_size, scene.votes_of(settings.output))
     counts = _write(output, cloud, job, scene.class_table().num_ids)
@@ -84,25 +84,21 @@ def _ranges(scene: Scene, masks: Masks, store: TileStore, spacing: float, settin
     return compute_ranges(RangeJob(scene.path, mesh, maps, {view.name: image_size(masks.files[view.name]) for view in masks.views}), tasks)
 
 
-def sample_spacing(store: TileStore, extent: Extent, num_points: int) -> tuple[float, np.ndarray]:
+def sample_spacing(store: TileStore, survey: Survey) -> tuple[float, np.ndarray]:
     """Sampling distance as `labelled.spacing_of` has it, and the points (S, 3) by which `default_voxel_size` measures mask pixels."""
     rows, distances, footprint_rows, footprints = [], [], [], []
+    num_points = sum(store.counts.values())
     for tile in store.tiles:
-        window = store.window(tile, MARGIN * store.grid.size)
+        window = store.window(tile, SAMPLE_MARGIN * survey.spacing)
         points = positions(window.gather(store.records))
         mine = window.core & (window.rows % max(1, num_points // SPACING_SAMPLE) == 0)
         rows.append(window.rows[mine])
-        distances.append(NeighborIndex(points, extent.low).nearest(points[mine], SPACING_NEIGHBORS + 1)[1])
+        distances.append(NeighborIndex(points, survey.extent.low).nearest(points[mine], SPACING_NEIGHBORS + 1)[1])
         mine = window.core & (window.rows % max(1, num_points // FOOTPRINT_SAMPLE) == 0)
         footprint_rows.append(window.rows[mine])
         footprints.append(points[mine])
     ordered = [np.concatenate(values)[np.argsort(np.concatenate(keys))] for keys, values in ((rows, distances), (footprint_rows, footprints))]
     return point_spacing(ordered[0]) or 1.0, ordered[1]
-
-
-def _require_margin(grid: Grid, margin: float) -> None:
-    if margin > grid.size / 2 and grid.shape != (1, 1):
-        raise InputError(f"--max-memory leaves room for tiles of {grid.size:g} only, too little beside margins of {margin:g}: allow more memory")
 
 
 def label_tile(job: LabelJob, tile: int) -> None:
@@ -114,7 +110,8 @@ def label_tile(job: LabelJob, tile: int) -> None:
     records = window.gather(store.records)
     points, masks = positions(records), Masks.of(scene, job.confidence)
     normals = unit_normals(columns(records, ("nx", "ny", "nz")), points, np.array([view.centre for view in masks.views]), job.extent.low)
-    density = point_density(scene, points, job.settings.voxel_size) if job.settings.density else None
+    origin = voxel_origin(job.extent.low, job.settings.voxel_size)
+    density = point_density(scene, points, job.settings.voxel_size, origin) if job.settings.density else None
     fusion = fuse(Cloud(points, normals, density, job.extent), masks.views, masks.read, job.maps, scene.class_table().num_ids, job.settings)
     core = window.core
     labels = fusion.labels

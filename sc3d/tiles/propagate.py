@@ -31,7 +31,7 @@ from sc3d.scene import Scene
 from sc3d.settings import Propagate
 from sc3d.tasks import Tasks
 from sc3d.tiles.files import CloudFile, write_ply
-from sc3d.tiles.label import MARGIN, sample_spacing
+from sc3d.tiles.label import sample_spacing
 from sc3d.tiles.parts import Part, PropagateJob, cells_of
 from sc3d.tiles.plan import Parts, max_points
 from sc3d.tiles.store import Results, Survey, TileStore
@@ -62,10 +62,9 @@ def propagate_tiles(scene: Scene, settings: Propagate, cloud: CloudFile, tasks: 
         raise InputError(f"{cloud.path} has no attribute {missing[0]!r}: it was not written by `sc3d label`")
     parts = Parts(output, "propagate", [cloud.path], settings)
     survey = Survey.of(cloud)
-    store = TileStore.build(cloud, survey.grid(max_points(settings, BYTES), lambda side: MARGIN * side), parts.subfolder("tiles"))
-    margin = HOPS * EDGE * sample_spacing(store, survey.extent, cloud.num_points)[0]
-    if margin > store.grid.size / 2 and len(store.tiles) > 1:
-        raise InputError(f"--max-memory leaves room for tiles of {store.grid.size:g} only, too little beside margins of {margin:g}: allow more memory")
+    grid = survey.grid(max_points(settings, BYTES), HOPS * EDGE * survey.spacing)
+    store = TileStore.build(cloud, grid, parts.subfolder("tiles"))
+    margin = HOPS * EDGE * sample_spacing(store, survey)[0]
     job = PropagateJob(settings, survey.extent, store, Results(parts.subfolder("results"), store), margin, num_ids, parts.subfolder("shared"))
     _solve(job, tasks, cloud.path)
     summary = _write(output, cloud, job)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sc3d.errors import InputError
 from sc3d.files import atomic_path
 from sc3d.fusion import MIDDLE_STEPS, Extent, count_steps, middle_of
 from sc3d.tiles.files import CHUNK, CloudFile, positions
@@ -78,13 +79,23 @@ class Survey:
             counts += np.bincount(fine.tile_of(points), minlength=RASTER * RASTER)[: RASTER * RASTER]
         return cls(Extent(low, high, middle_of(steps, low, high)), axes, counts.reshape(RASTER, RASTER))
 
-    def grid(self, max_points: int, margin: Callable[[float], float]) -> Grid:
-        """The largest tiles such that no tile with its margin holds more than about `max_points`; margin: of the tile's side, world units."""
+    @property
+    def spacing(self) -> float:
+        """About the distance between points, world units: from the cells that hold any, so too large for clouds with gaps smaller than a cell."""
+        side = float((self.extent.high - self.extent.low)[list(self.axes)].max()) / RASTER
+        return side * float(np.sqrt((self.counts > 0).sum() / max(self.counts.sum(), 1)))
+
+    def grid(self, max_points: int, margin: float = 0.0) -> Grid:
+        """The largest tiles such that none holds more than about `max_points`, the margin around it (world units) included.
+
+        InputError if the margin would be wider than the tile.
+        """
         extent = float((self.extent.high - self.extent.low)[list(self.axes)].max()) or 1.0
         sums = np.pad(self.counts.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
         for parts in range(1, int(MAX_TILES**0.5) + 1):
-            side = RASTER / parts
-            around = margin(extent / parts) / extent * RASTER
+            side, around = RASTER / parts, margin / extent * RASTER
+            if parts > 1 and around > side:
+                raise InputError(f"--max-memory leaves room for tiles of {extent / parts:g} only, too little beside margins of {margin:g}: allow more memory")
             low, high = (np.clip(edges, 0, RASTER).astype(int) for edges in (np.arange(parts) * side - around, np.ceil((np.arange(parts) + 1) * side + around)))
             held = sums[np.ix_(high, high)] - sums[np.ix_(low, high)] - sums[np.ix_(high, low)] + sums[np.ix_(low, low)]
             if held.max() <= max_points:

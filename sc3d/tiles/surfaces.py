@@ -62,7 +62,7 @@ def views_of(scene: Path) -> dict[str, View]:
 def split_mesh(path: Path, folder: Path, origin: np.ndarray, memory: int) -> MeshParts:
     """Parts of a mesh file small enough for `memory` bytes."""
     vertices = CloudFile.open(path)
-    grid = Survey.of(vertices).grid(max((memory - BASE) // TRIANGLE // 2, 1000), lambda side: 0.0)  # about two triangles for each vertex
+    grid = Survey.of(vertices).grid(max((memory - BASE) // TRIANGLE // 2, 1000))  # about two triangles for each vertex
     return MeshParts.split(read_triangles(path), grid, folder, origin)
 
 
