@@ -5,14 +5,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, Suppress, arg, subcommand
 
-from sc3d.splatting.settings import TrainSettings as Train
+from sc3d.errors import InputError
+from sc3d.splatting.settings import TrainSettings
 from sc3d.synthetic.settings import SynthesizeSettings as Synthesize
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where a stage may work; results do not depend on it."""
+
+    workers: int = 0
+    """Dask workers to start on this machine; without them all work is done in this process."""
+    cluster: str = ""
+    """Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers see the same files."""
+
+
+@dataclass(frozen=True)
+class Resources(Workers):
+    """What a stage may use; results do not depend on it."""
+
+    max_memory: str = ""
+    """Memory to stay below, such as 6G; what does not fit is worked on tile by tile, from disk. Half of this machine's memory otherwise. Each worker of
+    a --cluster may use as much."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +74,25 @@ class Georeference:
     """For scenes whose world is the CRS of --epsg minus this (easting, northing, height); 0 0 0 if it is the CRS itself."""
     from_gps: bool = False
     """Replace the present georeference by one from GPS."""
+
+
+@dataclass(frozen=True)
+class Train(Workers, TrainSettings):
+    """Gaussian training. Times are fractions of the run, so that a short run goes through all phases of a long one."""
+
+    blocks: int = 0
+    """cut the ground into so many blocks, which are trained one by one, or side by side on --workers or --cluster, in the memory of a block, and
+    merged; each takes its share of iterations and max_gaussians; 0 = train everything at once"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.blocks < 0 or self.workers < 0:
+            raise InputError("blocks and workers must not be negative")
+
+    @property
+    def training(self) -> TrainSettings:
+        """What decides the result of one training."""
+        return TrainSettings(**{field.name: getattr(self, field.name) for field in fields(TrainSettings)})
 
 
 @dataclass(frozen=True)
@@ -118,19 +157,6 @@ class Segment:
     """Compute in half precision (bfloat16; float16 on older GPUs); needs CUDA (grounded-sam, sam3)."""
     device: str = "auto"
     """torch device: auto, cpu, cuda."""
-
-
-@dataclass(frozen=True)
-class Resources:
-    """What a stage may use; results do not depend on it."""
-
-    max_memory: str = ""
-    """Memory to stay below, such as 6G; what does not fit is worked on tile by tile, from disk. Half of this machine's memory otherwise. Each worker of
-    a --cluster may use as much."""
-    workers: int = 0
-    """Dask workers to start on this machine; without them all work is done in this process."""
-    cluster: str = ""
-    """Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers see the same files."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ Its result is small; what is large it writes to a file of its own. A task that i
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,21 +16,23 @@ from typing import Protocol
 from tqdm import tqdm
 
 from sc3d.errors import InputError, Sc3dError
-from sc3d.settings import Resources
+from sc3d.settings import Workers
+
+logger = logging.getLogger(__name__)
 
 RETRIES = 3  # of a task whose worker is lost; more, and the task itself is what kills it
 
 
 class Tasks(Protocol):
-    """Runs a function on items; the results come in the order of the items."""
+    """Runs a function on items; the results come in the order of the items. needs: what a Dask worker must offer for one task, such as {"GPU": 1}"""
 
-    def run(self, name: str, function: Callable, items: Sequence) -> list: ...
+    def run(self, name: str, function: Callable, items: Sequence, needs: dict[str, float] | None = None) -> list: ...
 
 
 class Here:
     """One after another in this process."""
 
-    def run(self, name: str, function: Callable, items: Sequence) -> list:
+    def run(self, name: str, function: Callable, items: Sequence, needs: dict[str, float] | None = None) -> list:
         return [function(item) for item in tqdm(items, desc=name, disable=None)]
 
 
@@ -39,11 +42,13 @@ class OnDask:
     def __init__(self, client: object) -> None:
         self._client = client
 
-    def run(self, name: str, function: Callable, items: Sequence) -> list:
+    def run(self, name: str, function: Callable, items: Sequence, needs: dict[str, float] | None = None) -> list:
         from distributed import as_completed
         from distributed.scheduler import KilledWorker
 
-        futures = self._client.map(function, list(items), pure=False, retries=RETRIES)
+        if needs and not any(set(needs) <= set(worker["resources"]) for worker in self._client.scheduler_info()["workers"].values()):
+            logger.warning("%s: no worker offers %s; waiting for one", name, " ".join(f"{key}={value:g}" for key, value in needs.items()))
+        futures = self._client.map(function, list(items), pure=False, retries=RETRIES, resources=needs)
         try:
             for future in tqdm(as_completed(futures), desc=name, total=len(futures), disable=None):
                 future.result()
@@ -55,7 +60,7 @@ class OnDask:
 
 
 @contextmanager
-def open_tasks(resources: Resources) -> Iterator[Tasks]:
+def open_tasks(resources: Workers) -> Iterator[Tasks]:
     """Here, or the workers that the options ask for. InputError if Dask is missing or the scheduler does not answer."""
     if not resources.cluster and resources.workers < 1:
         yield Here()
@@ -74,7 +79,8 @@ def open_tasks(resources: Resources) -> Iterator[Tasks]:
         return
     threads = max(1, (os.cpu_count() or 1) // resources.workers)
     environment = {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
-    cluster = partial(LocalCluster, n_workers=resources.workers, threads_per_worker=1, memory_limit=None, host="127.0.0.1", dashboard_address=None)
+    cluster = partial(LocalCluster, n_workers=resources.workers, threads_per_worker=1, memory_limit=None, host="127.0.0.1", dashboard_address=None,
+                      resources={"GPU": 1})  # how many of them a GPU can feed is for the user to say
     before = {name: os.environ.get(name) for name in environment}
     os.environ.update(environment)
     try:

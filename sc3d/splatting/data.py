@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 import torch
 
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import View
+from sc3d.geometry.cameras import View, in_image, local_origin, project, resample, undistorted
+from sc3d.io import read_image
+from sc3d.scene import Scene
+from sc3d.splatting.settings import TrainSettings
+
+CACHED_PIXELS = 500_000_000  # undistorted photos kept in memory: 1.5 GB
 
 
 @dataclass(frozen=True)
@@ -57,11 +63,31 @@ class TrainingData:
         return TrainingData([self.views[index] for index in indices], lambda row: _item(self.images, indices[row]), self.points, self.colors,
                             tracks, lambda row: _item(self.masks, indices[row]))
 
+    def seen(self, index: int) -> np.ndarray:
+        """(T,) rows of the sparse points that a view sees; all in its image, where tracks are unknown."""
+        if self.tracks is not None:
+            return self.tracks[index]
+        pixels, depths = project(self.views[index], np.asarray(self.points, np.float64))
+        return np.nonzero(in_image(self.views[index], pixels) & (depths > 0))[0]
+
     def _checked(self, array: np.ndarray, index: int, what: str) -> np.ndarray:
         view = self.views[index]
         if array.shape[:2] != (view.height, view.width):
             raise InputError(f"{what} of {view.name} is {array.shape[1]}x{array.shape[0]}, its view {view.width}x{view.height}")
         return array
+
+
+def scene_data(scene: Scene, settings: TrainSettings) -> tuple[TrainingData, np.ndarray]:
+    """A scene's photos, undistorted at training size when they are asked for, and sparse points; the (3,) world position of the local origin."""
+    model = scene.model
+    origin = local_origin(model.views)
+    views = [undistorted(view.shifted(origin), settings.size(max(view.width, view.height))) for view in model.views]
+
+    @lru_cache(maxsize=max(2, CACHED_PIXELS // max(view.width * view.height for view in views)))
+    def image(index: int) -> np.ndarray:
+        return resample(read_image(scene.photo(model.views[index].name)), model.views[index].shifted(origin), views[index])
+
+    return TrainingData(views, image, model.points - origin, model.colors, model.tracks), origin
 
 
 def _item(source: Sequence | Callable | None, index: int) -> np.ndarray | None:

@@ -7,8 +7,10 @@ import torch
 
 from sc3d.geometry.cameras import View
 from sc3d.splatting import losses
+from sc3d.splatting.data import TrainingData
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.render import render, unbiased_depth
+from sc3d.splatting.settings import TrainSettings
 from sc3d.splatting.ssim import ssim_loss
 
 
@@ -35,6 +37,15 @@ def score_view(
         image = losses.apply_exposure(image, losses.fit_exposure(image[used], target[used]))
     image = torch.where(used[..., None], image.clamp(0, 1), target)
     return psnr(image[used], target[used]), 1 - float(ssim_loss(image.contiguous(), target))
+
+
+def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSettings) -> dict[str, float]:
+    """Mean "psnr" (dB) and "ssim" of the held-out views, whose exposure is fitted to the photo if exposures are used; empty without any."""
+    scores = [score_view(gaussians, *data.photo(index), settings.exposure) for index in settings.held_out(len(data.views))]
+    if not scores:
+        return {}
+    means = np.mean(scores, axis=0)
+    return {"psnr": float(means[0]), "ssim": float(means[1])}
 
 
 @torch.no_grad()

@@ -68,7 +68,9 @@ def fill_points(data: TrainingData, neighbours: list[np.ndarray], budget: int) -
     returns: (M, 3) float64 points, the views' world; (M, 3) uint8 colours. M = 0 where there is nothing to fill.
     Depth: where patches agree with the neighbours' (plane sweep); elsewhere interpolated from what the view knows around the pixel.
     """
-    step = max(4.0, np.sqrt(sum(view.width * view.height for view in data.views) / max(budget, 1)))
+    masks = map(data.mask, range(len(data.views)))
+    num_pixels = sum(view.width * view.height if mask is None else int(mask.sum()) for view, mask in zip(data.views, masks, strict=True))
+    step = max(4.0, np.sqrt(num_pixels / max(budget, 1)))
     greys = [_small_grey(data, index) for index in range(len(data.views))]
     layer = _Layer.of(np.asarray(data.points, np.float64), data.views)
     found, colors, sizes = [], [], []

@@ -51,8 +51,8 @@ def train(data: TrainingData, settings: TrainSettings = TrainSettings(), checkpo
 
 
 def write_log(rows: list[dict[str, float]], path: Path) -> None:
-    """Write the log rows as CSV."""
+    """Write the log rows as CSV; those of `train_blocks` have a first column more."""
     with atomic_path(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["iteration", "loss", "psnr", "num_gaussians", "seconds"])
+        writer = csv.DictWriter(file, [*(["block"] if rows and "block" in rows[0] else []), "iteration", "loss", "psnr", "num_gaussians", "seconds"])
         writer.writeheader()
         writer.writerows(rows)

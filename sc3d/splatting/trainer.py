@@ -18,7 +18,7 @@ from sc3d.splatting.checkpoint import check_state
 from sc3d.splatting.data import TrainingData
 from sc3d.splatting.densify import DensifyLimits, Statistics
 from sc3d.splatting.device import pick_device
-from sc3d.splatting.evaluation import depth_map, psnr, score_view
+from sc3d.splatting.evaluation import depth_map, held_out_scores, psnr
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.initialise import fill_points
 from sc3d.splatting.multiview import Neighbour, multi_view_losses, single_view_normal_loss
@@ -93,15 +93,12 @@ class Trainer:
         self._update(index, rendering)
         self.iteration += 1
         self._densify()
-        return self._record(float(loss.detach()), psnr(image.detach(), target))
+        used = ... if mask is None or not mask.any() else mask
+        return self._record(float(loss.detach()), psnr(image.detach()[used], target[used]))
 
     def evaluate(self) -> dict[str, float]:
         """Mean PSNR (dB) and SSIM of the held-out views; their exposure is fitted to the photo if exposures are used."""
-        if not self.test_views:
-            return {}
-        scores = [score_view(self.gaussians, *self.data.photo(index), self.settings.exposure) for index in self.test_views]
-        means = np.mean(scores, axis=0)
-        return {"psnr": float(means[0]), "ssim": float(means[1])}
+        return held_out_scores(self.gaussians, self.data, self.settings)
 
     def save(self, path: Path) -> None:
         """Write everything the rest of the run depends on."""

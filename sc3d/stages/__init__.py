@@ -28,7 +28,7 @@ from sc3d.errors import InputError, Sc3dError
 from sc3d.files import remove_leftovers, require_inside, temporary_name
 from sc3d.io import digest, read_json, write_json
 from sc3d.scene import Scene
-from sc3d.settings import Resources
+from sc3d.settings import Resources, Workers
 
 logger = logging.getLogger(__name__)
 
@@ -110,7 +110,7 @@ def _room(scene: Scene) -> Iterator[None]:
 
 def _decisive(settings: object) -> dict[str, object]:
     """The settings without those that no result depends on."""
-    ignored = {field.name for field in fields(Resources)} if isinstance(settings, Resources) else set()
+    ignored = {field.name for field in fields(Resources)} if isinstance(settings, Workers) else set()
     return {name: value for name, value in _plain(asdict(settings)).items() if name not in ignored}
 
 

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-from functools import lru_cache
 from pathlib import Path
 
-import numpy as np
-
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import local_origin, resample, undistorted
-from sc3d.io import digest, read_image
+from sc3d.files import remove
+from sc3d.io import digest
 from sc3d.scene import Scene, check_photos
 from sc3d.settings import Train
+from sc3d.splatting.block_tasks import BlockJob, train_blocks
+from sc3d.splatting.blocks import split_blocks
+from sc3d.splatting.data import TrainingData, scene_data
 from sc3d.splatting.device import pick_device
-from sc3d.splatting.train import TrainingData, train, write_log
+from sc3d.splatting.train import TrainResult, train, write_log
+from sc3d.tasks import open_tasks
 from sc3d.view.sheet import write_training_sheet
-
-CACHED_PIXELS = 500_000_000  # undistorted photos kept in memory: 1.5 GB
 
 
 def inputs(scene: Scene, settings: Train) -> list[Path]:
@@ -29,36 +28,42 @@ def outputs(scene: Scene, settings: Train) -> list[Path]:
 
 
 def run(scene: Scene, settings: Train) -> dict[str, object]:
-    pick_device(settings.device)  # complain before the work begins
-    model = scene.model
-    check_photos(scene, [view.name for view in model.views])
-    if len(model.points) < 10:
-        raise InputError(f"{scene.sparse} has {len(model.points)} sparse points, too few to start from: run `sc3d reconstruct` with more overlap")
-    origin = local_origin(model.views)
-    views = [undistorted(view.shifted(origin), settings.size(max(view.width, view.height))) for view in model.views]
-
-    @lru_cache(maxsize=max(2, CACHED_PIXELS // max(view.width * view.height for view in views)))
-    def image(index: int) -> np.ndarray:
-        return resample(read_image(scene.photo(model.views[index].name)), model.views[index].shifted(origin), views[index])
-
-    checkpoint = _checkpoint(scene, settings)
-    data = TrainingData(views, image, model.points - origin, model.colors, model.tracks)
-    result = train(data, settings, checkpoint if settings.checkpoint_every else None)
+    in_blocks = settings.blocks > 1
+    if not (in_blocks and settings.cluster):  # whose workers may have the GPU that this machine lacks
+        pick_device(settings.device)  # complain before the work begins
+    check_photos(scene, [view.name for view in scene.model.views])
+    if len(scene.model.points) < 10:
+        raise InputError(f"{scene.sparse} has {len(scene.model.points)} sparse points, too few to start from: run `sc3d reconstruct` with more overlap")
+    data, origin = scene_data(scene, settings.training)
+    unfinished = _unfinished(scene, settings)
+    if in_blocks:
+        result, summary = _train_blocks(scene, settings, data, unfinished)
+    else:
+        result, summary = train(data, settings.training, unfinished if settings.checkpoint_every else None), {}
     result.gaussians.save(scene.gaussians, [f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}"])
     write_log(result.log, scene.path / "train.csv")
-    write_training_sheet(scene.path / "train.jpg", result, data, settings)
-    checkpoint.unlink(missing_ok=True)
+    write_training_sheet(scene.path / "train.jpg", result, data, settings.training)
+    remove(unfinished)
     last = result.log[-1] if result.log else {}
     held_out = {f"held_out_{name}": round(value, 3) for name, value in result.metrics.items()}
-    return {"photos": len(views), "size": f"{views[0].width}x{views[0].height}", "gaussians": len(result.gaussians)} | {
-        "psnr": round(last.get("psnr", float("nan")), 2)} | held_out
+    return {"photos": len(data.views), "size": f"{data.views[0].width}x{data.views[0].height}", "gaussians": len(result.gaussians)} | {
+        "psnr": round(last.get("psnr", float("nan")), 2)} | held_out | summary
 
 
-def _checkpoint(scene: Scene, settings: Train) -> Path:
-    """Where this run's checkpoint lies; those of other settings, photos or cameras are removed."""
-    state = hashlib.blake2b(repr((settings, digest(scene.images), digest(scene.sparse))).encode(), digest_size=8).hexdigest()
-    mine = scene.path / f"train.{state}.checkpoint"
-    for other in scene.path.glob("train.*.checkpoint"):
+def _train_blocks(scene: Scene, settings: Train, data: TrainingData, folder: Path) -> tuple[TrainResult, dict[str, object]]:
+    blocks = tuple(split_blocks(data.points, settings.blocks))
+    here = not settings.workers and not settings.cluster
+    job = BlockJob(scene.path.absolute(), settings.training, blocks, folder.absolute(), progress=here)
+    with open_tasks(settings) as tasks:
+        return train_blocks(job, data, tasks)
+
+
+def _unfinished(scene: Scene, settings: Train) -> Path:
+    """Where this run's checkpoint lies, or the folder of its blocks; those of other settings, photos or cameras are removed."""
+    blocks = settings.blocks if settings.blocks > 1 else 0
+    state = repr((settings.training, blocks, digest(scene.images), digest(scene.sparse)))
+    mine = scene.path / f"train.{hashlib.blake2b(state.encode(), digest_size=8).hexdigest()}.{'blocks' if blocks else 'checkpoint'}"
+    for other in [*scene.path.glob("train.*.checkpoint"), *scene.path.glob("train.*.blocks")]:
         if other != mine:
-            other.unlink()
+            remove(other)
     return mine
