@@ -19,6 +19,21 @@ class Reliability:
     count: np.ndarray
     ece: float
 
+    @classmethod
+    def of_sums(cls, confidence: np.ndarray, right: np.ndarray, count: np.ndarray) -> Reliability:
+        """From the sum of confidences, the number of right samples and of all samples in each bin (B,)."""
+        some, total = np.where(count > 0, count, np.nan), count.sum()
+        mean, accuracy = confidence / some, right / some
+        ece = float(np.nansum(count * np.abs(mean - accuracy)) / total) if total else float("nan")
+        return cls(mean, accuracy, count, ece)
+
+    @classmethod
+    def total(cls, parts: list[Reliability]) -> Reliability:
+        """Of all samples of several parts, one at least."""
+        count = sum(part.count for part in parts)
+        sums = (sum(np.nan_to_num(mean) * part.count for part, mean in ((part, getattr(part, name)) for part in parts)) for name in ("confidence", "accuracy"))
+        return cls.of_sums(*sums, count)
+
     def summary(self) -> dict[str, object]:
         """JSON-ready figures; None for an empty bin."""
         rows = [None if not count else [float(mean), float(share), int(count)]
@@ -32,9 +47,4 @@ def reliability(confidence: np.ndarray, right: np.ndarray, bins: int = 10) -> Re
         raise ValueError("confidences must lie in [0, 1]")
     row = np.minimum((np.asarray(confidence, np.float64) * bins).astype(np.int64), bins - 1)
     count = np.bincount(row, minlength=bins)
-    some = np.where(count > 0, count, np.nan)
-    mean = np.bincount(row, confidence, minlength=bins) / some
-    accuracy = np.bincount(row, np.asarray(right, np.float64), minlength=bins) / some
-    total = count.sum()
-    ece = float(np.nansum(count * np.abs(mean - accuracy)) / total) if total else float("nan")
-    return Reliability(mean, accuracy, count, ece)
+    return Reliability.of_sums(np.bincount(row, confidence, minlength=bins), np.bincount(row, np.asarray(right, np.float64), minlength=bins), count)

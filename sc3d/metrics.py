@@ -99,7 +99,7 @@ class JudgedPixels:
 
     def look_up(self, values: np.ndarray) -> np.ndarray:
         """(P,) value of the point that each pixel shows, 0 where there is none. values: (N,) per point of the cloud."""
-        return np.append(values, values.dtype.type(0))[self.rows]
+        return np.where(self.rows >= 0, values[self.rows], values.dtype.type(0))
 
     def confusions(self, predicted: np.ndarray, num_ids: int) -> tuple[Confusion, Confusion]:
         """Confusion of (P,) uint8 predictions inside and outside the band; their sum is that of all pixels."""

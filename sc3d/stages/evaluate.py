@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
+from sc3d.calibration import Reliability
 from sc3d.geometry.cameras import View
 from sc3d.io import read_index_image, write_json
 from sc3d.labelled import LabelledSurface, read_labelled
@@ -45,16 +46,17 @@ def run(scene: Scene, settings: Evaluate) -> dict[str, object]:
         with open_tasks(settings) as tasks:
             surface = look_by_tiles(scene, settings, CloudFile.open(path), tasks)
     views = [view for view in scene.model.views if view.name in truth_files]
-    per_photo, pixels = {}, []
+    per_photo, beliefs = {}, []
     for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
         truth = read_index_image(truth_files[view.name])
         mask = read_index_image(mask_files[view.name]) if view.name in mask_files else None
-        pixels.append(_judged(surface, view, truth, settings.band))
-        per_photo[view.name] = _confusions(pixels[-1], labels.label, class_table.num_ids) | _masks(truth, mask, class_table.num_ids)
+        pixels = _judged(surface, view, truth, settings.band)
+        beliefs.append(pixels.reliability(labels.label, labels.confidence))
+        per_photo[view.name] = _confusions(pixels, labels.label, class_table.num_ids) | _masks(truth, mask, class_table.num_ids)
     parts = {key: total((photo[key] for photo in per_photo.values() if key in photo), class_table.num_ids) for key in SOURCES}
     totals = {key: confusion.summary(class_table) for key, confusion in parts.items() if key != "masks" or mask_files}
     photos = {name: {key: confusion.summary(class_table) for key, confusion in confusions.items()} for name, confusions in per_photo.items()}
-    believed = JudgedPixels.joined(pixels).reliability(labels.label, labels.confidence).summary() if pixels else {}
+    believed = Reliability.total(beliefs).summary() if beliefs else {}
     metrics = {"photos": [view.name for view in views], "classes": [entry.name for entry in class_table]} | totals
     write_json(settings.output or scene.metrics, metrics | {"reliability": believed, "per_photo": photos})
     if isinstance(surface, TiledSurface):
