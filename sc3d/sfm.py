@@ -121,6 +121,7 @@ def _match(database: Path, num_photos: int, settings: Reconstruct) -> None:
 def _map(database: Path, images: Path, work: Path, settings: Reconstruct, num_photos: int, has_gps: bool) -> pycolmap.Reconstruction:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = settings.seed
+    options.num_threads = 1  # with more, sums of larger scenes are rounded otherwise in each run
     options.use_prior_position = has_gps
     options.use_robust_loss_on_prior_position = has_gps
     options.min_model_size = min(10, num_photos)
