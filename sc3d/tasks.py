@@ -79,7 +79,7 @@ def open_tasks(resources: Workers) -> Iterator[Tasks]:
         return
     threads = max(1, (os.cpu_count() or 1) // resources.workers)
     environment = {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
-    cluster = partial(LocalCluster, n_workers=resources.workers, threads_per_worker=1, memory_limit=None, host="127.0.0.1", dashboard_address=None,
+    cluster = partial(LocalCluster, n_workers=resources.workers, threads_per_worker=1, memory_limit=None, host="127.0.0.1", dashboard_address="127.0.0.1:0",
                       resources={"GPU": 1})  # how many of them a GPU can feed is for the user to say
     before = {name: os.environ.get(name) for name in environment}
     os.environ.update(environment)
