@@ -87,6 +87,11 @@ def read_labelled(path: Path, made_by: str) -> tuple[o3d.t.geometry.PointCloud, 
     if not path.exists():
         raise InputError(f"{path} is missing: run `sc3d {made_by} SCENE` first")
     cloud = read_cloud(path)
+    return cloud, take_labels(cloud, path, made_by)
+
+
+def take_labels(cloud: o3d.t.geometry.PointCloud, path: Path, made_by: str) -> Labels:
+    """The labels of a cloud that was read from `path`, checked; its attributes get their proper types."""
     ranges = {"label": (255, np.uint8), "confidence": (1, np.float32), "state": (len(STATE_NAMES) - 1, np.uint8), "num_views": (2**31 - 1, np.int32)}
     missing = [name for name in ranges if name not in cloud.point]
     if missing:
@@ -94,7 +99,7 @@ def read_labelled(path: Path, made_by: str) -> tuple[o3d.t.geometry.PointCloud, 
     labels = Labels(*(_in_range(path, name, cloud.point[name].numpy().ravel(), *ranges[name]) for name in ranges))
     for name in ranges:
         cloud.point[name] = o3d.core.Tensor(getattr(labels, name)[:, None])
-    return cloud, labels
+    return labels
 
 
 def _in_range(path: Path, name: str, values: np.ndarray, largest: int, dtype: type) -> np.ndarray:

@@ -1,5 +1,7 @@
 """LAZ and clouds per class: nothing is lost, and everything lies where the CRS says."""
 
+import io
+
 import laspy
 import numpy as np
 import open3d as o3d
@@ -160,3 +162,19 @@ def test_normals_turn_with_the_grid(tmp_path):
     steep = np.hypot(before[:, 0], before[:, 1]) < 0.2  # their direction in plan is uncertain
     assert np.abs(turned[~steep] - convergence).max() < 0.02 and abs(convergence) > 0.5
     assert np.abs(array(part, "positions") - read_georeference(scene).to_crs(array(cloud, "positions")[array(cloud, "label") == 3])).max() < 1e-6
+
+
+def test_laz_in_parts_holds_what_the_whole_does(tmp_path, monkeypatch):
+    scene = write_scene(tmp_path, random_cloud(), UTM)
+    for settings in (Export(), Export(classes=("building", "road"))):
+        laz.write(scene, settings)
+        whole = laz.outputs(scene, settings)[0].read_bytes()
+        with monkeypatch.context() as patch:
+            patch.setattr("sc3d.exports.placement.fits", lambda *_: False)
+            patch.setattr("sc3d.tiles.files.CHUNK", 300)
+            figures = laz.write(scene, settings)
+        las, again = (laspy.read(source) for source in (io.BytesIO(whole), laz.outputs(scene, settings)[0]))
+        assert len(las.points) == figures["points"] == len(again.points)
+        for name in las.point_format.dimension_names:
+            np.testing.assert_array_equal(las[name], again[name], err_msg=name)
+        np.testing.assert_array_equal(las.header.offsets, again.header.offsets)

@@ -341,3 +341,18 @@ def test_a_cloud_that_cannot_be_read_in_parts_is_refused(tmp_path):
         CloudFile.open(tmp_path / "text.ply")
     with pytest.raises(InputError, match="PLY, LAS or LAZ"):
         CloudFile.open(tmp_path / "cloud.xyz")
+
+
+def test_a_laz_cloud_is_labelled(site, tmp_path):
+    """Normals are estimated by tile; positions are rounded to a millimetre."""
+    source = read_cloud(site / "cloud.ply")
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = [1e-3] * 3
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = source.point.positions.numpy().T
+    las.write(tmp_path / "cloud.laz")
+    label.run(Scene(site), Label(cloud=tmp_path / "cloud.laz", output=tmp_path / "laz.ply"))
+    found, expected = columns(tmp_path / "laz.ply"), run_label(site, "from_ply")
+    both = (found["label"] > 0) & (expected["label"] > 0)
+    assert both.mean() > 0.7 and (found["label"] == expected["label"])[both].mean() > 0.98
+    np.testing.assert_allclose(found["positions"], source.point.positions.numpy(), atol=1e-3)

@@ -10,7 +10,7 @@ import numpy as np
 import sc3d
 from sc3d.classes import ClassTable
 from sc3d.errors import InputError
-from sc3d.exports.placement import PlacedCloud, chosen_classes, read_placed_cloud
+from sc3d.exports.placement import PlacedCloud, chosen_classes, placed_chunks
 from sc3d.io import atomic_path
 from sc3d.scene import Scene
 from sc3d.settings import Export
@@ -34,19 +34,23 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/labelled.laz`: point format 7 (6 without colours); positions to 1 mm in the CRS, or in the scene's frame without one."""
-    placed = read_placed_cloud(scene, settings)
-    table = scene.class_table()
-    rows = np.flatnonzero(np.isin(placed.labels.label, sorted(chosen_classes(scene, settings))))
-    if not len(rows):
+    ids, codes = sorted(chosen_classes(scene, settings)), asprs_codes(scene.class_table())
+    low, high, counts, placed = np.full(3, np.inf), np.full(3, -np.inf), np.zeros(256, np.int64), None
+    for placed in placed_chunks(scene, settings):
+        rows = np.isin(placed.labels.label, ids)
+        if rows.any():
+            low, high = np.minimum(low, placed.points[rows].min(axis=0)), np.maximum(high, placed.points[rows].max(axis=0))
+        counts += np.bincount(codes[placed.labels.label[rows]], minlength=256)
+    if not counts.any():
         raise InputError(f"no point has one of the classes {', '.join(settings.classes)}: nothing to write")
-    header = make_header(placed, rows)
-    codes = asprs_codes(table)
+    header, placement = make_header(low, high, placed), placed.placement
     with atomic_path(outputs(scene, settings)[0]) as temporary, laspy.open(str(temporary), mode="w", header=header) as writer:
-        for start in range(0, len(rows), CHUNK):
-            writer.write_points(point_record(placed, rows[start : start + CHUNK], header, codes))
-    counts = np.bincount(codes[placed.labels.label[rows]])
+        for placed in placed_chunks(scene, settings):
+            rows = np.flatnonzero(np.isin(placed.labels.label, ids))
+            for start in range(0, len(rows), CHUNK):
+                writer.write_points(point_record(placed, rows[start : start + CHUNK], header, codes))
     used = {str(code): int(counts[code]) for code in np.flatnonzero(counts)}
-    return {"points": len(rows), **placed.placement.figures(), "points_by_asprs_code": used}
+    return {"points": int(counts.sum()), **placement.figures(), "points_by_asprs_code": used}
 
 
 def asprs_codes(table: ClassTable) -> np.ndarray:
@@ -57,9 +61,11 @@ def asprs_codes(table: ClassTable) -> np.ndarray:
     return codes
 
 
-def make_header(placed: PlacedCloud, rows: np.ndarray) -> laspy.LasHeader:
-    """LAS 1.4 header of the points `rows` (K,); InputError if they span more than whole millimetres in 32 bits can hold."""
-    low, high = placed.points[rows].min(axis=0), placed.points[rows].max(axis=0)
+def make_header(low: np.ndarray, high: np.ndarray, placed: PlacedCloud) -> laspy.LasHeader:
+    """LAS 1.4 header of points between low and high (3,), CRS; InputError if they span more than whole millimetres in 32 bits can hold.
+
+    placed: some of them, for what all have
+    """
     offsets = np.floor(low / OFFSET_STEP) * OFFSET_STEP
     if ((high - offsets) / SCALE >= 2**31).any():
         raise InputError(f"the cloud spans {(high - low).max():.0f} units, too much for LAZ at 1 mm: remove stray points first")

@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import open3d as o3d
 
+from sc3d.classes import ClassTable
 from sc3d.errors import InputError
 from sc3d.fusion import Labels
 from sc3d.georeferencing.georeference import Georeference, projected_crs, read_georeference
-from sc3d.labelled import read_labelled
+from sc3d.labelled import read_labelled, take_labels
 from sc3d.scene import Scene
-from sc3d.settings import Export
+from sc3d.settings import Export, Resources
+from sc3d.tiles.files import CloudFile, columns, positions
+from sc3d.tiles.plan import fits, num_points
 
 if TYPE_CHECKING:
     import pyproj
 
 logger = logging.getLogger(__name__)
+
+BYTES = 250  # of a point while a cloud is exported as a whole
 
 
 @dataclass(frozen=True)
@@ -112,11 +119,36 @@ class PlacedCloud:
 def read_placed_cloud(scene: Scene, settings: Export) -> PlacedCloud:
     """Read the labelled cloud, check its labels against the class table and move it into the CRS."""
     cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
-    unknown = scene.class_table().unknown(labels.label)
-    if unknown:
-        raise InputError(f"{settings.labelled or scene.labelled} has class id {unknown[0]}, which is not in {scene.classes}: add it there")
+    _require_known(scene.class_table(), labels, settings.labelled or scene.labelled, scene)
     placement = find_placement(scene, settings)
     return PlacedCloud(cloud, labels, placement.points(cloud.point.positions.numpy()), placement)
+
+
+def _require_known(table: ClassTable, labels: Labels, path: Path, scene: Scene) -> None:
+    unknown = table.unknown(labels.label)
+    if unknown:
+        raise InputError(f"{path} has class id {unknown[0]}, which is not in {scene.classes}: add it there")
+
+
+def placed_chunks(scene: Scene, settings: Export) -> Iterator[PlacedCloud]:
+    """The same in parts, in order; as a whole if that fits into half of the machine's memory."""
+    path = settings.labelled or scene.labelled
+    count = num_points(path) if path.exists() else None
+    if count is None or fits(count * BYTES, Resources()):
+        yield read_placed_cloud(scene, settings)
+        return
+    placement, table = find_placement(scene, settings), scene.class_table()
+    for _, records in CloudFile.open(path).chunks():
+        cloud = o3d.t.geometry.PointCloud(positions(records))
+        for name in ("label", "confidence", "state", "num_views"):
+            if name in records.dtype.names:
+                cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(records[name])[:, None])
+        colors = columns(records, ("red", "green", "blue"))
+        if colors is not None:
+            cloud.point.colors = o3d.core.Tensor(colors)
+        labels = take_labels(cloud, path, "propagate")
+        _require_known(table, labels, path, scene)
+        yield PlacedCloud(cloud, labels, placement.points(positions(records)), placement)
 
 
 def chosen_classes(scene: Scene, settings: Export) -> set[int]:

@@ -49,11 +49,11 @@ def run(scene: Scene, settings: Label) -> dict[str, object]:
 
 
 def _fits(scene: Scene, source: Path, settings: Label) -> bool:
-    """Whether cloud and mesh fit into memory as a whole, and nobody asked for workers."""
+    """Whether cloud and mesh fit into memory as a whole, and nobody asked for workers. LAS and LAZ are read in parts in any case."""
     count, triangles = num_points(source), mesh_triangles(scene.mesh)
     if count is None or not source.exists():
         return True  # cannot be read in parts
-    return fits(count * BYTES + triangles * TRIANGLE, settings)
+    return source.suffix.lower() == ".ply" and fits(count * BYTES + triangles * TRIANGLE, settings)
 
 
 def _summary(counts: np.ndarray, voxel_size: float, num_views: int) -> dict[str, object]:
