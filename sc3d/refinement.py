@@ -57,7 +57,7 @@ def material_of(scene: Scene, masks: Masks) -> Material:
     cloud = read_given_cloud(scene, None)
     points, normals = point_arrays(cloud, np.array([view.centre for view in masks.views]))
     surface = read_surface(scene.mesh, points, normals, local_origin(masks.views))
-    seen = LabelledSurface(surface, NeighborIndex(points), np.zeros(len(points), np.uint8), REACH * spacing_of(points))
+    seen = LabelledSurface(surface, NeighborIndex(points, points.min(axis=0)), np.zeros(len(points), np.uint8), REACH * spacing_of(points))
     colors = cloud.point.colors.numpy() if "colors" in cloud.point else None
     return Material(Cloud(points, normals), colors, seen, scene.class_table().num_ids, Label(voxel_size=default_voxel_size(points, masks)))
 

@@ -559,7 +559,7 @@ class TestClouds:
         np.testing.assert_array_equal(table["intensity"].ravel(), np.arange(100))
 
     @pytest.mark.parametrize("name, content, word", [
-        ("a.xyz", "1 2\n3 4\n", "x y z"), ("a.xyz", "1 2 3\n1 2 x\n", "line 2"), ("a.xyz", "", "x y z"), ("a.las", "nothing", "cannot read"), ("a.obj", "v 1 2 3\n", "no triangles"),
+        ("a.xyz", "1 2\n3 4\n", "x y z"), ("a.xyz", "1 2 3\n1 2 x\n", "line 2"), ("a.xyz", "", "x y z"), ("a.las", "nothing", "is not a LAS file"), ("a.obj", "v 1 2 3\n", "no triangles"),
         ("a.obj", "v 1 2 3\nf 1 2 9\n", "does not hold"), ("a.xyz", "nan 1 2\n1 2 3\n", "finite"), ("a.stl", "solid", "can be read")])
     def test_broken_files(self, capsys, tmp_path, name, content, word):
         (tmp_path / name).write_text(content)

@@ -92,7 +92,7 @@ def load_place(scene: Scene, every: int) -> Place:
     cloud = read_cloud(scene.cloud)
     points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
     surface = read_surface(scene.mesh, points, normals, local_origin(views))
-    index, reach = NeighborIndex(points), REACH * spacing_of(points)
+    index, reach = NeighborIndex(points, points.min(axis=0)), REACH * spacing_of(points)
     photos = [view for view in views if view.name in truth_files]
     photos = photos[:: max(1, min(every, len(photos) // FEW))]
     parts = []
