@@ -69,6 +69,7 @@ def open_tasks(resources: Workers) -> Iterator[Tasks]:
         from distributed import Client, LocalCluster
     except ImportError:
         raise InputError("--workers and --cluster need Dask: pip install 'sc3d[cluster]'") from None
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # importing it sets INFO
     if resources.cluster:
         try:
             client = Client(resources.cluster, timeout="20s", set_as_default=False)
