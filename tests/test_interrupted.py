@@ -139,8 +139,12 @@ def test_ctrl_c_is_one_clear_line(finished, tmp_path, monkeypatch, capsys):
     shutil.copytree(finished, scene)
     before = contents(scene)
     monkeypatch.setattr(label, "fuse", lambda *_: signal.raise_signal(signal.SIGINT))
-    with pytest.raises(SystemExit) as stopped:
-        main(["label", str(scene), "--overwrite"])
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts background jobs deaf to Ctrl-C
+    try:
+        with pytest.raises(SystemExit) as stopped:
+            main(["label", str(scene), "--overwrite"])
+    finally:
+        signal.signal(signal.SIGINT, handler)
     told = capsys.readouterr().err
     assert stopped.value.code == 130
     assert told.count("\n") == 1 and "interrupted; finished work is kept" in told
