@@ -173,7 +173,7 @@ def _read_geometry(path: Path, reader: str, suffixes: set[str]):  # noqa: ANN202
     try:
         with redirect_stdout(told):
             geometry = getattr(o3d.t.io, reader)(str(path))
-            names = list(geometry.point) if hasattr(geometry, "point") else list(geometry.vertex)  # noqa: F841 - fails for names that are no text
+            list(geometry.point if hasattr(geometry, "point") else geometry.vertex)  # fails for names that are no text
     except (RuntimeError, ValueError, IndexError) as error:
         told.write(f"failed: {error}")
     failure = re.search(r"\b(?:failed|unable to)\b[^\n\x1b]*", told.getvalue().replace(str(path), "the file"), re.IGNORECASE)

@@ -42,9 +42,10 @@ def run(scene: Scene, settings: Evaluate) -> dict[str, object]:
         cloud, labels = read_labelled(path, "propagate")
         surface = LabelledSurface.build(cloud, scene.model.views, scene.mesh)
     else:
-        labels = read_labels(CloudFile.open(path))
+        cloud = CloudFile.open(path)
+        labels = read_labels(cloud)
         with open_tasks(settings) as tasks:
-            surface = look_by_tiles(scene, settings, CloudFile.open(path), tasks)
+            surface = look_by_tiles(scene, settings, cloud, tasks)
     views = [view for view in scene.model.views if view.name in truth_files]
     per_photo, beliefs = {}, []
     for view in tqdm(views, desc="evaluating", unit="photo", disable=None):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.fusion import Cloud, Extent, Fusion, Labels, fuse
+from sc3d.fusion import Cloud, Extent, Fusion, fuse
 from sc3d.geometry.cameras import local_origin
 from sc3d.geometry.neighbors import NeighborIndex, point_spacing
 from sc3d.geometry.voxels import BLOCK, VOXELS, sort_by_voxel, voxel_origin

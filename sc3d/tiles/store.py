@@ -72,11 +72,11 @@ class Survey:
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
         axes = tuple(sorted(np.argsort(high - low, kind="stable")[1:].tolist()))
         steps, counts = np.zeros((3, MIDDLE_STEPS), np.int64), np.zeros(RASTER * RASTER, np.int64)
-        fine = _square_grid(low, high, axes, 1 / RASTER)
+        fine = Grid(low[list(axes)], float((high - low).max()) / RASTER or 1.0, (RASTER, RASTER), axes)
         for _, records in cloud.chunks():
             points = positions(records)
             steps += count_steps(points, low, high)
-            counts += np.bincount(fine.tile_of(points), minlength=RASTER * RASTER)[: RASTER * RASTER]
+            counts += np.bincount(fine.tile_of(points), minlength=RASTER * RASTER)
         return cls(Extent(low, high, middle_of(steps, low, high)), axes, counts.reshape(RASTER, RASTER))
 
     @property
@@ -100,18 +100,14 @@ class Survey:
             held = sums[np.ix_(high, high)] - sums[np.ix_(low, high)] - sums[np.ix_(high, low)] + sums[np.ix_(low, low)]
             if held.max() <= max_points:
                 break
-        return _square_grid(self.extent.low, self.extent.high, self.axes, 1 / parts)
+        return _square_grid(self.extent, self.axes, parts)
 
 
-def _square_grid(low: np.ndarray, high: np.ndarray, axes: tuple[int, int], share: float) -> Grid:
-    """Tiles of this share of the longer side; along the shorter, as many as are needed."""
-    axis = list(axes)
-    extent = (high - low)[axis]
-    size = float(extent.max() * share) or 1.0
-    count = tuple(int(n) for n in np.clip(np.ceil(extent / size - 1e-9), 1, round(1 / share)))
-    if share == 1 / RASTER:
-        count = (RASTER, RASTER)
-    return Grid(low[axis], size, count, axes)
+def _square_grid(extent: Extent, axes: tuple[int, int], parts: int) -> Grid:
+    """So many tiles along the longer side; along the shorter, as many as are needed."""
+    sides = (extent.high - extent.low)[list(axes)]
+    size = float(sides.max()) / parts or 1.0
+    return Grid(extent.low[list(axes)], size, tuple(int(count) for count in np.clip(np.ceil(sides / size - 1e-9), 1, parts)), axes)
 
 
 @dataclass(frozen=True)
