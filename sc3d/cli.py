@@ -76,11 +76,11 @@ def _describe(record: type) -> str:
 
 
 def _dispatch(name: str, command: object) -> None:
-    from sc3d.scene import Scene
-    from sc3d.stages import execute, require_writable
+    from sc3d.scene.scene import Scene
+    from sc3d.runner import execute, require_writable
 
     if name in COMMANDS:
-        importlib.import_module(f"sc3d.stages.{MODULES.get(name, name)}").main(command)
+        importlib.import_module(f"sc3d.runner.{MODULES.get(name, name)}").main(command)
         return
     require_writable(command.scene)
     execute(name, Scene(command.scene), command.settings, command.overwrite)

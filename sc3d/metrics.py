@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from sc3d.calibration import Reliability, reliability
-from sc3d.classes import ClassTable
+from sc3d.scene.class_table import ClassTable
 
 
 @dataclass(frozen=True)

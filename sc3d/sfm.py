@@ -18,7 +18,7 @@ from tqdm import tqdm
 from sc3d.georeferencing.alignment import Similarity, main_plane
 from sc3d.georeferencing.control_points import ControlPoints, align_to_control_points, transform
 from sc3d.errors import InputError, Sc3dError
-from sc3d.files import require_room, telling_of_full_disk, temporary_name
+from sc3d.io.atomic import require_room, telling_of_full_disk, temporary_name
 from sc3d.georeferencing.focal import anchor_focal, tells_focal
 from sc3d.georeferencing.georeference import Georeference, from_origin
 from sc3d.georeferencing.gps import Flight, place, read_flight, residuals

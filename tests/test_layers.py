@@ -9,20 +9,20 @@ ROOT = Path(sc3d.__file__).parent
 # lowest first; a module may import its own layer and those below
 LAYERS = [
     ["sc3d.errors"],
-    ["sc3d.splatting.settings", "sc3d.synthetic.settings"],
+    ["sc3d.settings.train", "sc3d.settings.synthesize"],
     ["sc3d.settings"],
     ["sc3d.commands"],
     ["sc3d.geometry"],
-    ["sc3d.files", "sc3d.formats"],
-    ["sc3d.calibration", "sc3d.classes", "sc3d.io"],
-    ["sc3d.manual", "sc3d.tasks"],
-    ["sc3d.scene"],
+    ["sc3d.io.atomic", "sc3d.io.limits"],
+    ["sc3d.calibration", "sc3d.scene.class_table", "sc3d.io"],
+    ["tools.make_manual", "sc3d.tiling.executor"],
+    ["sc3d.scene.scene"],
     ["sc3d.georeferencing"],
-    ["sc3d.imports", "sc3d.splatting", "sc3d.sfm", "sc3d.segmentation", "sc3d.synthetic", "sc3d.density", "sc3d.verification", "sc3d.voting_kernels", "sc3d.voting", "sc3d.fusion", "sc3d.metrics"],
-    ["sc3d.propagation", "sc3d.labelled", "sc3d.labelling"],
-    ["sc3d.view", "sc3d.exports", "sc3d.refinement", "sc3d.annotate", "sc3d.tiles"],
+    ["sc3d.importers", "sc3d.splatting", "sc3d.sfm", "sc3d.segmentation", "sc3d.synthetic", "sc3d.labelling.density", "sc3d.labelling.verification", "sc3d.labelling.voting_kernels", "sc3d.labelling.voting", "sc3d.labelling.fusion", "sc3d.metrics"],
+    ["sc3d.propagation", "sc3d.scene.labelled_cloud", "sc3d.labelling.inputs"],
+    ["sc3d.view", "sc3d.exporters", "sc3d.segmentation.mask_refinement", "sc3d.annotate", "sc3d.tiling"],
     ["sc3d.report"],
-    ["sc3d.stages", "sc3d.benchmark"],
+    ["sc3d.runner", "tools.benchmark"],
     ["sc3d.cli"],
 ]
 SIDE_BY_SIDE = {"sc3d.splatting", "sc3d.sfm", "sc3d.segmentation", "sc3d.synthetic"}  # stages' packages that must not know one another
@@ -66,13 +66,13 @@ def test_every_module_has_a_layer():
 def test_stage_packages_do_not_know_one_another():
     crossing = [f"{module} imports {name}" for module, names in modules().items() for name in names
                 if package(module) in SIDE_BY_SIDE and package(name) in SIDE_BY_SIDE and package(module) != package(name)]
-    stages = [f"{module} imports {name}" for module, names in modules().items() if module.startswith("sc3d.stages.") and module != "sc3d.stages.run"
-              for name in names if name.startswith("sc3d.stages.")]
+    stages = [f"{module} imports {name}" for module, names in modules().items() if module.startswith("sc3d.runner.") and module != "sc3d.commands.run"
+              for name in names if name.startswith("sc3d.runner.")]
     assert not crossing and not stages
 
 
 def test_torch_lives_in_splatting_and_segmentation_only():
-    homes = ("sc3d.splatting", "sc3d.segmentation", "sc3d.benchmark")  # the benchmark takes splatting apart to time it
+    homes = ("sc3d.splatting", "sc3d.segmentation", "tools.benchmark")  # the benchmark takes splatting apart to time it
     assert not [module for module, names in modules().items() if not module.startswith(homes) and any(name.split(".")[0] in ("torch", "transformers") for name in names)]
 
 

@@ -27,7 +27,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
+sys.path.insert(0, str(ROOT))
 
 PART = 500  # cases
 SECONDS = 2.0
@@ -46,7 +46,7 @@ def main() -> None:
     arguments.folder.mkdir(parents=True, exist_ok=True)
     if arguments.atheris:
         return guided(arguments.atheris, rest)
-    from readers import READERS
+    from tests.robustness.readers import READERS
 
     if arguments.only:
         name, number = arguments.only.rsplit(":", 1)
@@ -117,7 +117,7 @@ class Fixture:
     """The valid files of a reader, in memory and in a folder."""
 
     def __init__(self, name: str) -> None:
-        from readers import READERS
+        from tests.robustness.readers import READERS
 
         self.name, self.reader = name, READERS[name]
         self.folder = Path(tempfile.mkdtemp(prefix=f"sc3d-fuzz-{os.getppid()}-", dir="/dev/shm")) / "files"
@@ -126,8 +126,8 @@ class Fixture:
 
     def case(self, number: int) -> dict[str, bytes]:
         """Damaged contents of one file, or sometimes of two."""
-        from hostile_files import damage, damage_json
-        from readers import TEXT
+        from tests.robustness.hostile_files import damage, damage_json
+        from tests.robustness.readers import TEXT
 
         rng = random.Random(f"{self.name}:{number}")
         chosen = rng.sample(self.reader.targets, 2 if len(self.reader.targets) > 1 and rng.random() < 0.1 else 1)

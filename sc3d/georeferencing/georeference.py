@@ -24,7 +24,7 @@ from sc3d.io import read_json, write_json
 if TYPE_CHECKING:
     import pyproj
 
-    from sc3d.scene import Scene
+    from sc3d.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
 

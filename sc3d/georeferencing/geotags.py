@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.formats.images import open_image
+from sc3d.io.images import open_image
 from sc3d.georeferencing.georeference import geodetic_to_enu
 
 STANDARD_DEVIATION = (1.0, 1.0, 1.0)  # m, of GPS that states none: what positions of one flight are worth against one another

@@ -9,9 +9,9 @@ from importlib import resources
 from pathlib import Path
 
 from sc3d.io import atomic_path
-from sc3d.report.material import gather
+from sc3d.report.data import gather
 from sc3d.report.sections import headline, sections, summary_line
-from sc3d.scene import Scene
+from sc3d.scene.scene import Scene
 
 __all__ = ["write_report"]
 

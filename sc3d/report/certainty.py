@@ -7,7 +7,7 @@ from html import escape
 import numpy as np
 
 from sc3d.report.charts import css_color, histogram, number, reliability_curve, stacked_bar
-from sc3d.report.material import Material
+from sc3d.report.data import Material
 from sc3d.view.colors import STATES, confidence_colors
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View
 from sc3d.io import read_image, read_index_image
-from sc3d.report.material import Material
-from sc3d.labelled import LabelledSurface
+from sc3d.report.data import Material
+from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.view import COLOURINGS, Style, color_points, draw_points, screenshot
 
 logger = logging.getLogger(__name__)

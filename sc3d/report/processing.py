@@ -6,7 +6,7 @@ import json
 from html import escape
 
 from sc3d.report.charts import formatted, number
-from sc3d.report.material import Material
+from sc3d.report.data import Material
 
 _BLOCKS = {"settings": "Settings", "summary": "Results", "inputs": "Inputs and their hashes", "versions": "Versions"}
 

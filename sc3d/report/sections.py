@@ -11,11 +11,11 @@ import numpy as np
 from sc3d.io import read_image
 from sc3d.report.certainty import certainty_section
 from sc3d.report.charts import css_color, flight_map, number, paired_bars
-from sc3d.report.found import found_section, iou_of
+from sc3d.report.objects import found_section, iou_of
 from sc3d.report.images import cloud_pictures, comparison, ground_picture, jpeg
-from sc3d.report.material import Material
+from sc3d.report.data import Material
 from sc3d.report.processing import processing_section
-from sc3d.labelled import LabelledSurface
+from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.view import color_points
 from sc3d.view.colors import confidence_colors, legend_entries
 

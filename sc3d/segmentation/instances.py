@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.classes import ClassTable
+from sc3d.scene.class_table import ClassTable
 from sc3d.io import write_json
-from sc3d.segmentation.runs import Window, area, bounds, encode_runs, find_runs, iou, move_runs
+from sc3d.segmentation.rle import Window, area, bounds, encode_runs, find_runs, iou, move_runs
 
 SAME_OBJECT = 0.5  # two masks of one class with a larger intersection over union are one object
 
@@ -19,7 +19,7 @@ SAME_OBJECT = 0.5  # two masks of one class with a larger intersection over unio
 class Instance:
     """One object that a segmenter found in a photo.
 
-    runs: (K, 2) int64 runs of the mask (`sc3d.segmentation.runs`)
+    runs: (K, 2) int64 runs of the mask (`sc3d.segmentation.rle`)
     size: (height, width) of the photo, px
     class_id: 1 to 255
     box_score, mask_score: 0 to 1, how sure the detector is of the class and the segmenter of the outline

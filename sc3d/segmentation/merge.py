@@ -8,7 +8,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.segmentation.instances import Instance, useful
-from sc3d.segmentation.runs import Window, fill_runs
+from sc3d.segmentation.rle import Window, fill_runs
 
 
 class Areas(NamedTuple):

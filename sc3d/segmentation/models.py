@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sc3d.errors import InputError, MissingPackageError
-from sc3d.segmentation.runs import find_runs
+from sc3d.segmentation.rle import find_runs
 from sc3d.segmentation.weights import model_type
 from sc3d.settings import Segment
 

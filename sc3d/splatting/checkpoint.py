@@ -7,7 +7,7 @@ from dataclasses import fields
 import torch
 
 from sc3d.geometry.cameras import View
-from sc3d.splatting.densify import Statistics
+from sc3d.splatting.strategy import Statistics
 from sc3d.splatting.gaussians import Gaussians
 
 

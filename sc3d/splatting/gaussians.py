@@ -10,9 +10,9 @@ import torch
 from scipy.spatial import cKDTree
 
 from sc3d.errors import InputError
-from sc3d.files import atomic_path
-from sc3d.formats import FARTHEST
-from sc3d.formats.ply import check_ply
+from sc3d.io.atomic import atomic_path
+from sc3d.io.limits import FARTHEST
+from sc3d.io.ply import check_ply
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic Y_0."""

@@ -22,7 +22,7 @@ from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import View
 from sc3d.splatting.device import INSTALL
 from sc3d.splatting.gaussians import Gaussians
-from sc3d.splatting.render import Rendering, ViewStatistics
+from sc3d.splatting.rendering import Rendering, ViewStatistics
 
 TILE = 16
 NEAR = 0.01

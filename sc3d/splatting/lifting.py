@@ -14,10 +14,11 @@ import torch
 from tqdm import tqdm
 
 from sc3d.geometry.cameras import View
-from sc3d.splatting import kernels_lift, kernels_project
+from sc3d.splatting.cpu import label_lifting as kernels_lift
+from sc3d.splatting.cpu import projection as kernels_project
 from sc3d.splatting.device import has_kernels
 from sc3d.splatting.gaussians import SH_C0, Gaussians
-from sc3d.splatting.render import camera_array, interleaved, render, sort_into_tiles
+from sc3d.splatting.rendering import camera_array, interleaved, render, sort_into_tiles
 
 SCALE = 1 << 30  # evidence of one whole pixel, in fixed point: 2^63 of it are 8 thousand million pixels
 ReadMask = Callable[[View], tuple[np.ndarray, np.ndarray | None]]

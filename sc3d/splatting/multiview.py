@@ -9,7 +9,7 @@ import torch
 from sc3d.geometry.cameras import View
 from sc3d.splatting import losses
 from sc3d.splatting.consistency import pixel_rays, reprojection_error
-from sc3d.splatting.render import Rendering
+from sc3d.splatting.rendering import Rendering
 
 PIXELS_PER_PATCH = 4
 """the geometric term looks at this many times more pixels than the photometric one"""

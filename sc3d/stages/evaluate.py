@@ -11,14 +11,14 @@ from tqdm import tqdm
 from sc3d.calibration import Reliability
 from sc3d.geometry.cameras import View
 from sc3d.io import read_index_image, write_json
-from sc3d.labelled import LabelledSurface, read_labelled
+from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
 from sc3d.metrics import Confusion, JudgedPixels, depth_edge_band, total
-from sc3d.scene import Scene
+from sc3d.scene.scene import Scene
 from sc3d.settings import Evaluate
-from sc3d.tasks import open_tasks
-from sc3d.tiles.evaluate import BYTES, TiledSurface, look_by_tiles, read_labels
-from sc3d.tiles.files import CloudFile
-from sc3d.tiles.plan import TRIANGLE, fits, mesh_triangles, num_points
+from sc3d.tiling.executor import open_tasks
+from sc3d.tiling.evaluate import BYTES, TiledSurface, look_by_tiles, read_labels
+from sc3d.io.chunked_clouds import CloudFile
+from sc3d.tiling.memory import TRIANGLE, fits, mesh_triangles, num_points
 
 SOURCES = ("labels", "masks", "labels_near_edges", "labels_elsewhere")  # order of the figures
 

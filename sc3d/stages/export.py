@@ -1,4 +1,4 @@
-"""Labelled scene -> files for other programs, each format by a module of `sc3d.exports`."""
+"""Labelled scene -> files for other programs, each format by a module of `sc3d.exporters`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import importlib
 from pathlib import Path
 
 from sc3d.georeferencing.georeference import georeference_path
-from sc3d.scene import Scene
+from sc3d.scene.scene import Scene
 from sc3d.settings import Export
 
 MODULES = {"masks": "masks", "laz": "laz", "clouds": "clouds", "splats": "splats", "spz": "spz", "orthophoto": "orthophoto", "objects": "objects",
@@ -31,5 +31,5 @@ def run(scene: Scene, settings: Export) -> dict[str, object]:
     return figures
 
 
-def _module(name: str):  # noqa: ANN202 - a module of sc3d.exports; its packages load late
-    return importlib.import_module(f"sc3d.exports.{MODULES[name]}")
+def _module(name: str):  # noqa: ANN202 - a module of sc3d.exporters; its packages load late
+    return importlib.import_module(f"sc3d.exporters.{MODULES[name]}")

@@ -10,11 +10,11 @@ import open3d as o3d
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import project, resample, undistorted
 from sc3d.io import read_image, write_geometry
-from sc3d.scene import Scene, check_photos
+from sc3d.scene.scene import Scene, check_photos
 from sc3d.settings import Extract
-from sc3d.splatting.extraction import DepthViews, centre_cloud, extract_surface
-from sc3d.splatting.neighbours import neighbour_views
-from sc3d.splatting.pictures import load_gaussians
+from sc3d.extraction import DepthViews, centre_cloud, extract_surface
+from sc3d.geometry.view_selection import neighbour_views
+from sc3d.view.splat_images import load_gaussians
 
 
 def inputs(scene: Scene, settings: Extract) -> list[Path]:

@@ -7,16 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.fusion import PROPAGATED
+from sc3d.labelling.fusion import PROPAGATED
 from sc3d.io import write_geometry
-from sc3d.labelled import read_labelled, read_votes, with_labels
-from sc3d.propagation import Evidence, complete
-from sc3d.scene import Scene
+from sc3d.scene.labelled_cloud import read_labelled, read_votes, with_labels
+from sc3d.propagation import Evidence
+from sc3d.propagation import propagate as complete
+from sc3d.scene.scene import Scene
 from sc3d.settings import Propagate
-from sc3d.tasks import open_tasks
-from sc3d.tiles.files import CloudFile
-from sc3d.tiles.plan import fits, num_points
-from sc3d.tiles.propagate import BYTES, Summary, propagate_tiles
+from sc3d.tiling.executor import open_tasks
+from sc3d.io.chunked_clouds import CloudFile
+from sc3d.tiling.memory import fits, num_points
+from sc3d.tiling.propagate import BYTES, Summary, propagate_tiles
 
 
 def inputs(scene: Scene, settings: Propagate) -> list[Path]:

@@ -10,10 +10,10 @@ from sc3d.georeferencing.control_points import read_control_points
 from sc3d.errors import InputError
 from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
 from sc3d.io import atomic_path, find_photos, image_size
-from sc3d.scene import Scene
+from sc3d.scene.scene import Scene
 from sc3d.settings import Reconstruct, ReconstructCommand
 from sc3d.sfm import reconstruct
-from sc3d.stages import execute, require_writable
+from sc3d.runner import execute, require_writable
 
 
 def main(command: ReconstructCommand) -> None:

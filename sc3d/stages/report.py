@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sc3d.report import write_report
-from sc3d.scene import Scene
+from sc3d.scene.scene import Scene
 from sc3d.settings import Report
 
 

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from sc3d.classes import ClassTable
+from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
-from sc3d.files import discard, remove_leftovers
+from sc3d.io.atomic import discard, remove_leftovers
 from sc3d.io import atomic_path, digest, find_photos, read_json, write_image, write_json
-from sc3d.scene import Scene, photo_sizes
+from sc3d.scene.scene import Scene, photo_sizes
 from sc3d.settings import Segment
 
 if TYPE_CHECKING:
-    from sc3d.segmentation.run import Folders
+    from sc3d.segmentation.segment import Folders
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
     discard(scene.confidence_refined)  # it belongs to the masks that are replaced
     if settings.backend == "files":
         return _import(scene, settings, class_table)
-    from sc3d.segmentation.run import Folders, segment_photos
+    from sc3d.segmentation.segment import Folders, segment_photos
 
     class_table = with_prompts(class_table, settings.prompts)
     segmenter = _segmenter(scene, settings, class_table)
@@ -84,9 +84,9 @@ def _set_aside(folders: Folders, suffix: str) -> None:
             logger.info("%s is now %s", folder, aside)
 
 
-def _segmenter(scene: Scene, settings: Segment, class_table: ClassTable):  # noqa: ANN202 - a sc3d.segmentation.run.Segmenter; packages load late
+def _segmenter(scene: Scene, settings: Segment, class_table: ClassTable):  # noqa: ANN202 - a sc3d.segmentation.segment.Segmenter; packages load late
     if settings.backend == "strokes":
-        from sc3d.segmentation.strokes import Strokes
+        from sc3d.segmentation.strokes.backend import Strokes
 
         return Strokes.learn(settings.strokes or scene.strokes, scene.images, class_table)
     if settings.backend == "sam3":
@@ -111,8 +111,8 @@ def with_prompts(class_table: ClassTable, prompts: tuple[str, ...]) -> ClassTabl
 
 def _refine(scene: Scene, settings: Segment) -> dict[str, object]:
     """Lower the confidence of doubted masks, if that helps."""
-    from sc3d.labelling import Masks
-    from sc3d.refinement import material_of, refine
+    from sc3d.labelling.inputs import Masks
+    from sc3d.segmentation.mask_refinement import material_of, refine
 
     if settings.backend != "files" or settings.masks is not None:
         raise InputError("--refine works on the masks that are in the scene: make them first, then run `sc3d segment SCENE --refine`")
@@ -129,7 +129,7 @@ def _refine(scene: Scene, settings: Segment) -> dict[str, object]:
 
 
 def _import(scene: Scene, settings: Segment, class_table: ClassTable) -> dict[str, object]:
-    from sc3d.segmentation.files import MaskFiles, import_masks, warn_of_turned
+    from sc3d.segmentation.mask_formats.import_masks import MaskFiles, import_masks, warn_of_turned
 
     if settings.masks is None:
         if settings.mapping is not None or settings.format not in ("auto", "index"):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from sc3d.scene import Scene
+from sc3d.scene.scene import Scene
 from sc3d.settings import Synthesize
 from sc3d.synthetic import synthesize
 

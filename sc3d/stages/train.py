@@ -6,17 +6,17 @@ import hashlib
 from pathlib import Path
 
 from sc3d.errors import InputError
-from sc3d.files import remove
+from sc3d.io.atomic import remove
 from sc3d.io import digest
-from sc3d.scene import Scene, check_photos
+from sc3d.scene.scene import Scene, check_photos
 from sc3d.settings import Train
 from sc3d.splatting.block_tasks import BlockJob, train_blocks
 from sc3d.splatting.blocks import split_blocks
-from sc3d.splatting.data import TrainingData, scene_data
+from sc3d.splatting.dataset import TrainingData, scene_data
 from sc3d.splatting.device import pick_device
 from sc3d.splatting.train import TrainResult, train, write_log
-from sc3d.tasks import open_tasks
-from sc3d.view.sheet import write_training_sheet
+from sc3d.tiling.executor import open_tasks
+from sc3d.view.contact_sheet import write_training_sheet
 
 
 def inputs(scene: Scene, settings: Train) -> list[Path]:

@@ -2,7 +2,7 @@
 
 from importlib import import_module
 
-from sc3d.synthetic.settings import SynthesizeSettings
+from sc3d.settings.synthesize import SynthesizeSettings
 
 _HOMES = {"World": "world", "build_world": "world", "fly": "flight", "Photo": "photos", "photograph": "photos", "noisy_mask": "masks",
           "truth_cloud": "cloud", "synthesize": "generate"}

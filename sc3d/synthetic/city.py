@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from sc3d.geometry.cameras import View, pixel_centres, rays
 from sc3d.io import write_image, write_json
-from sc3d.scene import Scene
+from sc3d.scene.scene import Scene
 from sc3d.settings import BenchmarkCity
 from sc3d.synthetic.city_files import CloudFile, MeshFile, open_cloud, open_mesh, write_cameras
 from sc3d.synthetic.city_flight import fly_over
@@ -21,7 +21,7 @@ from sc3d.synthetic.cloud import truth_cloud
 from sc3d.synthetic.generate import CLASSES
 from sc3d.synthetic.masks import noisy_mask
 from sc3d.synthetic.mesh import OTHER
-from sc3d.synthetic.settings import SynthesizeSettings
+from sc3d.settings.synthesize import SynthesizeSettings
 from sc3d.synthetic.shading import surface_labels
 from sc3d.synthetic.world import World, build_world, ray_tensor
 

@@ -7,7 +7,7 @@ import numpy as np
 from sc3d.geometry.cameras import View, look_at, pinhole_view
 from sc3d.settings import BenchmarkCity
 from sc3d.synthetic.flight import focal_length
-from sc3d.synthetic.settings import SynthesizeSettings
+from sc3d.settings.synthesize import SynthesizeSettings
 
 ALTITUDE = 120.0  # m
 TILT = np.radians(40.0)  # of oblique photos, from straight down

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 
 from sc3d.geometry.cameras import View, look_at, pinhole_view
-from sc3d.synthetic.settings import SynthesizeSettings
+from sc3d.settings.synthesize import SynthesizeSettings
 
 FOCAL_35MM = 28  # mm on 36 x 24 mm film; whole, because EXIF stores it so
 

@@ -22,7 +22,7 @@ from sc3d.synthetic.flight import camera_in_model, fly
 from sc3d.synthetic.masks import noisy_mask
 from sc3d.synthetic.mesh import OTHER
 from sc3d.synthetic.photos import Photo, photograph
-from sc3d.synthetic.settings import SynthesizeSettings
+from sc3d.settings.synthesize import SynthesizeSettings
 from sc3d.synthetic.shading import display
 from sc3d.synthetic.world import World, build_world
 

@@ -11,7 +11,7 @@ from sc3d.synthetic.ground import Ground, add_ground, plan_ground
 from sc3d.synthetic.layout import build_fences, park_cars, place_buildings, plant
 from sc3d.synthetic.mesh import LEAF, MeshBuilder, face_normals
 from sc3d.synthetic.objects import Building, add_building
-from sc3d.synthetic.settings import SynthesizeSettings
+from sc3d.settings.synthesize import SynthesizeSettings
 from sc3d.synthetic.shading import SUN, shade, surface_labels
 
 

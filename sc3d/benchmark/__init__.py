@@ -1,1 +1,0 @@
-"""Measurements behind `sc3d benchmark`: how fast training is, how good the surface, the tables of the paper."""

@@ -1,0 +1,57 @@
+"""What this machine has: versions, libraries, Vulkan, CUDA, model weights."""
+
+from __future__ import annotations
+
+import ctypes.util
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from sc3d.errors import Sc3dError
+from sc3d.segmentation.weights import find_weights
+from sc3d.settings import Doctor, Segment
+from sc3d.runner import versions
+
+logger = logging.getLogger(__name__)
+
+PROBES = {  # each in a process of its own: a missing library may abort it
+    "open3d": "import open3d; print('works')",
+    "pycolmap": "import pycolmap; print('works, CUDA' if pycolmap.has_cuda else 'works, CPU')",
+    "torch": "import torch; print(f'works, CUDA {torch.version.cuda}' if torch.cuda.is_available() else 'works, CPU')",
+    "transformers": "import transformers; print('works')",
+    "vulkan pictures": "import open3d as o; o.visualization.rendering.OffscreenRenderer(8, 8); print('work')",
+    "OpenGL pictures": "import open3d as o; v = o.visualization.Visualizer(); print('work' if v.create_window(visible=False) else 'do not work')",
+}
+APT = {"GL": "libgl1", "EGL": "libegl1", "usb-1.0": "libusb-1.0-0", "vulkan": "libvulkan1 mesa-vulkan-drivers"}
+
+
+def main(command: Doctor) -> None:
+    for name, version in versions().items():
+        logger.info("%-22s %s", name, version)
+    missing = [package for library, package in APT.items() if ctypes.util.find_library(library) is None]
+    logger.info("%-22s %s", "system libraries", "complete" if not missing else f"sudo apt-get install --no-install-recommends {' '.join(missing)}")
+    for name, code in PROBES.items():
+        logger.info("%-22s %s", name, _probe(code))
+    logger.info("%-22s %s", "processor cores", os.cpu_count())
+    for model in (Segment.detector, Segment.segmenter, Segment.concept_model):
+        logger.info("%-22s %s", model, _weights(model, command.model_dir))
+
+
+def _probe(code: str) -> str:
+    try:
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    except subprocess.TimeoutExpired:
+        return "no answer within 120 s"
+    if result.returncode == 0 and result.stdout.strip():
+        return result.stdout.strip().splitlines()[-1]
+    lines = (result.stderr.strip() or result.stdout.strip() or f"ended with status {result.returncode}").splitlines()
+    return f"does not work: {lines[-1][:150]}"
+
+
+def _weights(model: str, model_dir: Path | None) -> str:
+    try:
+        return f"found in {find_weights(model, model_dir, download=False)}"
+    except Sc3dError:
+        return "not on this machine"

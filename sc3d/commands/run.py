@@ -1,0 +1,57 @@
+"""All stages in the order of the data flow."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from dataclasses import replace
+
+from sc3d import settings as options
+from sc3d.scene.class_table import read_classes
+from sc3d.errors import InputError
+from sc3d.io import atomic_path
+from sc3d.scene.scene import Scene, match_masks, photo_sizes
+from sc3d.runner import execute
+from sc3d.stages.reconstruct import prepare
+
+logger = logging.getLogger(__name__)
+
+
+def main(command: options.Run) -> None:
+    started = time.perf_counter()
+    scene = Scene(command.scene)
+    segment = replace(command.segment, masks=command.masks or command.segment.masks, confidence=command.confidence or command.segment.confidence)
+    check(command, segment)
+    prepare(command.photos, scene)
+    if command.classes is not None:
+        with atomic_path(scene.classes) as temporary:
+            shutil.copyfile(command.classes, temporary)
+    stages = [
+        ("reconstruct", command.reconstruct), ("train", command.train), ("extract", command.extract), ("segment", replace(segment, refine=False)),
+        *([("segment", options.Segment(refine=True))] if segment.refine else []), ("label", command.label), ("propagate", command.propagate),
+    ]
+    if command.truth is not None:
+        stages.append(("evaluate", options.Evaluate(truth=command.truth)))
+    for name, settings in [*stages, ("report", options.Report())]:
+        execute(name, scene, settings, command.overwrite)
+    logger.info("run: %.0f s; look at %s", time.perf_counter() - started, scene.report)
+
+
+def check(command: options.Run, segment: options.Segment) -> None:
+    """Find what would stop a late stage before the first one starts."""
+    sizes = photo_sizes(command.photos)
+    classes = command.classes or Scene(command.scene).classes
+    if not classes.exists():
+        raise InputError(f"{classes} is missing: pass --classes FILE (data/classes.json of the sc3d repository is one to start from)")
+    class_table = read_classes(classes)
+    if segment.backend == "files":
+        from sc3d.segmentation.mask_formats.import_masks import MaskFiles, check_masks
+
+        masks = segment.masks or Scene(command.scene).masks
+        if not masks.exists():
+            raise InputError("--masks PATH is needed (or --segment.backend strokes or grounded-sam, which make masks)")
+        source = MaskFiles(masks, segment.format, segment.mapping) if segment.masks else MaskFiles(masks, "index")
+        check_masks(source, sizes, class_table, segment.confidence)
+    if command.truth is not None:
+        match_masks(command.truth, sizes, class_table)

@@ -1,0 +1,46 @@
+"""The labelled cloud as one PLY per class, with all its attributes."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+
+from sc3d.errors import InputError
+from sc3d.exporters.projected_cloud import chosen_classes, read_placed_cloud
+from sc3d.io import atomic_path, write_geometry
+from sc3d.scene.scene import Scene
+from sc3d.settings import Export
+
+
+def outputs(scene: Scene, settings: Export) -> list[Path]:
+    return [scene.export / "clouds"]
+
+
+def write(scene: Scene, settings: Export) -> dict[str, object]:
+    """`export/clouds/<id>_<name>.ply` for each class that has points, unlabelled ones too; float64 positions in the CRS, points in their order."""
+    placed = read_placed_cloud(scene, settings)
+    table = scene.class_table()
+    present = [label for label in sorted(chosen_classes(scene, settings)) if (placed.labels.label == label).any()]
+    if not present:
+        raise InputError(f"no point has one of the classes {', '.join(settings.classes)}: nothing to write")
+    cloud = placed.cloud.clone()
+    if "normals" in cloud.point:
+        normals = placed.placement.directions(cloud.point.positions.numpy().astype(np.float64), cloud.point.normals.numpy())
+        cloud.point.normals = o3d.core.Tensor(np.ascontiguousarray(normals))
+    cloud.point.positions = o3d.core.Tensor(np.ascontiguousarray(placed.points))
+    counts = {}
+    with atomic_path(outputs(scene, settings)[0]) as folder:
+        folder.mkdir()
+        for label in present:
+            part = cloud.select_by_mask(o3d.core.Tensor(placed.labels.label == label))
+            write_geometry(folder / f"{label}_{file_name(table.name(label))}.ply", part)
+            counts[table.name(label)] = len(part.point.positions)
+    return {**placed.placement.figures(), "points_by_class": counts}
+
+
+def file_name(name: str) -> str:
+    """A class name that every file system takes."""
+    return re.sub(r"[^\w-]+", "_", name).strip("_") or "class"

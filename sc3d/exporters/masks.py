@@ -1,0 +1,75 @@
+"""Masks back: the fused labels as each photo sees them, through its own camera model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from sc3d.geometry.cameras import View
+from sc3d.io import atomic_path, read_image, read_index_image, write_image
+from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
+from sc3d.scene.scene import Scene
+from sc3d.settings import Export
+from sc3d.view.contact_sheet import side_by_side
+
+
+SHOWN, PANEL = 4, 600  # photos in masks.jpg, and the width of each picture there, px
+
+
+def outputs(scene: Scene, settings: Export) -> list[Path]:
+    return [scene.export / "masks", scene.export / "confidence", scene.export / "masks.jpg"]
+
+
+def write(scene: Scene, settings: Export) -> dict[str, object]:
+    """`export/masks/<photo stem>.png` and `export/confidence/<photo stem>.png` for every photo; usable as `segment --masks`, `--confidence`."""
+    cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
+    views = scene.model.views
+    surface = LabelledSurface.build(cloud, views, scene.mesh)
+    covered = []
+    masks, confidences, sheet = outputs(scene, settings)
+    with atomic_path(masks) as mask_folder, atomic_path(confidences) as confidence_folder:
+        mask_folder.mkdir()
+        confidence_folder.mkdir()
+        for view in tqdm(views, desc="rendering masks", unit="photo", disable=None):
+            mask, confidence = render_mask(surface, labels.confidence, view, settings.max_size)
+            name = f"{Path(view.name).stem}.png"
+            write_image(mask_folder / name, mask)
+            write_image(confidence_folder / name, confidence)
+            covered.append(float((mask > 0).mean()))
+    write_image(sheet, _comparison(scene, views))
+    return {"photos": len(views), "labelled_pixels": f"{np.mean(covered):.1%}"}
+
+
+def _comparison(scene: Scene, views: list[View]) -> np.ndarray:
+    """Some photos, evenly spread over the flight, beside the mask that went in and the mask that comes back: (H, W, 3) uint8 RGB."""
+    palette, rows = scene.class_table().palette, []
+    for view in [views[row] for row in np.unique(np.linspace(0, len(views) - 1, min(SHOWN, len(views))).round().astype(int))]:
+        size, stem = (PANEL, round(PANEL * view.height / view.width)), Path(view.name).stem
+        pictures, captions = [], []
+        if scene.photo(view.name).exists():
+            pictures.append(cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA))
+            captions.append(view.name)
+        for folder, caption in ((scene.masks, "mask in"), (scene.export / "masks", "mask back")):
+            file = folder / f"{stem}.png"
+            mask = read_index_image(file) if file.exists() else np.zeros((1, 1), np.uint8)
+            pictures.append(palette[cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)])
+            captions.append(caption)
+        rows.append(side_by_side(pictures, captions))
+    width = max(row.shape[1] for row in rows)
+    return np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows])
+
+
+def render_mask(surface: LabelledSurface, confidence: np.ndarray, view: View, max_size: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Labels and confidence of one photo.
+
+    confidence: (N,) float32 of the cloud's points, 0 to 1; max_size: longest side, px, 0 = the photo's
+    returns: (H, W) uint8 ids, 0 = no label; (H, W) uint8, 255 = sure, at least 1 where there is a label
+    """
+    scale = min(1.0, max_size / max(view.width, view.height)) if max_size else 1.0
+    rows, _ = surface.rows(view, (max(1, round(view.width * scale)), max(1, round(view.height * scale))))
+    mask = np.where(rows >= 0, surface.label[rows], 0).astype(np.uint8)
+    sure = np.clip(np.rint(confidence[rows] * 255), 1, 255)
+    return mask, np.where(mask > 0, sure, 0).astype(np.uint8)

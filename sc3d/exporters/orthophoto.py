@@ -1,0 +1,110 @@
+"""Maps from straight above as GeoTIFF: colours, classes with their palette, heights of the surface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import numpy as np
+from tqdm import tqdm
+
+from sc3d.scene.class_table import ClassTable
+from sc3d.exporters.from_above import FromAbove
+from sc3d.geometry.raster import Grid, spacing_of_all
+from sc3d.exporters.packages import load
+from sc3d.exporters.projected_cloud import PlacedCloud, read_placed_cloud
+from sc3d.io import atomic_path
+from sc3d.scene.scene import Scene
+from sc3d.settings import Export
+
+rasterio = load("rasterio")
+enums, transforms = load("rasterio.enums"), load("rasterio.transform")
+
+TILE = 256  # px; strips of this many rows are worked on at a time
+NO_HEIGHT = -9999.0
+OVERVIEW = 512  # overviews halve the longest side until it is below this, px
+COLOR, CLASSES, HEIGHT = "orthophoto.tif", "classes.tif", "height.tif"
+NAMES = "classes.tif.aux.xml"  # where GDAL keeps names of categories
+
+
+def outputs(scene: Scene, settings: Export) -> list[Path]:
+    return [scene.export / name for name in (COLOR, CLASSES, NAMES, HEIGHT)]
+
+
+def write(scene: Scene, settings: Export) -> dict[str, object]:
+    """`export/orthophoto.tif` (RGB and alpha), `classes.tif` (ids, 0 = none, names and palette) and `height.tif` (float32 z, CRS), on one grid."""
+    placed = read_placed_cloud(scene, settings)
+    unit = placed.placement.unit
+    pixel = (settings.pixel_size or round_to_digit(spacing_of_all(placed.points) * unit * (1 if scene.mesh.exists() else 2))) / unit
+    grid = Grid.around(placed.points, pixel)
+    above = FromAbove.build(scene, placed, grid)
+    table = scene.class_table()
+    color, classes, names, height = outputs(scene, settings)
+    with atomic_path(color) as color_file, atomic_path(classes) as class_file, atomic_path(height) as height_file:
+        covered = _fill(above, placed, table, (color_file, class_file, height_file))
+        for file, resampling in ((color_file, enums.Resampling.average), (class_file, enums.Resampling.mode), (height_file, enums.Resampling.average)):
+            _add_overviews(file, resampling)
+    with atomic_path(names) as temporary:
+        temporary.write_text(category_names(table), encoding="utf-8")
+    size = f"{grid.width} x {grid.height} px of {pixel:g} {'m' if unit == 1 else 'units'}"
+    return {"size": size, "covered": f"{covered:.1%}", **placed.placement.figures()}
+
+
+def round_to_digit(length: float) -> float:
+    """The length rounded to one significant digit."""
+    return float(f"{length:.0e}")
+
+
+def category_names(table: ClassTable) -> str:
+    """GDAL's side file: the name of each class id, in the order of the ids, for the legend."""
+    names = "".join(f"<Category>{escape(table.name(label)) if label in {entry.id for entry in table} | {0} else ''}</Category>" for label in range(table.num_ids))
+    return f'<PAMDataset><PAMRasterBand band="1"><CategoryNames>{names}</CategoryNames></PAMRasterBand></PAMDataset>\n'
+
+
+def _fill(above: FromAbove, placed: PlacedCloud, table: ClassTable, files: tuple[Path, Path, Path]) -> float:
+    """Write all pixels, strip by strip; returns the share of the cells that have a height."""
+    grid, covered = above.grid, 0
+    with _open(files[0], placed, grid, count=4, dtype="uint8", predictor=2) as color, \
+            _open(files[1], placed, grid, count=1, dtype="uint8", nodata=0) as classes, \
+            _open(files[2], placed, grid, count=1, dtype="float32", predictor=3, nodata=NO_HEIGHT) as height:
+        color.colorinterp = [enums.ColorInterp.red, enums.ColorInterp.green, enums.ColorInterp.blue, enums.ColorInterp.alpha]
+        classes.write_colormap(1, {label: (*map(int, table.palette[label]), 255 if label else 0) for label in range(table.num_ids)})
+        for dataset, name in ((classes, "class"), (height, "height of the surface")):
+            dataset.set_band_description(1, name)
+        for first_row in tqdm(range(0, grid.height, TILE), desc="rendering maps", unit="strip", disable=None):
+            num_rows = min(TILE, grid.height - first_row)
+            heights, rows = above.look(first_row, num_rows)
+            window = rasterio.windows.Window(0, first_row, grid.width, num_rows)
+            color.write(_colors(placed, rows), window=window)
+            classes.write(np.where(rows >= 0, placed.labels.label[rows], 0).astype(np.uint8), 1, window=window)
+            height.write(np.where(np.isfinite(heights), heights, NO_HEIGHT).astype(np.float32), 1, window=window)
+            covered += int(np.isfinite(heights).sum())
+    return covered / (grid.height * grid.width)
+
+
+def _colors(placed: PlacedCloud, rows: np.ndarray) -> np.ndarray:
+    """(4, h, w) uint8 red, green, blue, alpha of point rows (h, w); grey for clouds without colours."""
+    image = np.full((4, *rows.shape), 128, np.uint8)
+    if placed.colors is not None:
+        image[:3] = placed.colors[rows].transpose(2, 0, 1)
+    image[3] = 255
+    image[:, rows < 0] = 0
+    return image
+
+
+def _open(file: Path, placed: PlacedCloud, grid: Grid, **profile: object):  # noqa: ANN202 - rasterio's writer
+    transform = transforms.from_origin(grid.left, grid.top, grid.pixel, grid.pixel)
+    crs = placed.placement.crs
+    return rasterio.open(
+        file, "w", driver="GTiff", width=grid.width, height=grid.height, transform=transform, crs=crs.to_wkt() if crs else None, tiled=True,
+        blockxsize=TILE, blockysize=TILE, compress="deflate", bigtiff="if_safer", **profile,
+    )
+
+
+def _add_overviews(file: Path, resampling: object) -> None:
+    """Smaller copies inside the file, so that map programs draw it at once."""
+    with rasterio.open(file, "r+") as dataset:
+        longest = max(dataset.width, dataset.height)
+        factors = [2**level for level in range(1, 16) if longest / 2 ** (level - 1) > OVERVIEW]
+        if factors:
+            dataset.build_overviews(factors, resampling)

@@ -1,0 +1,163 @@
+"""Where exported coordinates lie: the CRS of the scene or a chosen one, or the scene's own frame where there is no georeference."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import open3d as o3d
+
+from sc3d.scene.class_table import ClassTable
+from sc3d.errors import InputError
+from sc3d.labelling.fusion import Labels
+from sc3d.georeferencing.georeference import Georeference, projected_crs, read_georeference
+from sc3d.scene.labelled_cloud import read_labelled, take_labels
+from sc3d.scene.scene import Scene
+from sc3d.settings import Export, Resources
+from sc3d.io.chunked_clouds import CloudFile, columns, positions
+from sc3d.tiling.memory import fits, num_points
+
+if TYPE_CHECKING:
+    import pyproj
+
+logger = logging.getLogger(__name__)
+
+BYTES = 250  # of a point while a cloud is exported as a whole
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How world coordinates become exported ones. georeference, epsg: None = they stay as they are, one unit = 1 m, z up."""
+
+    georeference: Georeference | None = None
+    epsg: int | None = None
+
+    @cached_property
+    def crs(self) -> pyproj.CRS | None:
+        return projected_crs(self.epsg) if self.epsg else None
+
+    @cached_property
+    def unit(self) -> float:
+        """Metres per unit of the exported coordinates, all three of them."""
+        return float(self.crs.axis_info[0].unit_conversion_factor) if self.crs else 1.0
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) world to (N, 3) float64 easting, northing, height in the CRS."""
+        points = np.asarray(points, np.float64)
+        if self.georeference is None:
+            return points
+        points = self.georeference.to_crs(points)
+        if self.epsg == self.georeference.epsg:
+            return points
+        import pyproj
+
+        between = pyproj.Transformer.from_crs(self.georeference.crs, self.crs, always_xy=True)
+        east, north = between.transform(points[:, 0], points[:, 1])
+        if not np.isfinite([east, north]).all():
+            raise InputError(f"the scene lies outside the area of EPSG:{self.epsg}: choose the CRS of the place with --epsg")
+        return np.stack([east, north, points[:, 2] * self.georeference.unit / self.unit], axis=1)
+
+    def directions(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Unit vectors (N, 3) at world points (N, 3), turned as the CRS is (grid north is not true north); float32."""
+        if self.georeference is None:
+            return directions
+        turned = self.points(points + directions) - self.points(points)
+        length = np.linalg.norm(turned, axis=1, keepdims=True)
+        return np.divide(turned, length, out=np.zeros_like(turned), where=length > 0).astype(np.float32)
+
+    def figures(self) -> dict[str, object]:
+        """What the summary says about coordinates."""
+        return {"crs": f"EPSG:{self.epsg}" if self.epsg else "none: the scene has no georeference, coordinates are its own"}
+
+
+def find_placement(scene: Scene, settings: Export) -> Placement:
+    """The scene's georeference with the CRS of `--epsg`; without a georeference, `--epsg` says which CRS the world coordinates are in."""
+    georeference = read_georeference(scene)
+    if georeference is not None:
+        placement = Placement(georeference, settings.epsg or georeference.epsg)
+    elif settings.epsg:
+        placement = Placement(Georeference(settings.epsg, (0.0, 0.0, 0.0)), settings.epsg)
+    else:
+        _warn(scene)
+        return Placement()
+    _ = placement.crs  # an unknown code is an error before any work
+    return placement
+
+
+@lru_cache(maxsize=8)
+def _warn(scene: Scene) -> None:
+    """Once per scene, not once per format."""
+    logger.warning("%s has no georeference: coordinates stay those of the scene, z is taken as up and 1 unit as 1 m", scene.path)
+
+
+@dataclass(frozen=True)
+class PlacedCloud:
+    """The labelled cloud with its positions in the CRS.
+
+    cloud: N points with attributes, positions in the world; points: (N, 3) float64 CRS
+    """
+
+    cloud: o3d.t.geometry.PointCloud
+    labels: Labels
+    points: np.ndarray
+    placement: Placement
+
+    @property
+    def colors(self) -> np.ndarray | None:
+        """(N, 3) uint8 RGB; None if the cloud has no colours."""
+        if "colors" not in self.cloud.point:
+            return None
+        colors = self.cloud.point.colors.numpy()
+        return colors if colors.dtype == np.uint8 else np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8)
+
+
+def read_placed_cloud(scene: Scene, settings: Export) -> PlacedCloud:
+    """Read the labelled cloud, check its labels against the class table and move it into the CRS."""
+    cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
+    _require_known(scene.class_table(), labels, settings.labelled or scene.labelled, scene)
+    placement = find_placement(scene, settings)
+    return PlacedCloud(cloud, labels, placement.points(cloud.point.positions.numpy()), placement)
+
+
+def _require_known(table: ClassTable, labels: Labels, path: Path, scene: Scene) -> None:
+    unknown = table.unknown(labels.label)
+    if unknown:
+        raise InputError(f"{path} has class id {unknown[0]}, which is not in {scene.classes}: add it there")
+
+
+def placed_chunks(scene: Scene, settings: Export) -> Iterator[PlacedCloud]:
+    """The same in parts, in order; as a whole if that fits into half of the machine's memory."""
+    path = settings.labelled or scene.labelled
+    count = num_points(path) if path.exists() else None
+    if count is None or fits(count * BYTES, Resources()):
+        yield read_placed_cloud(scene, settings)
+        return
+    placement, table = find_placement(scene, settings), scene.class_table()
+    for _, records in CloudFile.open(path).chunks():
+        cloud = o3d.t.geometry.PointCloud(positions(records))
+        for name in ("label", "confidence", "state", "num_views"):
+            if name in records.dtype.names:
+                cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(records[name])[:, None])
+        colors = columns(records, ("red", "green", "blue"))
+        if colors is not None:
+            cloud.point.colors = o3d.core.Tensor(colors)
+        labels = take_labels(cloud, path, "propagate")
+        _require_known(table, labels, path, scene)
+        yield PlacedCloud(cloud, labels, placement.points(positions(records)), placement)
+
+
+def chosen_classes(scene: Scene, settings: Export) -> set[int]:
+    """Ids of the classes to write: those named in `--classes`, or all with 0; InputError for a name that is not in the class table."""
+    table = scene.class_table()
+    if not settings.classes:
+        return {0} | {entry.id for entry in table}
+    ids = {entry.name: entry.id for entry in table}
+    for name in settings.classes:
+        if name not in ids:
+            raise InputError(f"there is no class {name!r} in {scene.classes}: its classes are {', '.join(ids)}")
+    return {ids[name] for name in settings.classes}

@@ -1,0 +1,83 @@
+"""Trees on a grid: the canopy height model, its tops, and the crown around each top."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from sc3d.geometry.raster import Grid, close_gaps, highest_points
+from sc3d.exporters.regions import disk, renumbered
+
+GAP = 0.5  # gaps of the canopy narrower than about twice this are filled, m
+SMOOTHING = 0.4  # standard deviation of the Gaussian that joins the lobes of a crown, m
+UNDER = 0.5  # tree points this far below the top of their cell are not canopy, m
+MIN_CROWN = 2.0  # m2
+
+
+def canopy_height(points: np.ndarray, is_tree: np.ndarray, ground: np.ndarray, grid: Grid) -> np.ndarray:
+    """(H, W) float64 height of the canopy above the ground, m; NaN where nothing or something else is on top.
+
+    points: (N, 3) m; is_tree: (N,) bool; ground: (H, W) z of the ground, m
+    """
+    top, trees = highest_points(grid, points), highest_points(grid, points, is_tree)
+    canopy = (trees >= 0) & (points[trees, 2] >= points[top, 2] - UNDER)
+    rows = close_gaps(np.where(canopy, trees, -1), round(GAP / grid.pixel))
+    return np.where(rows >= 0, points[rows, 2] - ground, np.nan)
+
+
+def split_crowns(canopy: np.ndarray, grid: Grid, min_height: float) -> np.ndarray:
+    """(H, W) int32 number of the tree in each cell, 0 = none: the watershed of the smoothed canopy around its tops.
+
+    canopy: (H, W) m, NaN = none; min_height: lower plants are not trees, m
+    """
+    tall = canopy >= min_height
+    heights = smoothed(np.where(tall, canopy, 0.0), tall, SMOOTHING / grid.pixel)
+    crowns = climb(heights, tall, grid.pixel)
+    kept = np.bincount(crowns.ravel())[crowns] * grid.pixel**2 >= MIN_CROWN
+    return renumbered(np.where(kept, crowns, 0))
+
+
+def smoothed(heights: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray:
+    """(H, W) Gaussian mean over the known cells; 0 elsewhere."""
+    weight = ndimage.gaussian_filter(known.astype(np.float64), sigma, mode="constant")
+    mean = ndimage.gaussian_filter(np.where(known, heights, 0.0), sigma, mode="constant")
+    return np.where(known, mean / np.maximum(weight, 1e-9), 0.0)
+
+
+def climb(heights: np.ndarray, tall: np.ndarray, pixel: float) -> np.ndarray:
+    """(H, W) int32 number from 1 of the top that each tall cell climbs to, 0 = not tall.
+
+    A cell steps to the highest of its neighbours; from a local maximum on to the highest cell within half the usual width of a crown of that height;
+    where there is none, it is a top. heights: (H, W) m; equal heights are decided by place.
+    """
+    order = np.lexsort((np.arange(heights.size), np.where(tall, heights, -np.inf).ravel()))
+    rank = np.empty(heights.size, np.int64)
+    rank[order] = np.arange(heights.size)
+    rank = rank.reshape(heights.shape)
+    target = ndimage.maximum_filter(rank, 3, mode="nearest")
+    lobes = tall & (target == rank)
+    rows, columns = np.nonzero(tall & (target == rank))  # local maxima
+    radius = np.rint(0.5 * crown_width(heights[rows, columns]) / pixel).astype(np.int64)
+    for reach in np.unique(radius):
+        here = radius == reach
+        target[rows[here], columns[here]] = _highest_around(rank, rows[here], columns[here], int(reach))
+    target = order[target.ravel()]
+    while True:
+        further = target[target]
+        if (further == target).all():
+            break
+        target = further
+    return renumbered(np.where(tall, target.reshape(heights.shape) + 1, 0))
+
+
+def crown_width(heights: np.ndarray) -> np.ndarray:
+    """Usual width of the crown of a tree of some height, both in m: 2.5 + 0.009 h^2 (Popescu and Wynne 2004, for mixed stands)."""
+    return 2.51503 + 0.00901 * heights**2
+
+
+def _highest_around(rank: np.ndarray, rows: np.ndarray, columns: np.ndarray, reach: int) -> np.ndarray:
+    """(K,) largest rank within `reach` cells of each of K cells."""
+    around = np.argwhere(disk(reach)) - reach
+    near_rows = np.clip(rows[:, None] + around[:, 0], 0, rank.shape[0] - 1)
+    near_columns = np.clip(columns[:, None] + around[:, 1], 0, rank.shape[1] - 1)
+    return rank[near_rows, near_columns].max(axis=1)

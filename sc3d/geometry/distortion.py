@@ -1,0 +1,122 @@
+"""Lens models of other programs as COLMAP cameras, exactly; where COLMAP has no such model, within a tolerance or not at all.
+
+All models here share one form: normalised image coordinates (perspective x / z, or the angle from the axis for fisheyes) times a radial polynomial,
+plus tangential terms, then focal lengths, skew and principal point. Pixel coordinates are COLMAP's: the centre of the first pixel is (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+
+from sc3d.errors import InputError
+from sc3d.io.images import MAX_PIXELS, MAX_SIDE
+
+NUM_RADII = 400  # samples along the image diagonal on which a lens is compared with its replacement
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens model.
+
+    width, height: px; focal: (fx, fy) px; principal: (cx, cy) px; skew: px per unit of y
+    radial: coefficients of r^2, r^4, ... (r: normalised radius, or the angle for a fisheye)
+    tangential: (p1, p2) as in OpenCV: dx = 2 p1 xy + p2 (r^2 + 2 x^2), dy = 2 p2 xy + p1 (r^2 + 2 y^2)
+    prism: thin prism (x, y): dx = s r^2
+    """
+
+    width: int
+    height: int
+    focal: tuple[float, float]
+    principal: tuple[float, float]
+    radial: tuple[float, ...] = ()
+    tangential: tuple[float, float] = (0.0, 0.0)
+    fisheye: bool = False
+    skew: float = 0.0
+    prism: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def reach(self) -> float:
+        """Largest distorted radius in the image, normalised."""
+        x = max(self.principal[0], self.width - self.principal[0]) / self.focal[0]
+        y = max(self.principal[1], self.height - self.principal[1]) / self.focal[1]
+        return float(np.hypot(x, y))
+
+    def radii(self) -> np.ndarray:
+        """Undistorted radii from the middle to the corner of the image; up to where the polynomial folds back, if it does before."""
+        radius = np.linspace(0, np.pi if self.fisheye else 4 * self.reach + 1, 20 * NUM_RADII)
+        distorted = radius * self.factor(radius)
+        inside = (distorted <= self.reach) & (np.maximum.accumulate(distorted) == distorted)
+        last = len(inside) if inside.all() else int(np.argmin(inside))
+        return np.linspace(0, radius[max(last - 1, 1)], NUM_RADII)
+
+    def factor(self, radius: np.ndarray) -> np.ndarray:
+        """Radial factor 1 + k1 r^2 + k2 r^4 + ..."""
+        return np.polynomial.polynomial.polyval(radius**2, (1.0, *self.radial))
+
+
+def to_camera(lens: Lens, tolerance: float, where: str) -> pycolmap.Camera:
+    """COLMAP camera of a lens, of the simplest model that holds it.
+
+    tolerance: largest error, px, that may come from what no COLMAP model has. InputError beyond it; `where`: names the camera in the message
+    """
+    values = np.array([lens.width, lens.height, *lens.focal, *lens.principal, *lens.radial, *lens.tangential, lens.skew, *lens.prism])
+    if not np.isfinite(values).all() or min(lens.width, lens.height, *lens.focal) <= 0:
+        raise InputError(f"{where}: size and focal length must be positive, all parameters finite numbers")
+    if max(lens.width, lens.height) > MAX_SIDE or lens.width * lens.height > MAX_PIXELS:
+        raise InputError(f"{where} is {lens.width}x{lens.height}: sizes up to {MAX_PIXELS // 10**6} megapixels are possible")
+    lens = replace(lens, radial=tuple(np.trim_zeros(lens.radial, "b")))
+    lost = abs(lens.skew) * max(lens.principal[1], lens.height - lens.principal[1]) / lens.focal[1]
+    if lost > tolerance:
+        raise InputError(f"{where}: pixels that are not rectangular (skew {lens.skew:.3g} px) have no COLMAP model; leaving that out costs up to {lost:.2g} px: "
+                         f"optimise the cameras without it, export undistorted photos, or allow it with --tolerance {_ceiling(lost)}")
+    model, params = (_fisheye if lens.fisheye else _perspective)(lens, tolerance, where)
+    return pycolmap.Camera(model=model, width=lens.width, height=lens.height, params=[*lens.focal, *lens.principal, *params])
+
+
+def _perspective(lens: Lens, tolerance: float, where: str) -> tuple[str, list[float]]:
+    if any(lens.prism):
+        raise InputError(f"{where}: a thin prism on a perspective lens has no COLMAP model: export undistorted photos")
+    if not lens.radial and not any(lens.tangential):
+        return "PINHOLE", []
+    radial = [*lens.radial, 0.0, 0.0, 0.0]
+    if len(lens.radial) <= 2:
+        return "OPENCV", [*radial[:2], *lens.tangential]
+    rational = [*radial[2:3], 0.0, 0.0, 0.0] if len(lens.radial) == 3 else None
+    if rational is None:
+        radial, rational = _rational(lens, tolerance, where)
+    return "FULL_OPENCV", [*radial[:2], *lens.tangential, *rational]
+
+
+def _rational(lens: Lens, tolerance: float, where: str) -> tuple[list[float], list[float]]:
+    """FULL_OPENCV's k1, k2 and k3..k6 for a polynomial of higher degree: (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)."""
+    radius = lens.radii()
+    factor, powers = lens.factor(radius), (radius[:, None] / radius[-1]) ** [2, 4, 6]
+    weight = radius[:, None] * np.hstack([powers, -factor[:, None] * powers])
+    found, *_ = np.linalg.lstsq(weight, radius * (factor - 1), rcond=1e-14)
+    found = found / np.tile(radius[-1] ** np.array([2, 4, 6]), 2)
+    squares = radius**2
+    top, bottom = (np.polynomial.polynomial.polyval(squares, (1.0, *part)) for part in (found[:3], found[3:]))
+    lost = float(np.max(np.abs(radius * (top / bottom - factor))) * max(lens.focal))
+    if not lost <= tolerance:
+        raise InputError(f"{where}: a radial polynomial up to r^{2 * len(lens.radial)} has no COLMAP model, and the nearest one is up to {lost:.2g} px off: "
+                         f"optimise the cameras without k4, export undistorted photos, or allow it with --tolerance {_ceiling(lost)}")
+    return list(found[:2]), list(found[2:])
+
+
+def _fisheye(lens: Lens, tolerance: float, where: str) -> tuple[str, list[float]]:
+    radial = [*lens.radial, *6 * [0.0]]
+    if len(lens.radial) <= 4 and not any(lens.tangential) and not any(lens.prism):
+        return "OPENCV_FISHEYE", radial[:4]
+    if len(lens.radial) <= 4:
+        return "THIN_PRISM_FISHEYE", [*radial[:2], *lens.tangential, *radial[2:4], *lens.prism]
+    if len(lens.radial) > 6 or any(lens.tangential) or any(lens.prism):
+        raise InputError(f"{where}: this fisheye (radial terms up to r^{2 * len(lens.radial)} with tangential ones) has no COLMAP model: export undistorted photos")
+    return "RAD_TAN_THIN_PRISM_FISHEYE", [*radial[:6], *6 * [0.0]]
+
+
+def _ceiling(value: float) -> str:
+    """A little more than a value, with two digits."""
+    return f"{1.1 * value:.2g}"

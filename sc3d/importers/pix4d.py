@@ -1,0 +1,109 @@
+"""Pix4Dmapper: `*_calibrated_camera_parameters.txt` in `1_initial/params`, with `*_offset.xyz` and `*_wkt.prj` beside it.
+
+The model is m = K [R | -R t] X with OpenCV's axes and distortion; the world is the project's CRS minus the offset; (0, 0) is the corner of the first pixel.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pyproj
+
+from sc3d.errors import InputError
+from sc3d.geometry.cameras import View
+from sc3d.georeferencing.georeference import Georeference
+from sc3d.geometry.distortion import Lens, to_camera
+from sc3d.importers.project import Project, rigid
+from sc3d.settings import Import
+
+logger = logging.getLogger(__name__)
+
+EXPECTED = "a project folder with 1_initial/params/*_calibrated_camera_parameters.txt, or that file, is expected"
+SUFFIX = "calibrated_camera_parameters.txt"
+LINES = 10  # per photo
+
+
+def matches(path: Path) -> bool:
+    return _file(path) is not None
+
+
+def files(path: Path) -> list[Path]:
+    return [_file(path), *_place_files(_file(path))]
+
+
+def read(path: Path, settings: Import) -> Project:
+    file = _file(path)
+    try:
+        lines = [(number, line.strip()) for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines(), start=1)]
+    except UnicodeDecodeError:
+        raise InputError(f"{file} is no text file") from None
+    header = [line.lower() for _, line in lines[:8]]
+    if any("fisheye" in line for line in header):
+        raise InputError(f"{file}: Pix4D's fisheye polynomial has no COLMAP model: export undistorted photos")
+    body = [(number, line) for number, line in lines if line][_header_length(lines, file) :]
+    if len(body) % LINES:
+        raise InputError(f"{file} is cut off or of another layout: {LINES} lines per photo are expected after the header, {len(body)} lines are there")
+    cameras: dict[Lens, object] = {}
+    views = []
+    for start in range(0, len(body), LINES):
+        name, lens, rotation, centre = _block(body[start : start + LINES], file)
+        if lens not in cameras:
+            cameras[lens] = to_camera(lens, settings.tolerance, f"{file}, {name}")
+        views.append(View(name, cameras[lens], rigid(rotation, centre, f"{file}, {name}")))
+    return Project("pix4d", views, georeference=_georeference(file), notes={"read": file.name})
+
+
+def _file(path: Path) -> Path | None:
+    if path.is_file():
+        return path if path.name.endswith(SUFFIX) else None
+    return next((file for folder in (path, path / "params", path / "1_initial" / "params") for file in sorted(folder.glob(f"*{SUFFIX}"))), None)
+
+
+def _header_length(lines: list[tuple[int, str]], file: Path) -> int:
+    """Lines in front of the first photo, empty ones not counted: up to the one that states the camera model."""
+    filled = [line for _, line in lines if line]
+    found = [row for row, line in enumerate(filled[:12]) if line.lower().startswith("camera model")]
+    if not found:
+        raise InputError(f"{file} does not start as Pix4D writes it, with fileName ... camera model m = K [R|-Rt] X")
+    return found[0] + 1
+
+
+def _block(lines: list[tuple[int, str]], file: Path) -> tuple[str, Lens, np.ndarray, np.ndarray]:
+    """Name, lens, rotation (3, 3) and centre (3,) of a photo."""
+    name, *size = lines[0][1].rsplit(maxsplit=2)
+    try:
+        width, height = (int(word) for word in size)
+        rows = [np.array(line.split(), np.float64) for _, line in lines[1:]]
+        matrix, radial, tangential, centre, rotation = np.stack(rows[:3]), rows[3], rows[4], rows[5], np.stack(rows[6:])
+        if (matrix.shape, radial.shape, tangential.shape, centre.shape, rotation.shape) != ((3, 3), (3,), (2,), (3,), (3, 3)):
+            raise ValueError
+    except ValueError:
+        raise InputError(f"{file}, line {lines[0][0]}: name, width and height, then K [3x3], distortion [3] and [2], position [3] and rotation [3x3] "
+                         "are expected") from None
+    lens = Lens(width, height, (float(matrix[0, 0]), float(matrix[1, 1])), (float(matrix[0, 2]), float(matrix[1, 2])), tuple(radial.tolist()),
+                tuple(tangential.tolist()), skew=float(matrix[0, 1]))
+    return name, lens, rotation, centre
+
+
+def _place_files(file: Path) -> tuple[Path, Path]:
+    """WKT of the CRS and offset that belong to a parameter file."""
+    stem = file.name.removesuffix(SUFFIX)
+    return file.with_name(f"{stem}wkt.prj"), file.with_name(f"{stem}offset.xyz")
+
+
+def _georeference(file: Path) -> Georeference | None:
+    projection, offset_file = _place_files(file)
+    if not projection.is_file():
+        return None
+    try:
+        crs = pyproj.CRS.from_wkt(projection.read_text(encoding="utf-8").strip())
+        offset = np.array(offset_file.read_text(encoding="utf-8").replace(",", " ").split(), np.float64)[:3] if offset_file.is_file() else np.zeros(3)
+    except (pyproj.exceptions.CRSError, ValueError):
+        raise InputError(f"{projection} or {offset_file} cannot be understood: a WKT of a CRS and three numbers are expected") from None
+    crs = crs.sub_crs_list[0] if crs.is_compound else crs
+    if not crs.is_projected or crs.to_epsg() is None or offset.shape != (3,):
+        logger.warning("%s: %s has no EPSG code of a projected CRS: the place stays unknown", projection, crs.name)
+        return None
+    return Georeference(crs.to_epsg(), tuple(offset.tolist()))

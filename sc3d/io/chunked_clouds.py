@@ -1,0 +1,119 @@
+"""Tables of points on disk: PLY (binary) and LAS/LAZ in chunks, and binary PLY written in chunks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sc3d.errors import InputError
+from sc3d.io.atomic import atomic_path
+from sc3d.io.limits import FARTHEST
+from sc3d.io.ply import Header, check_ply
+
+CHUNK = 1_000_000  # rows held at a time
+TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
+LAS_FIELDS = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
+LAS_COLORS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+
+
+@dataclass(frozen=True)
+class CloudFile:
+    """A cloud on disk. dtype: of a record, fields x, y, z and whatever else the file has; offset: bytes before the first one (PLY)."""
+
+    path: Path
+    dtype: np.dtype
+    num_points: int
+    offset: int = 0
+
+    @classmethod
+    def open(cls, path: Path) -> CloudFile:
+        """InputError if the file is damaged, empty, or of a kind that cannot be read in chunks."""
+        kind = path.suffix.lower()
+        if kind in (".las", ".laz"):
+            return _open_las(path)
+        if kind != ".ply":
+            raise InputError(f"{path} does not fit into --max-memory, and can be read in parts as PLY, LAS or LAZ only: convert it, or allow more memory")
+        header = check_ply(path)
+        vertex = header.element("vertex")
+        if not header.order or vertex is None or vertex.has_lists or header.elements[0] is not vertex:
+            raise InputError(f"{path} does not fit into --max-memory, and can be read in parts as binary PLY with the vertices first only: write it anew")
+        if not vertex.rows or not {"x", "y", "z"} <= {entry.name for entry in vertex.properties}:
+            raise InputError(f"{path} holds no points")
+        return cls(path, _record(header), vertex.rows, header.size)
+
+    def chunks(self) -> Iterator[tuple[int, np.ndarray]]:
+        """First row and records of each chunk; InputError at positions that are not finite or too far away."""
+        for start, records in self._read():
+            for axis in "xyz":
+                if not (np.abs(records[axis]) <= FARTHEST).all():
+                    raise InputError(f"{self.path} has positions that are not finite, or more than {FARTHEST:g} from the origin: remove those points first")
+            yield start, records
+
+    def _read(self) -> Iterator[tuple[int, np.ndarray]]:
+        if self.path.suffix.lower() in (".las", ".laz"):
+            yield from _read_las(self)
+            return
+        with self.path.open("rb") as file:
+            file.seek(self.offset)
+            for start in range(0, self.num_points, CHUNK):
+                yield start, np.fromfile(file, self.dtype, min(CHUNK, self.num_points - start))
+
+
+def _record(header: Header) -> np.dtype:
+    return np.dtype([(entry.name, header.order + entry.dtype) for entry in header.elements[0].properties])
+
+
+def _open_las(path: Path) -> CloudFile:
+    import laspy
+
+    try:
+        with laspy.open(path) as file:
+            colored = {"red", "green", "blue"} <= set(file.header.point_format.dimension_names)
+            return CloudFile(path, np.dtype(LAS_FIELDS + (LAS_COLORS if colored else [])), file.header.point_count)
+    except (OSError, ValueError, laspy.errors.LaspyException) as error:
+        raise InputError(f"cannot read {path}: {error}") from None
+
+
+def _read_las(cloud: CloudFile) -> Iterator[tuple[int, np.ndarray]]:
+    import laspy
+
+    start = 0
+    with laspy.open(cloud.path) as file:
+        for points in file.chunk_iterator(CHUNK):
+            records = np.empty(len(points), cloud.dtype)
+            for axis in "xyz":
+                records[axis] = getattr(points, axis)
+            for name in cloud.dtype.names[3:]:
+                records[name] = np.asarray(points[name]) >> 8  # 16 bits, by the standard
+            yield start, records
+            start += len(records)
+
+
+def positions(records: np.ndarray) -> np.ndarray:
+    """(N, 3) float64."""
+    return np.stack([records[axis].astype(np.float64) for axis in "xyz"], axis=1)
+
+
+def columns(records: np.ndarray, names: Iterable[str]) -> np.ndarray | None:
+    """(N, K) of the named fields, of their common type; None if the records lack one."""
+    names = list(names)
+    if not set(names) <= set(records.dtype.names):
+        return None
+    return np.stack([records[name] for name in names], axis=1)
+
+
+def write_ply(path: Path, dtype: np.dtype, num_points: int, chunks: Iterable[np.ndarray]) -> None:
+    """Write records of `dtype` (native fields without byte order) as a binary PLY, atomically."""
+    lines = [f"property {TYPES[dtype[name].str[1:]]} {name}" for name in dtype.names]
+    header = "\n".join(["ply", "format binary_little_endian 1.0", "comment sc3d", f"element vertex {num_points}", *lines, "end_header", ""])
+    written = 0
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(header.encode("ascii"))
+        for records in chunks:
+            file.write(np.ascontiguousarray(records, dtype))  # not tofile, which hides a full disk
+            written += len(records)
+        if written != num_points:
+            raise ValueError(f"{written} records instead of {num_points}")

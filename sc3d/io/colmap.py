@@ -1,0 +1,176 @@
+"""COLMAP models, read by pycolmap after a look at them.
+
+pycolmap believes the counts in binary files: one that is too large makes it fill the memory, or read on behind the end for ever. In text files a
+count never leads beyond its line. Cameras and poses are not checked by pycolmap at all.
+Layout: https://colmap.github.io/format.html; rigs.bin and frames.bin as COLMAP 3.12 and later write them. Little endian throughout.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from sc3d.errors import InputError
+from sc3d.io.limits import FARTHEST
+from sc3d.io.images import MAX_PIXELS, MAX_SIDE
+
+FILES = ("cameras", "rigs", "frames", "images", "points3D")  # rigs and frames only in newer models
+LARGEST = 1 << 62  # count of a list: bounded by the size of the file alone
+POINT = np.array([[0, 43, 0, 0, 0], [8, 8, 0, LARGEST, 0]])  # id, position, colour, error; track of photo and keypoint
+FRAME = np.array([[0, 64, 0, 0, 0], [4, 16, 0, LARGEST, 0]])  # id, rig, rotation, translation; sensor and photo
+MAX_NAME = 4096  # bytes of a photo name
+NOT_RIGID = 0.01  # largest error of R R^T: text models are rounded
+
+
+class _Damage(ValueError):
+    """Completes "<file> of the COLMAP model in <folder>"."""
+
+
+def load_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a model, binary or text; InputError if it is missing, damaged, without photos, or has cameras or poses that are none."""
+    if not any((folder / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+        raise InputError(f"no cameras in {folder}: run `sc3d reconstruct PHOTOS SCENE`, or put a COLMAP model there")
+    check_counts(folder)
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+        images = [model.image(image_id) for image_id in model.reg_image_ids()]
+        names = [image.name for image in images]
+        poses = [image.cam_from_world() for image in images]
+    except Exception as error:  # pycolmap raises bare RuntimeError, ValueError, IndexError, MemoryError and UnicodeDecodeError for broken files
+        raise InputError(f"cannot read the COLMAP model in {folder}: {(str(error).splitlines() or [type(error).__name__])[0]}") from None
+    if not images:
+        raise InputError(f"the COLMAP model in {folder} has no registered photos")
+    for camera_id in sorted({image.camera_id for image in images}):
+        _check_camera(model.camera(camera_id), folder)
+    _check_poses(poses, names, folder)
+    return model
+
+
+def _check_camera(camera: pycolmap.Camera, folder: Path) -> None:
+    where = f"{folder}: camera {camera.camera_id}"
+    if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE and camera.width * camera.height <= MAX_PIXELS):
+        raise InputError(f"{where} is {camera.width}x{camera.height}: sizes from 1 px to {MAX_PIXELS // 10**6} megapixels are possible")
+    params = np.array(camera.params)
+    if not np.isfinite(params).all() or not (params[list(camera.focal_length_idxs())] > 0).all():
+        raise InputError(f"{where} has parameters that are not finite numbers, or a focal length that is not positive")
+
+
+def _check_poses(poses: list[pycolmap.Rigid3d], names: list[str], folder: Path) -> None:
+    """poses: cam_from_world."""
+    matrices = np.array([pose.matrix() for pose in poses])
+    with np.errstate(all="ignore"):
+        length = np.linalg.norm([pose.rotation.quat for pose in poses], axis=1)
+        error = np.abs(matrices[:, :, :3] @ matrices[:, :, :3].transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        right = (error < NOT_RIGID) & (length > 0.5) & (np.abs(matrices[:, :, 3]) < FARTHEST).all(axis=1)
+    if not right.all():
+        raise InputError(f"{folder}: the pose of photo {names[int(np.argmin(right))]!r} is not a rotation and a finite position")
+
+
+def check_counts(folder: Path) -> None:
+    """InputError if a file of a binary model is not as long as its counts say, or an id is used twice; a text model is left to pycolmap."""
+    if not all((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D")):
+        return
+    walks = {"cameras": _walk_cameras, "rigs": _walk_rigs, "frames": _walk_frames, "images": _walk_images, "points3D": _walk_points}
+    for name in FILES:
+        file = folder / f"{name}.bin"
+        if not file.exists():
+            continue
+        try:
+            _check_file(file, walks[name])
+        except (_Damage, struct.error) as error:
+            what = str(error) if isinstance(error, _Damage) else "is cut off"
+            raise InputError(f"{file.name} of the COLMAP model in {folder} {what}: it is damaged, write or copy it again") from None
+
+
+def _check_file(file: Path, walk: Callable[[mmap.mmap, int], int]) -> None:
+    if not file.is_file():
+        raise _Damage("is no file")
+    if file.stat().st_size < 8:
+        raise _Damage("is cut off")
+    with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        count = _read("<Q", data, 0)[0]
+        if count > len(data) // 8:  # no record is shorter
+            raise _Damage(f"announces {count} entries in {len(data)} bytes")
+        end = walk(data, count)
+        if end != len(data):
+            raise _Damage("is cut off" if end > len(data) else f"has {len(data) - end} bytes more than it announces")
+
+
+def _read(form: str, data: mmap.mmap, position: int) -> tuple:
+    return struct.unpack_from(form, data, position)
+
+
+def _walk_cameras(data: mmap.mmap, count: int) -> int:
+    position, ids = 8, set()
+    for _ in range(count):
+        number, model = _read("<Ii", data, position)
+        _once(number, ids, "camera")
+        position += 24 + 8 * _num_params(model)
+    return position
+
+
+@cache
+def _num_params(model: int) -> int:
+    try:
+        return len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1).params)
+    except (ValueError, TypeError):
+        raise _Damage(f"has a camera of the unknown model {model}") from None
+
+
+def _walk_rigs(data: mmap.mmap, count: int) -> int:
+    position, ids = 8, set()
+    for _ in range(count):
+        number, sensors = _read("<II", data, position)
+        _once(number, ids, "rig")
+        position += 8 + (8 if sensors else 0)
+        for _ in range(max(sensors, 1) - 1):
+            _, _, has_pose = _read("<iI?", data, position)
+            position += 9 + (56 if has_pose else 0)
+    return position
+
+
+def _walk_frames(data: mmap.mmap, count: int) -> int:
+    return _walk_records(data, count, FRAME)
+
+
+def _walk_points(data: mmap.mmap, count: int) -> int:
+    return _walk_records(data, count, POINT)
+
+
+def _walk_records(data: mmap.mmap, count: int, fields: np.ndarray) -> int:
+    if not count:
+        return 8
+    from sc3d.io import record_walk as kernels  # loads numba
+
+    view = np.frombuffer(data, np.uint8)
+    end, row = kernels.walk_bytes(view, 8, count, fields, False)
+    del view  # it would keep the file mapped
+    if end < 0:
+        raise _Damage(f"is cut off in entry {row} of {count}")
+    return end
+
+
+def _walk_images(data: mmap.mmap, count: int) -> int:
+    position, ids = 8, set()
+    for _ in range(count):
+        _once(_read("<I", data, position)[0], ids, "photo")
+        end = data.find(b"\0", position + 64, position + 64 + MAX_NAME)
+        if end < 0:
+            raise _Damage(f"has a photo whose name does not end within {MAX_NAME} bytes")
+        points = _read("<Q", data, end + 1)[0]
+        position = end + 9 + 24 * points
+        if position > len(data):
+            raise _Damage(f"is cut off: photo {len(ids)} of {count} announces {points} keypoints")
+    return position
+
+
+def _once(number: int, ids: set[int], what: str) -> None:
+    if number in ids:
+        raise _Damage(f"has the {what} {number} twice")
+    ids.add(number)

@@ -1,0 +1,110 @@
+"""What a report is made of, read from the scene's files; missing files give None or nothing."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sc3d.scene.class_table import ClassTable
+from sc3d.errors import InputError
+from sc3d.io import read_cloud, read_json, read_mesh
+from sc3d.scene.scene import Scene
+
+if TYPE_CHECKING:
+    import open3d as o3d
+
+    from sc3d.geometry.cameras import View
+
+logger = logging.getLogger(__name__)
+
+_STAGES = ("synthesize", "reconstruct", "train", "extract", "segment", "label", "propagate", "evaluate", "export")
+
+
+@dataclass(frozen=True)
+class Material:
+    """Everything a report may show.
+
+    cloud: the labelled cloud, else the seeds, else the bare cloud; mesh: the surface
+    views: cameras by name order; metrics: content of metrics.json; records: sidecars in the order of the stages
+    """
+
+    scene: Scene
+    class_table: ClassTable | None = None
+    cloud: o3d.t.geometry.PointCloud | None = None
+    mesh: o3d.t.geometry.TriangleMesh | None = None
+    views: list[View] = field(default_factory=list)
+    metrics: dict = field(default_factory=dict)
+    records: list[dict] = field(default_factory=list)
+
+    def values(self, name: str) -> np.ndarray | None:
+        """(N,) values of an attribute of the cloud; None if it has none."""
+        if self.cloud is None or name not in self.cloud.point:
+            return None
+        return self.cloud.point[name].numpy().reshape(-1)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """(N, 3) float64 world."""
+        return np.empty((0, 3)) if self.cloud is None else self.cloud.point.positions.numpy().astype(np.float64)
+
+    @cached_property
+    def label_counts(self) -> np.ndarray | None:
+        """(256,) points per id; None without labels."""
+        labels = self.values("label")
+        return None if labels is None else np.bincount(labels.astype(np.uint8), minlength=256)
+
+    @cached_property
+    def truth(self) -> Path:
+        """The folder of truth masks that was evaluated against, else the scene's own."""
+        used = next((record.get("settings") for record in self.records if record["stage"] == "evaluate"), None)
+        folder = used.get("truth") if isinstance(used, dict) else None
+        return Path(folder) if isinstance(folder, str) and Path(folder).is_dir() else self.scene.truth
+
+    @property
+    def training_sheet(self) -> Path:
+        """The contact sheet that training writes; may not exist."""
+        return self.scene.path / "train.jpg"
+
+    def figures(self, source: str) -> dict:
+        """Figures of "labels" or "masks" in metrics.json; empty if there are none."""
+        found = self.metrics.get(source)
+        return found if isinstance(found, dict) else {}
+
+
+def gather(scene: Scene) -> Material:
+    """Read whatever of a scene exists; InputError for files that exist and are broken."""
+    cloud_file = next((path for path in (scene.labelled, scene.seeds, scene.cloud) if path.exists()), None)
+    metrics = read_json(scene.metrics) if scene.metrics.exists() else {}
+    if not isinstance(metrics, dict):
+        raise InputError(f"{scene.metrics} must hold an object: run `sc3d evaluate {scene.path} --overwrite`")
+    return Material(
+        scene=scene,
+        class_table=scene.class_table() if scene.classes.exists() else None,
+        cloud=None if cloud_file is None else read_cloud(cloud_file),
+        mesh=read_mesh(scene.mesh) if scene.mesh.exists() else None,
+        views=scene.model.views if scene.sparse.is_dir() else [],
+        metrics=metrics,
+        records=_read_sidecars(scene.path),
+    )
+
+
+def _read_sidecars(folder: Path) -> list[dict]:
+    """Records of the stages; outputs of one run count once."""
+    records: dict[str, dict] = {}
+    for file in sorted([*folder.glob("*.json"), *folder.glob("sparse/*.json")]):
+        try:
+            record = json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            logger.warning("%s is not valid JSON and is left out of the report", file)
+            continue
+        if isinstance(record, dict) and isinstance(record.get("stage"), str):
+            key = json.dumps([record["stage"], record.get("settings"), record.get("seconds")], sort_keys=True)
+            records.setdefault(key, record | {"outputs": []})["outputs"].append(str(file.relative_to(folder))[: -len(".json")])
+    order = {stage: position for position, stage in enumerate(_STAGES)}
+    return sorted(records.values(), key=lambda record: (order.get(record["stage"], len(order)), record["stage"], record["outputs"]))

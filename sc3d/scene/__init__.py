@@ -1,0 +1,1 @@
+"""The scene folder: its files, class table, cameras, labels and labelled clouds."""

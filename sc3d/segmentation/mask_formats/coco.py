@@ -1,0 +1,96 @@
+"""COCO instances: one JSON file for many photos, polygons or run-length codes.
+
+Format: https://cocodataset.org/#format-data. The format has no order, and its own tools refuse overlaps: here the smaller region wins, so
+that a car stays on its road. Crowd regions count as their class, because CVAT and Datumaro mark every mask that is not a polygon as one.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from sc3d.errors import InputError
+from sc3d.io import read_json
+from sc3d.segmentation.mask_formats.drawing import Drawing, Shape
+from sc3d.segmentation.mask_formats.outlines import OutlineError, Polygons, Runs, numbers, polygons, runs
+
+
+def read_coco(file: Path) -> Iterator[Drawing]:
+    """The drawings of a COCO file, one per image; InputError if it is none."""
+    content = read_json(file)
+    images, annotations, categories = (_entries(content, key, file) for key in ("images", "annotations", "categories"))
+    names = {_id(category, "id", file): str(category.get("name", "")) for category in categories}
+    by_image = defaultdict(list)
+    for annotation in annotations:
+        by_image[_id(annotation, "image_id", file)].append(annotation)
+    known = [_id(image, "id", file) for image in images]
+    strangers = by_image.keys() - set(known)
+    if strangers or len(set(known)) < len(known):
+        raise InputError(f"{file} has annotations of an image that it does not list, or an image twice: it is damaged")
+    for image, image_id in zip(images, known, strict=True):
+        photo, size = str(image.get("file_name", "")), (image.get("width"), image.get("height"))
+        shapes = tuple(_shape(annotation, names, file) for annotation in by_image[image_id])
+        yield Drawing(str(file), (photo,), None if None in size else size, shapes, smaller_on_top=True)
+
+
+def _entries(content: object, key: str, file: Path) -> list[dict]:
+    entries = content.get(key) if isinstance(content, dict) else None
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{file} is not a COCO file of instances: lists of images, annotations and categories are expected")
+    return entries
+
+
+def _id(entry: dict, key: str, file: Path) -> int | str:
+    if not isinstance(entry.get(key), int | str):
+        raise InputError(f"{file} is not a COCO file of instances: an entry lacks its {key}")
+    return entry[key]
+
+
+def _shape(annotation: dict, names: dict[int | str, str], file: Path) -> Shape:
+    category = _id(annotation, "category_id", file)
+    keys = (names.get(category, f"category {category}"), str(category))
+    segmentation = annotation.get("segmentation")
+    if not segmentation:
+        return Shape("box or keypoints", keys, None)
+    if isinstance(segmentation, dict):
+        return Shape("run-length code", keys, partial(_runs, segmentation))
+    return Shape("polygon", keys, partial(_polygons, segmentation))
+
+
+def _polygons(segmentation: object, size: tuple[int, int]) -> Polygons:
+    if not isinstance(segmentation, list) or not all(isinstance(ring, list) for ring in segmentation):
+        raise OutlineError("is no list of polygons")
+    return polygons(segmentation, size)
+
+
+def _runs(segmentation: dict, size: tuple[int, int]) -> Runs:
+    counts = segmentation["counts"]
+    if numbers(segmentation["size"]).tolist() != [size[1], size[0]]:
+        raise OutlineError("has a run-length code of another size than its image")
+    return runs(decompress(counts) if isinstance(counts, str) else counts, (0, 0, *size), True, size)
+
+
+def decompress(text: str) -> np.ndarray:
+    """(N,) int64 counts of a compressed run-length code.
+
+    Each count is 5 bits per character (+48), the lowest first; bit 32 says that more follow, and bit 16 of the last one is the sign. From
+    the fourth count on, the difference to the count two before is stored. Source: rleFrString of the COCO API.
+    """
+    try:
+        code = np.frombuffer(text.encode("ascii"), np.uint8).astype(np.int64) - 48
+    except UnicodeEncodeError:
+        code = np.array([-1])
+    last = np.flatnonzero(~code & 32)
+    first = np.concatenate([[0], last[:-1] + 1])
+    if not len(last) or last[-1] != len(code) - 1 or (code < 0).any() or (code > 63).any() or (last - first > 6).any():
+        raise OutlineError("has a compressed run-length code that is damaged")
+    place = np.arange(len(code)) - np.repeat(first, last - first + 1)
+    values = np.add.reduceat((code & 31) << 5 * place, first)
+    values -= (code[last] & 16 > 0).astype(np.int64) << 5 * (last - first + 1)
+    for start in (1, 2):
+        values[start::2] = np.cumsum(values[start::2])
+    return values

@@ -1,0 +1,91 @@
+"""CVAT for images 1.1: one XML file for many photos; a larger z_order lies on top, and of equal ones the later.
+
+Format: https://docs.cvat.ai/docs/manual/advanced/xml_format. Read by a parser that refuses document type declarations, and with them
+entities, which can make a small file fill the memory or read others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from xml.parsers import expat
+
+from sc3d.errors import InputError
+from sc3d.segmentation.mask_formats.drawing import Drawing, Shape
+from sc3d.segmentation.mask_formats.outlines import OutlineError, Polygons, Runs, ellipse, polygons, rectangle, runs
+
+WITHOUT_AREA = {"points", "polyline", "cuboid", "skeleton", "tag"}
+WITH_AREA = {"polygon", "box", "ellipse", "mask"}
+
+
+def read_cvat(file: Path) -> Iterator[Drawing]:
+    """The drawings of a CVAT file, one per image; InputError if it is none, or one for videos."""
+    document = _Document(file)
+    parser = expat.ParserCreate()
+    parser.StartDoctypeDeclHandler = document.refuse
+    parser.StartElementHandler = document.start
+    parser.EndElementHandler = document.end
+    try:
+        with file.open("rb") as stream:
+            parser.ParseFile(stream)
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror}") from None
+    except (expat.ExpatError, ValueError, LookupError) as error:
+        raise InputError(f"{file} is not valid XML ({error})") from None
+    yield from document.drawings
+
+
+class _Document:
+    """What the parser has met so far."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.drawings: list[Drawing] = []
+        self._depth = 0
+        self._image: dict[str, str] | None = None
+        self._shapes: list[tuple[int, Shape]] = []
+
+    def refuse(self, *declaration: object) -> None:
+        raise InputError(f"{self.file} has a document type declaration, which CVAT never writes: it is refused")
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        if self._depth == 0 and tag != "annotations":
+            raise InputError(f"{self.file} is not a CVAT file: <annotations> is expected, not <{tag[:40]}>")
+        self._depth += 1
+        if tag == "track":
+            raise InputError(f"{self.file} is CVAT for video: export the task as 'CVAT for images 1.1'")
+        if tag == "image":
+            self._image, self._shapes = attributes, []
+        elif self._image is not None and tag in WITH_AREA | WITHOUT_AREA:
+            outline = partial(_outline, tag, attributes) if tag in WITH_AREA else None
+            self._shapes.append((self._level(attributes), Shape(tag, (attributes.get("label", ""),), outline)))
+
+    def end(self, tag: str) -> None:
+        self._depth -= 1
+        if tag == "image" and self._image is not None:
+            size = (self._image.get("width"), self._image.get("height"))
+            shapes = tuple(shape for _, shape in sorted(self._shapes, key=lambda entry: entry[0]))
+            self.drawings.append(Drawing(str(self.file), (self._image.get("name", ""),), None if None in size else size, shapes))
+            self._image = None
+
+    def _level(self, attributes: dict[str, str]) -> int:
+        try:
+            return int(attributes.get("z_order", 0))
+        except ValueError:
+            raise InputError(f"{self.file} has the z_order {attributes['z_order'][:40]!r}: a whole number is expected") from None
+
+
+def _outline(tag: str, attributes: dict[str, str], size: tuple[int, int]) -> Polygons | Runs:
+    rotation = float(attributes.get("rotation", 0))
+    if tag == "polygon":
+        pairs = attributes["points"].replace(";", ",").split(",")
+        return polygons([pairs], size)
+    if tag == "box":
+        return rectangle([attributes["xtl"], attributes["ytl"]], [attributes["xbr"], attributes["ybr"]], rotation, size)
+    if tag == "ellipse":
+        return ellipse([attributes["cx"], attributes["cy"]], [attributes["rx"], attributes["ry"]], rotation, size)
+    box = tuple(int(attributes[key]) for key in ("left", "top", "width", "height"))
+    if min(box) < 0 or max(box) > max(size):
+        raise OutlineError("lies outside of the image")
+    return runs(attributes["rle"].split(","), box, False, size)

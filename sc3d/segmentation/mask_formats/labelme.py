@@ -1,0 +1,73 @@
+"""LabelMe: one JSON file per photo; later shapes lie on top, as LabelMe itself exports them.
+
+Format: https://github.com/wkentaro/labelme. Also read by its relatives, such as X-AnyLabeling.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import io
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from sc3d.errors import InputError
+from sc3d.io import read_json
+from sc3d.segmentation.mask_formats.drawing import Drawing, Shape
+from sc3d.segmentation.mask_formats.outlines import OutlineError, Polygons, Runs, ellipse, encode, numbers, polygons, rectangle, runs
+
+WITHOUT_AREA = {"point", "points", "line", "linestrip"}
+
+
+def read_labelme(file: Path) -> Iterator[Drawing]:
+    """The drawing of a LabelMe file; the photo is found by its imagePath, or else by the file's own name."""
+    content = read_json(file)
+    shapes = content.get("shapes") if isinstance(content, dict) else None
+    if not isinstance(shapes, list) or not all(isinstance(shape, dict) for shape in shapes):
+        raise InputError(f"{file} is not a LabelMe file: it has no list of shapes")
+    size = (content.get("imageWidth"), content.get("imageHeight"))
+    path = content.get("imagePath")
+    photos = (path, file.name) if isinstance(path, str) and path else (file.name,)
+    yield Drawing(str(file), photos, None if None in size else size, tuple(_shape(shape) for shape in shapes))
+
+
+def _shape(shape: dict) -> Shape:
+    kind = str(shape.get("shape_type") or "polygon")
+    keys = (str(shape.get("label", "")),)
+    return Shape(kind, keys, None if kind in WITHOUT_AREA else partial(_outline, shape, kind))
+
+
+def _outline(shape: dict, kind: str, size: tuple[int, int]) -> Polygons | Runs:
+    points = shape["points"]
+    if kind in ("polygon", "oriented_rectangle", "rotation"):
+        return polygons([points], size)
+    if kind == "rectangle":
+        corners = numbers(points).reshape(-1, 2)
+        return rectangle(corners.min(axis=0), corners.max(axis=0), 0.0, size)
+    if kind == "circle":
+        centre, edge = numbers(points)
+        return ellipse(centre, [np.hypot(*(edge - centre))] * 2, 0.0, size)
+    if kind == "mask":
+        return _mask(shape["mask"], numbers(points), size)
+    raise OutlineError("is of a type that is not known")
+
+
+def _mask(text: str, corners: np.ndarray, size: tuple[int, int]) -> Runs:
+    """A PNG in base64 for the pixels from the first to the second corner, both included; its size is checked before it is decoded."""
+    from PIL import Image
+
+    if corners.shape != (2, 2) or (corners < 0).any() or (corners >= size).any() or (corners[1] < corners[0]).any():
+        raise OutlineError("lies outside of the image")
+    (left, top), (right, bottom) = corners.astype(int).tolist()
+    width, height = right - left + 1, bottom - top + 1
+    try:
+        with Image.open(io.BytesIO(base64.b64decode(text, validate=True)), formats=["PNG"]) as image:
+            if image.size != (width, height):
+                raise OutlineError("has a picture of another size than its corners say")
+            mask = np.array(image.convert("L")) > 0
+    except (OSError, SyntaxError, binascii.Error, Image.DecompressionBombError):
+        raise OutlineError("has a damaged picture") from None
+    return runs(encode(mask), (left, top, width, height), False, size)

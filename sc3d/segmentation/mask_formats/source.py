@@ -1,0 +1,110 @@
+"""Which format is it, and which photo does each mask belong to? Reads any of them to checked masks that are drawn one at a time."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from sc3d.scene.class_table import ClassTable
+from sc3d.errors import InputError
+from sc3d.segmentation.mask_formats.checks import Checks, Mask
+from sc3d.segmentation.mask_formats.coco import read_coco
+from sc3d.segmentation.mask_formats.cvat import read_cvat
+from sc3d.segmentation.mask_formats.drawing import to_mask
+from sc3d.segmentation.mask_formats.labelme import read_labelme
+from sc3d.segmentation.mask_formats.mapping import read_mapping
+from sc3d.segmentation.mask_formats.pngs import check_png, is_colored
+
+logger = logging.getLogger(__name__)
+
+READERS = {"labelme": read_labelme, "coco": read_coco, "cvat": read_cvat}
+SUFFIXES = {"labelme": ".json", "coco": ".json", "cvat": ".xml", "index": ".png", "color": ".png"}
+
+
+@dataclass(frozen=True)
+class MaskFiles:
+    """Masks made elsewhere.
+
+    path: a folder, or a JSON or XML file
+    format: auto, index, color, labelme, coco or cvat
+    mapping: JSON file of the ids, names or colours in them and the classes that they stand for
+    """
+
+    path: Path
+    format: str = "auto"
+    mapping: Path | None = None
+
+
+def read_masks(source: MaskFiles, photo_sizes: dict[str, tuple[int, int]], class_table: ClassTable) -> dict[str, Mask]:
+    """Masks by photo name, all checked and none drawn yet.
+
+    photo_sizes: (width, height) px by photo name
+    Raises InputError, in one line, for everything that does not fit.
+    """
+    kind = detect(source.path) if source.format == "auto" else source.format
+    checks = Checks(photo_sizes, read_mapping(source.mapping, class_table))
+    masks: dict[str, Mask] = {}
+    for file in _files(source.path, kind):
+        try:
+            for name, mask in _read(file, kind, checks):
+                if name in masks:
+                    checks.add("double", f"{name} has a mask in {masks[name].origin} and another in {mask.origin}")
+                masks.setdefault(name, mask)
+        except InputError as error:
+            checks.add("file", str(error))
+    checks.finish(source.path)
+    if not masks:
+        raise InputError(f"no masks in {source.path}: no annotation with an area is there")
+    logger.info("%s: %s masks for %d of %d photos", source.path, kind, len(masks), len(photo_sizes))
+    return dict(sorted(masks.items()))
+
+
+def _read(file: Path, kind: str, checks: Checks) -> Iterator[tuple[str, Mask]]:
+    if kind in ("index", "color"):
+        yield from check_png(file, kind == "color", checks)
+        return
+    for drawing in READERS[kind](file):
+        found = to_mask(drawing, checks)
+        if found is not None:
+            yield found
+
+
+def detect(path: Path) -> str:
+    """Format of a file or folder, by what is in it; InputError if nothing is known."""
+    annotated = next(filter(None, map(_kind, _find(path, (".json", ".xml")))), None)
+    if annotated:
+        return annotated
+    pngs = _find(path, (".png",)) if path.is_dir() else []
+    if pngs:
+        return "color" if all(is_colored(file) for file in pngs) else "index"
+    if path.suffix.lower() in (".zip", ".gz", ".7z"):
+        raise InputError(f"no masks in {path}: unpack the archive")
+    raise InputError(f"no masks in {path}: PNG files named like the photos, LabelMe or COCO JSON or CVAT XML are expected")
+
+
+def _kind(file: Path) -> str | None:
+    """Format of a JSON or XML file by the words in it, without decoding a file that may be large."""
+    if file.suffix.lower() == ".xml":
+        return "cvat"
+    content = file.read_bytes()
+    if b'"annotations"' in content and b'"categories"' in content:
+        return "coco"
+    return "labelme" if b'"shapes"' in content else None
+
+
+def _files(path: Path, kind: str) -> list[Path]:
+    files = _find(path, (SUFFIXES[kind],))
+    if not files or (kind in ("index", "color") and not path.is_dir()):
+        what = f"a folder of {SUFFIXES[kind]} files named like the photos is" if SUFFIXES[kind] == ".png" else f"a {SUFFIXES[kind]} file or a folder of them is"
+        raise InputError(f"no masks in {path}: {what} expected for --format {kind}")
+    return files
+
+
+def _find(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """The file itself, or the files of a folder by name; annotations also in folders below, PNGs not, because those may be photos."""
+    if not path.is_dir():
+        return [path] if path.is_file() and path.suffix.lower() in suffixes else []
+    found = path.iterdir() if suffixes == (".png",) else path.rglob("*")
+    return sorted(file for file in found if file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file())

@@ -1,0 +1,116 @@
+"""A second round for the masks: what contradicts the fused labels loses confidence, if photos that were left out say that this helps."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from tqdm import tqdm
+
+from sc3d.labelling.fusion import Cloud, Labels, Mask, fuse
+from sc3d.geometry.cameras import View, local_origin
+from sc3d.geometry.neighbors import NeighborIndex
+from sc3d.scene.labelled_cloud import REACH, LabelledSurface, point_arrays, read_surface, spacing_of
+from sc3d.labelling.inputs import Masks, default_voxel_size, read_given_cloud
+from sc3d.metrics import Confusion, total
+from sc3d.propagation import Evidence
+from sc3d.propagation import propagate as complete
+from sc3d.scene.scene import Scene
+from sc3d.settings import Label, Propagate
+
+logger = logging.getLogger(__name__)
+
+EVERY = 4  # every so many photos one is left out
+FULL = 255  # confidence of a mask that has no confidence map
+
+ReadMask = Callable[[View], Mask]
+
+
+@dataclass(frozen=True)
+class Material:
+    """A cloud with its surface, and the settings by which masks become labels.
+
+    colors: (N, 3) uint8 or None; seen: the surface, whatever labels it has; num_ids: largest class id + 1
+    """
+
+    cloud: Cloud
+    colors: np.ndarray | None
+    seen: LabelledSurface
+    num_ids: int
+    label: Label
+    propagate: Propagate = Propagate()
+
+    def labels(self, views: list[View], read: ReadMask) -> Labels:
+        """Labels of all points from the masks of some views."""
+        fusion = fuse(self.cloud, views, read, self.seen.surface, self.num_ids, self.label)
+        return complete(Evidence(self.cloud.points, fusion.labels, fusion.votes, self.colors), self.cloud.normals, self.propagate)
+
+    def render(self, labels: Labels, view: View, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W) uint8 labels and (H, W) float32 confidences, 0 to 1, as a photo of (width, height) sees them."""
+        rows, _ = self.seen.rows(view, size)
+        return np.where(rows >= 0, labels.label[rows], 0).astype(np.uint8), np.where(rows >= 0, labels.confidence[rows], 0).astype(np.float32)
+
+
+def material_of(scene: Scene, masks: Masks) -> Material:
+    """What refinement needs of a scene, with the default settings of `label` and `propagate`."""
+    cloud = read_given_cloud(scene, None)
+    points, normals = point_arrays(cloud, np.array([view.centre for view in masks.views]))
+    surface = read_surface(scene.mesh, points, normals, local_origin(masks.views))
+    seen = LabelledSurface(surface, NeighborIndex(points, points.min(axis=0)), np.zeros(len(points), np.uint8), REACH * spacing_of(points))
+    colors = cloud.point.colors.numpy() if "colors" in cloud.point else None
+    return Material(Cloud(points, normals), colors, seen, scene.class_table().num_ids, Label(voxel_size=default_voxel_size(points, masks)))
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """before, after: mIoU of fused labels against the masks of the photos left out, without and with one more round; labels: of all photos."""
+
+    before: float
+    after: float
+    material: Material
+    labels: Labels
+
+    @property
+    def helps(self) -> bool:
+        return self.after > self.before
+
+    def confidence(self, view: View, read: ReadMask) -> np.ndarray:
+        """(H, W) uint8 new confidence of a mask."""
+        return _doubted(self.material, self.labels, view, read)[1]
+
+
+def refine(material: Material, views: list[View], read: ReadMask) -> Refinement:
+    """Fuse, lower the confidence of what contradicts, fuse again: once without every 4th photo, to see whether it helps there, and once with all."""
+    ordered = sorted(views, key=lambda view: view.name)
+    asked = ordered[EVERY // 2 :: EVERY]
+    kept = [view for view in ordered if view not in asked]
+    first = material.labels(kept, read)
+    second = material.labels(kept, lambda view: _doubted(material, first, view, read))
+    before, after = (_agreement(material, labels, asked, read) for labels in (first, second))
+    logger.info("photos left out: mIoU of their masks with the fused labels %.2f %%, with doubted masks %.2f %%", 100 * before, 100 * after)
+    return Refinement(before, after, material, material.labels(ordered, read) if after > before else first)
+
+
+def doubt(mask: np.ndarray, confidence: np.ndarray | None, fused: np.ndarray, sure: np.ndarray) -> np.ndarray:
+    """(H, W) uint8 confidence c (1 - p) where the fused label is another than the mask's, c elsewhere.
+
+    mask, fused: (H, W) uint8 ids, 0 = no label; confidence c: (H, W) uint8, None = full; sure: (H, W) probability p of the fused label, 0 to 1
+    """
+    given = np.full(mask.shape, FULL, np.uint8) if confidence is None else confidence
+    contradicted = (mask > 0) & (fused > 0) & (mask != fused)
+    return np.where(contradicted, np.rint(given * (1 - np.clip(sure, 0, 1))), given).astype(np.uint8)
+
+
+def _doubted(material: Material, labels: Labels, view: View, read: ReadMask) -> Mask:
+    mask, confidence = read(view)
+    return mask, doubt(mask, confidence, *material.render(labels, view, mask.shape[::-1]))
+
+
+def _agreement(material: Material, labels: Labels, views: list[View], read: ReadMask) -> float:
+    parts = []
+    for view in tqdm(views, desc="photos left out", unit="photo", disable=None):
+        mask = read(view)[0]
+        parts.append(Confusion.of(mask, material.render(labels, view, mask.shape[::-1])[0], material.num_ids))
+    return total(parts, material.num_ids).mean_iou

@@ -1,0 +1,1 @@
+"""Masks from a few strokes: a pixel classifier on color and texture."""

@@ -1,0 +1,153 @@
+"""Numba kernels that composite tiles front to back.
+
+Inside a tile the Gaussian is the outer loop, its rows come next, and runs of 8 pixels between the ends of its ellipse are the inner one.
+All pixel state of a tile lives in one small flat buffer, plane after plane, with rows padded so that a run may start at any column;
+padding and pixels outside the image have transmittance 0 and so never count. See `kernels_project` for the record and its u, m, a, h.
+`kernels_unraster` repeats the walk: what decides whether a fragment counts is the same operations in both, so both see the same fragments.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from sc3d.splatting.cpu.tile_binning import ROOM, TILE, first_pixel, last_pixel
+from sc3d.splatting.cpu.projection import MIN_ALPHA, RECORD
+from sc3d.splatting.cpu.simd import (
+    LANES, any_at_least, exp2, fma, largest, load, maximum, minimum, ramp, root, splat, store, store_whole, total, where_at_least,
+)
+
+MAX_ALPHA = 0.99
+MIN_TRANSMITTANCE = 1e-4
+CHANNELS = 8  # colour 3, normal 3, plane distance, alpha
+STRIDE = TILE + LANES  # floats per row of a plane
+PLANE = TILE * STRIDE
+CHECK = 16  # instances between two checks whether a tile is finished
+LOG2_MIN_ALPHA = np.float32(math.log2(MIN_ALPHA))
+_CEIL = np.float32(1.0 - 1e-6)  # truncating x + this rounds up, at worst one pixel early
+_HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0.0), np.float32(1.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def open_tile(pixels, rows, columns):
+    """Transmittance 1 inside the image, 0 in padding; all other planes 0."""
+    pixels[:] = _ZERO
+    for row in range(rows):
+        for column in range(columns):
+            pixels[row * STRIDE + column] = _ONE
+
+
+@numba.njit(cache=True, error_model="numpy")
+def finished(pixels):
+    """Whether no pixel of the tile lets light through any more."""
+    limit = splat(MIN_TRANSMITTANCE)
+    for place in range(0, PLANE, LANES):
+        if any_at_least(load(pixels, place), limit):
+            return False
+    return True
+
+
+@numba.njit(cache=True, error_model="numpy")
+def measure_rows(records, base, origin_x, origin_y, rows, columns, lines, ends):
+    """Where the ellipse of a record meets the 16 pixel rows of a tile; returns first and last row.
+
+    lines (3 * 16,): dy, centre - 0.5 (px, tile frame) and log2 alpha at the centre of each row
+    ends (2 * 16,): first column and one past the last column of each row
+    """
+    mean_y, half_y = records[base + 1] - origin_y, records[base + 7]
+    mean_x, slope = splat(records[base] - origin_x - _HALF), splat(records[base + 2])
+    minus_decay_y, log_opacity, inverse_decay = splat(-records[base + 4]), splat(records[base + 5]), splat(_ONE / records[base + 3])
+    for row in range(0, TILE, LANES):
+        dy = ramp() + splat(np.float32(row) + _HALF - mean_y)
+        peak, centre = fma(minus_decay_y * dy, dy, log_opacity), fma(slope, dy, mean_x)
+        half = root(maximum((peak + splat(ROOM)) * inverse_decay, splat(_ZERO)))
+        store(lines, row, dy)
+        store(lines, TILE + row, centre)
+        store(lines, 2 * TILE + row, peak)
+        limit = splat(np.float32(columns))
+        store_whole(ends, row, minimum(maximum(centre - half + splat(_CEIL), splat(_ZERO)), limit))
+        store_whole(ends, TILE + row, minimum(maximum(centre + half + splat(_ONE), splat(_ZERO)), limit))
+    return first_pixel(mean_y - half_y, rows), last_pixel(mean_y + half_y, rows - 1)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _forward_tile(records, ranks, instances, first, last, origin_x, origin_y, rows, columns, geometry, pixels, contributions):
+    """Composites one tile into `pixels`; contributions (P, 2): sum of weights and largest transmittance of each instance."""
+    lane, low, high, limit = ramp(), splat(LOG2_MIN_ALPHA), splat(MAX_ALPHA), splat(MIN_TRANSMITTANCE)
+    lines, ends = np.empty(3 * TILE, np.float32), np.empty(2 * TILE, np.int32)
+    for entry in range(first, last):
+        if (entry - first) % CHECK == CHECK - 1 and finished(pixels):
+            return
+        base = np.int64(ranks[entry]) * RECORD
+        first_row, last_row = measure_rows(records, base, origin_x, origin_y, rows, columns, lines, ends)
+        minus_decay = splat(-records[base + 3])
+        red, green, blue = splat(records[base + 8]), splat(records[base + 9]), splat(records[base + 10])
+        normal_x, normal_y, normal_z = splat(records[base + 11]), splat(records[base + 12]), splat(records[base + 13])
+        distance = splat(records[base + 14])
+        weight, brightest = splat(_ZERO), splat(_ZERO)
+        for row in range(first_row, last_row + 1):
+            column, end, centre, peak = np.int64(ends[row]), np.int64(ends[TILE + row]), lines[TILE + row], splat(lines[2 * TILE + row])
+            while column < end:
+                place = row * STRIDE + column
+                transmittance = load(pixels, place)
+                if not any_at_least(transmittance, limit):
+                    column += LANES
+                    continue
+                u = lane + splat(np.float32(column) - centre)
+                exponent = fma(minus_decay * u, u, peak)
+                alpha = where_at_least(exponent, low, where_at_least(transmittance, limit, minimum(exp2(exponent), high)))
+                w = alpha * transmittance
+                store(pixels, place, transmittance - w)
+                weight = weight + w
+                brightest = maximum(brightest, where_at_least(exponent, low, transmittance))
+                store(pixels, place + PLANE, fma(w, red, load(pixels, place + PLANE)))
+                store(pixels, place + 2 * PLANE, fma(w, green, load(pixels, place + 2 * PLANE)))
+                store(pixels, place + 3 * PLANE, fma(w, blue, load(pixels, place + 3 * PLANE)))
+                if geometry:
+                    store(pixels, place + 4 * PLANE, fma(w, normal_x, load(pixels, place + 4 * PLANE)))
+                    store(pixels, place + 5 * PLANE, fma(w, normal_y, load(pixels, place + 5 * PLANE)))
+                    store(pixels, place + 6 * PLANE, fma(w, normal_z, load(pixels, place + 6 * PLANE)))
+                    store(pixels, place + 7 * PLANE, fma(w, distance, load(pixels, place + 7 * PLANE)))
+                column += LANES
+        instance, seen = np.int64(instances[entry]), largest(brightest)
+        contributions[instance, 0], contributions[instance, 1] = total(weight), seen if seen >= MIN_TRANSMITTANCE else _ZERO
+
+
+@numba.njit(cache=True, error_model="numpy", parallel=True)
+def rasterise(records, ranks, instances, starts, order, background, geometry, image, contributions):
+    """Composites all tiles.
+
+    records: (M * 16,) in depth order; ranks, instances: (P,) tile by tile, starts (tiles + 1,); order: (tiles,) permutation, for balance
+    background: (3,); image: (8, H, W) filled with colour, normal, plane distance, alpha; contributions: (P, 2), zero on entry
+    """
+    height, width = image.shape[1], image.shape[2]
+    tiles_x = (width + TILE - 1) // TILE
+    for item in numba.prange(order.shape[0]):
+        tile = order[item]
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        rows, columns = min(TILE, height - top), min(TILE, width - left)
+        pixels = np.empty(CHANNELS * PLANE, np.float32)
+        open_tile(pixels, rows, columns)
+        _forward_tile(records, ranks, instances, starts[tile], starts[tile + 1], np.float32(left), np.float32(top), rows, columns, geometry,
+                      pixels, contributions)
+        for row in range(rows):
+            for column in range(columns):
+                place = row * STRIDE + column
+                for channel in range(3):
+                    image[channel, top + row, left + column] = pixels[place + (channel + 1) * PLANE] + pixels[place] * background[channel]
+                for channel in range(3, 7):
+                    image[channel, top + row, left + column] = pixels[place + (channel + 1) * PLANE]
+                image[7, top + row, left + column] = _ONE - pixels[place]
+
+
+@numba.njit(cache=True, error_model="numpy", parallel=True)
+def collect_contributions(visible, offsets, contributions, weight, max_transmittance):
+    """Per Gaussian: sum of its instances' weights and largest transmittance; rows of invisible Gaussians are not touched."""
+    for rank in numba.prange(visible.shape[0]):
+        total_weight, largest_seen = 0.0, _ZERO
+        for instance in range(offsets[rank], offsets[rank + 1]):
+            total_weight += contributions[instance, 0]
+            largest_seen = max(largest_seen, contributions[instance, 1])
+        weight[visible[rank]], max_transmittance[visible[rank]] = total_weight, largest_seen

@@ -1,0 +1,114 @@
+"""Numba kernels that sort records into tiles of 16 x 16 px: which Gaussians touch which tile, front to back.
+
+An *instance* is a (Gaussian, tile) pair. Instances are numbered Gaussian by Gaussian, so that what each of them sums up can be added per Gaussian
+in a fixed order, whatever the number of threads. Only tiles that the ellipse of alpha >= 1/255 really touches are listed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from sc3d.splatting.cpu.projection import MIN_ALPHA
+
+TILE = 16
+ROOM = np.float32(-math.log2(MIN_ALPHA) + 5e-4)  # log2 alpha above 1/255; half the slack of the extents in `kernels_project`
+_HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0.0), np.float32(1.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def first_pixel(low, limit):
+    """Smallest pixel index >= 0 whose centre is >= low, at most limit."""
+    place = min(max(low - _HALF, _ZERO), np.float32(limit))
+    whole = np.int64(place)
+    return whole + np.int64(np.float32(whole) < place)  # math.ceil would be a library call in the innermost loops
+
+
+@numba.njit(cache=True, error_model="numpy")
+def last_pixel(high, limit):
+    """Largest pixel index <= limit whose centre is <= high, at least -1."""
+    return np.int64(min(max(high + _HALF, _ZERO), np.float32(limit) + _ONE)) - 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _tile_rows(record, height):
+    """First and last tile row that the ellipse of a record touches."""
+    return first_pixel(record[1] - record[7], height) // TILE, last_pixel(record[1] + record[7], height - 1) // TILE
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _tile_columns(record, tile_row, width, height):
+    """First and last tile column that the ellipse touches between the first and last pixel centre of a tile row; empty if first > last."""
+    mean_y, half_y, extreme = record[1], record[7], record[15]
+    top = max(np.float32(tile_row * TILE) + _HALF - mean_y, -half_y)
+    bottom = min(np.float32(min((tile_row + 1) * TILE, height)) - _HALF - mean_y, half_y)
+    if top > bottom:
+        return 1, 0
+    right, left = min(max(extreme, top), bottom), min(max(-extreme, top), bottom)
+    room = record[5] + ROOM
+    high = record[0] + record[2] * right + math.sqrt(max(room - record[4] * right * right, _ZERO) / record[3])
+    low = record[0] + record[2] * left - math.sqrt(max(room - record[4] * left * left, _ZERO) / record[3])
+    first, last = first_pixel(low, width), last_pixel(high, width - 1)
+    if first > last:
+        return 1, 0
+    return first // TILE, last // TILE
+
+
+@numba.njit(cache=True, error_model="numpy", parallel=True)
+def count_instances(near_to_far, visible, all_records, records, width, height, histograms, counts):
+    """Copies records (M, 16) in depth order; counts tiles per Gaussian, and Gaussians per tile in each of several blocks of the depth order.
+
+    near_to_far: (M,) order of visible (M,), the ids of all_records that matter
+    counts: (M,) in the order of `visible`; histograms: (blocks, tiles), zero on entry
+    """
+    blocks, tiles_x = histograms.shape[0], (width + TILE - 1) // TILE
+    size = (near_to_far.shape[0] + blocks - 1) // blocks
+    for block in numba.prange(blocks):
+        for rank in range(block * size, min(near_to_far.shape[0], (block + 1) * size)):
+            source, record = visible[near_to_far[rank]], records[rank]
+            for k in range(record.shape[0]):
+                record[k] = all_records[source, k]
+            count = 0
+            first_row, last_row = _tile_rows(record, height)
+            for row in range(first_row, last_row + 1):
+                first, last = _tile_columns(record, row, width, height)
+                for column in range(first, last + 1):
+                    histograms[block, row * tiles_x + column] += 1
+                count += max(last - first + 1, 0)
+            counts[near_to_far[rank]] = count
+
+
+@numba.njit(cache=True, error_model="numpy")
+def place_blocks(histograms, starts):
+    """Turns counts (blocks, tiles) into each block's first place in each tile, tile by tile; starts (tiles + 1,)."""
+    place = 0
+    for tile in range(histograms.shape[1]):
+        starts[tile] = place
+        for block in range(histograms.shape[0]):
+            count = histograms[block, tile]
+            histograms[block, tile] = place
+            place += count
+    starts[histograms.shape[1]] = place
+
+
+@numba.njit(cache=True, error_model="numpy", parallel=True)
+def place_instances(near_to_far, records, width, height, histograms, offsets, ranks, instances):
+    """Counting sort: for each tile, front to back, the row in `records` and the number of each instance.
+
+    offsets: (M + 1,) first instance of each visible Gaussian; histograms: from `place_blocks`, used up
+    """
+    blocks, tiles_x = histograms.shape[0], (width + TILE - 1) // TILE
+    size = (near_to_far.shape[0] + blocks - 1) // blocks
+    for block in numba.prange(blocks):
+        for rank in range(block * size, min(near_to_far.shape[0], (block + 1) * size)):
+            instance = offsets[near_to_far[rank]]
+            first_row, last_row = _tile_rows(records[rank], height)
+            for row in range(first_row, last_row + 1):
+                first, last = _tile_columns(records[rank], row, width, height)
+                for column in range(first, last + 1):
+                    place = histograms[block, row * tiles_x + column]
+                    histograms[block, row * tiles_x + column] = place + 1
+                    ranks[place], instances[place] = rank, instance
+                    instance += 1

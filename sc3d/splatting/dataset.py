@@ -1,0 +1,96 @@
+"""What training starts from: pinhole views with their photos, and sparse points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import torch
+
+from sc3d.errors import InputError
+from sc3d.geometry.cameras import View, in_image, local_origin, project, resample, undistorted
+from sc3d.io import read_image
+from sc3d.scene.scene import Scene
+from sc3d.settings.train import TrainSettings
+
+CACHED_PIXELS = 500_000_000  # undistorted photos kept in memory: 1.5 GB
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Photos and sparse points; positions in a local world frame that float32 can hold.
+
+    views: V pinhole views at training size, V >= 2
+    images: per view (H, W, 3) uint8 RGB, a sequence or a function of the view's index (then read anew each time)
+    points, colors: (N, 3) sparse points; (N, 3) uint8 RGB
+    tracks: per view the row indices of the sparse points it sees; None = unknown
+    masks: per view (H, W) bool, False = ignored; sequence, function (may return None) or None
+    """
+
+    views: list[View]
+    images: Sequence[np.ndarray] | Callable[[int], np.ndarray]
+    points: np.ndarray
+    colors: np.ndarray
+    tracks: list[np.ndarray] | None = None
+    masks: Sequence[np.ndarray] | Callable[[int], np.ndarray | None] | None = None
+
+    def image(self, index: int) -> np.ndarray:
+        """(H, W, 3) uint8 photo of a view. Raises InputError if its size is not the view's."""
+        return self._checked(_item(self.images, index), index, "image")
+
+    def mask(self, index: int) -> np.ndarray | None:
+        """(H, W) bool mask of a view, if there is one. Raises InputError if its size is not the view's."""
+        mask = _item(self.masks, index)
+        return None if mask is None else self._checked(mask, index, "mask").astype(bool)
+
+    def photo(self, index: int, halved: bool = False) -> tuple[View, torch.Tensor, torch.Tensor | None]:
+        """View, (H, W, 3) image in [0, 1] and (H, W) bool mask or None, at full or half size."""
+        view, image, mask = self.views[index], self.image(index), self.mask(index)
+        if halved:
+            view = view.resized(max(1, view.width // 2), max(1, view.height // 2))
+            image = cv2.resize(image, (view.width, view.height), interpolation=cv2.INTER_AREA)
+            if mask is not None:
+                mask = cv2.resize(mask.astype(np.uint8), (view.width, view.height), interpolation=cv2.INTER_NEAREST).astype(bool)
+        planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).float() / 255
+        return view, planes.permute(1, 2, 0), None if mask is None else torch.from_numpy(mask)  # plane by plane, as `render` stores images
+
+    def subset(self, indices: list[int]) -> TrainingData:
+        """The same points with some of the views, renumbered from 0."""
+        tracks = None if self.tracks is None else [self.tracks[index] for index in indices]
+        return TrainingData([self.views[index] for index in indices], lambda row: _item(self.images, indices[row]), self.points, self.colors,
+                            tracks, lambda row: _item(self.masks, indices[row]))
+
+    def seen(self, index: int) -> np.ndarray:
+        """(T,) rows of the sparse points that a view sees; all in its image, where tracks are unknown."""
+        if self.tracks is not None:
+            return self.tracks[index]
+        pixels, depths = project(self.views[index], np.asarray(self.points, np.float64))
+        return np.nonzero(in_image(self.views[index], pixels) & (depths > 0))[0]
+
+    def _checked(self, array: np.ndarray, index: int, what: str) -> np.ndarray:
+        view = self.views[index]
+        if array.shape[:2] != (view.height, view.width):
+            raise InputError(f"{what} of {view.name} is {array.shape[1]}x{array.shape[0]}, its view {view.width}x{view.height}")
+        return array
+
+
+def scene_data(scene: Scene, settings: TrainSettings) -> tuple[TrainingData, np.ndarray]:
+    """A scene's photos, undistorted at training size when they are asked for, and sparse points; the (3,) world position of the local origin."""
+    model = scene.model
+    origin = local_origin(model.views)
+    views = [undistorted(view.shifted(origin), settings.size(max(view.width, view.height))) for view in model.views]
+
+    @lru_cache(maxsize=max(2, CACHED_PIXELS // max(view.width * view.height for view in views)))
+    def image(index: int) -> np.ndarray:
+        return resample(read_image(scene.photo(model.views[index].name)), model.views[index].shifted(origin), views[index])
+
+    return TrainingData(views, image, model.points - origin, model.colors, model.tracks), origin
+
+
+def _item(source: Sequence | Callable | None, index: int) -> np.ndarray | None:
+    if source is None:
+        return None
+    return source(index) if callable(source) else source[index]

@@ -1,0 +1,89 @@
+"""How much fits into memory, and the folder in which a stage's finished parts wait."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+from dataclasses import asdict, fields
+from pathlib import Path
+
+from sc3d.errors import InputError
+from sc3d.io.atomic import require_room
+from sc3d.io.ply import read_header
+from sc3d.settings import Resources
+from sc3d.io.chunked_clouds import CloudFile
+
+BASE = 900 << 20  # bytes of a process without points: libraries, a photo's masks, a few range maps
+TRIANGLE = 300  # bytes of a triangle while rays are cast
+LEAST = 20_000  # points of a tile; with fewer, most of the work would be on margins
+UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
+
+
+def memory_of(resources: Resources) -> int:
+    """Bytes that one process may use; InputError if the option is no amount of memory, or too small."""
+    if resources.max_memory:
+        found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?", resources.max_memory.strip(), re.IGNORECASE)
+        if not found:
+            raise InputError(f"--max-memory {resources.max_memory}: an amount such as 6G or 800M is expected")
+        total = int(float(found[1]) * UNITS[found[2].upper()])
+    else:
+        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    share = total // max(resources.workers + 1, 1) if not resources.cluster else total  # this process is there beside its workers
+    if share <= BASE + (100 << 20):
+        raise InputError(f"--max-memory: {total >> 20} MiB are too little for {resources.workers + 1} processes of at least {(BASE >> 20) + 100} MiB")
+    return share
+
+
+def fits(needed: int, resources: Resources) -> bool:
+    """Whether work of so many bytes fits into memory as a whole, and nobody asked for workers."""
+    return resources.workers < 1 and not resources.cluster and needed + BASE <= memory_of(resources)
+
+
+def max_points(resources: Resources, bytes_per_point: int) -> int:
+    """Points that a process has room for."""
+    return max((memory_of(resources) - BASE) // bytes_per_point, LEAST)
+
+
+def num_points(path: Path) -> int | None:
+    """Points of a file that can be read in parts; None for other kinds, which are read as a whole."""
+    kind = path.suffix.lower()
+    if kind == ".ply" and path.is_file():
+        vertex = read_header(path).element("vertex")
+        return vertex.rows if vertex is not None else None
+    return CloudFile.open(path).num_points if kind in (".las", ".laz") else None
+
+
+def mesh_triangles(path: Path) -> int:
+    """Triangles of a mesh file, 0 if there is none."""
+    face = read_header(path).element("face") if path.is_file() else None
+    return face.rows if face is not None else 0
+
+
+class Parts:
+    """A folder for what a stage has finished, beside its output: hidden, named after all that decides its content, and removed with the last output."""
+
+    def __init__(self, output: Path, stage: str, inputs: list[Path], settings: object) -> None:
+        ignored = {field.name for field in fields(Resources)}
+        decisive = [sorted((name, str(value)) for name, value in asdict(settings).items() if name not in ignored | {"output"})]
+        state = hashlib.sha256(repr((stage, decisive, [_identity(path) for path in inputs])).encode()).hexdigest()[:12]
+        self.folder = output.absolute().parent / f".{output.name}.{state}.parts"
+        for other in self.folder.parent.glob(f".{output.name}.*.parts"):
+            if other != self.folder:
+                shutil.rmtree(other, ignore_errors=True)
+
+    def subfolder(self, name: str) -> Path:
+        folder = self.folder / name
+        folder.mkdir(parents=True, exist_ok=True)
+        require_room(folder / "any")
+        return folder
+
+    def remove(self) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _identity(path: Path) -> tuple:
+    """Of a file, or of all files of a folder: names, sizes and times."""
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    return str(path), tuple((str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file())

@@ -1,0 +1,113 @@
+"""What `propagate` keeps of each tile between its passes: the neighbour graph of the tile and its margin, and arrays of the tile's own points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from sc3d.labelling.fusion import Extent, Labels
+from sc3d.geometry.graph import Graph, build_graph
+from sc3d.scene.labelled_cloud import VOTES
+from sc3d.propagation import Evidence, tie_breakers
+from sc3d.propagation.appearance import COLOR_BINS, COLOR_BLUR, RELIEF_BINS, RELIEF_BLUR, Cells, Raters
+from sc3d.propagation.terrain import NUM_FEATURES
+from sc3d.settings import Propagate
+from sc3d.io.chunked_clouds import columns, positions
+from sc3d.tiling.store import Results, TileStore, Window
+
+GRAPH = tuple(field.name for field in fields(Graph))
+KNOWN = ("points", "votes", *(field.name for field in fields(Labels)), "colors")  # of Evidence, in the order of the graph
+
+
+@dataclass(frozen=True)
+class PropagateJob:
+    """What the task of a tile needs to know. margin: world units; num_ids: channels of the votes; shared: folder for what all tiles read"""
+
+    settings: Propagate
+    extent: Extent
+    store: TileStore
+    results: Results
+    margin: float
+    num_ids: int
+    shared: Path
+
+    @property
+    def colored(self) -> bool:
+        return {"red", "green", "blue"} <= set(self.store.dtype.names)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A tile with its margin, in the canonical order of its graph. core: (N,) bool points of the tile itself"""
+
+    tile: int
+    window: Window
+    graph: Graph
+    known: Evidence
+    core: np.ndarray
+
+    @classmethod
+    def load(cls, job: PropagateJob, tile: int) -> Part:
+        """The graph is built at the first time and kept in files, of which a pass reads what it looks at."""
+        window = job.store.window(tile, job.margin)
+        if not job.results.has(tile, f"part_{KNOWN[-1]}"):
+            _build(job, tile, window)
+        graph, known = Graph(*_mapped(job, tile, GRAPH)), _mapped(job, tile, KNOWN)
+        evidence = Evidence(known[0], Labels(*known[2:-1]), known[1], known[-1] if job.colored else None)
+        return cls(tile, window, graph, evidence, window.core[graph.order])
+
+    def own(self, values: np.ndarray) -> np.ndarray:
+        """Values of the tile's own points, as `Results` keeps them, from values (N, ...) of the part."""
+        result = np.empty_like(values)
+        result[self.graph.order] = values
+        return result[self.window.core]
+
+    def around(self, job: PropagateJob, name: str) -> np.ndarray:
+        """Values of all points of the part, from what their tiles keep."""
+        return job.results.around(self.window, name)[self.graph.order]
+
+    def own_in_order(self, values: np.ndarray) -> np.ndarray:
+        """The opposite of `own`; 0 at the points of the margin."""
+        result = np.zeros((len(self.core), *values.shape[1:]), values.dtype)
+        result[self.window.core] = values
+        return result[self.graph.order]
+
+    def raters(self, job: PropagateJob) -> Raters:
+        """Histogram cells of all points of the part."""
+        return raters_of(self.around(job, "cells"))
+
+
+def raters_of(cells: np.ndarray) -> Raters:
+    """Raters from the cells (N, G) int32 that `cells_of` gives."""
+    relief = Cells(cells[:, -1], (RELIEF_BINS,) * NUM_FEATURES, RELIEF_BLUR)
+    return Raters((relief,) if cells.shape[1] == 1 else (Cells(cells[:, 0], (COLOR_BINS,) * 3, COLOR_BLUR), relief))
+
+
+def cells_of(raters: Raters) -> np.ndarray:
+    """(N, G) int32 cell of each point in each group."""
+    return np.stack([group.cell for group in raters.groups], axis=1)
+
+
+def _build(job: PropagateJob, tile: int, window: Window) -> None:
+    evidence, normals = _evidence(job, window)
+    colors, box = evidence.colors if job.settings.color else None, (job.extent.low, job.extent.high)
+    graph = build_graph(evidence.points, normals, job.settings.num_neighbors, colors, tie_breakers(evidence, normals), box)
+    known = evidence.ordered(graph.order)
+    values = (known.points, known.votes, *(getattr(known.seeds, field.name) for field in fields(Labels)), known.colors if job.colored else np.empty(0))
+    for names, arrays in ((GRAPH, [getattr(graph, name) for name in GRAPH]), (KNOWN, values)):
+        job.results.write(tile, **{f"part_{name}": array for name, array in zip(names, arrays, strict=True)})
+
+
+def _mapped(job: PropagateJob, tile: int, names: tuple[str, ...]) -> list[np.ndarray]:
+    return [np.asarray(job.results.read(tile, f"part_{name}", mapped=True)) for name in names]
+
+
+def _evidence(job: PropagateJob, window: Window) -> tuple[Evidence, np.ndarray]:
+    """What is known of the window's points, by row, and their normals."""
+    records = window.gather(job.store.records)
+    labels = Labels(*(records[name].astype(kind) for name, kind in
+                      (("label", np.uint8), ("confidence", np.float32), ("state", np.uint8), ("num_views", np.int32))))
+    votes = columns(records, [f"{VOTES}{label}" for label in range(job.num_ids)])
+    return Evidence(positions(records), labels, votes, columns(records, ("red", "green", "blue"))), columns(records, ("nx", "ny", "nz"))

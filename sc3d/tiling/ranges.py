@@ -1,0 +1,149 @@
+"""First surfaces through a mesh that need not fit into memory: it is cut into parts, and the nearest hit over all parts counts.
+
+The minimum does not care about the order of the parts, so the ranges are those of the whole mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numba
+import numpy as np
+
+from sc3d.errors import InputError
+from sc3d.io.atomic import atomic_path
+from sc3d.io.ply import check_ply
+from sc3d.geometry.cameras import View, camera_rays, may_see
+from sc3d.geometry.raycast import Surface
+from sc3d.io.chunked_clouds import CHUNK, positions
+from sc3d.tiling.store import Grid
+
+SLACK = 1e-5  # of the box around a part, and of a range: rays that only just reach it are cast
+
+
+@dataclass(frozen=True)
+class MeshParts:
+    """Triangles by tile of the ground plane: folder/<part>.bin, (T, 9) float32 corners less `origin` (3,); boxes: {part: (2, 3) float64 their box, same frame}."""
+
+    folder: Path
+    origin: np.ndarray
+    boxes: dict[int, np.ndarray]
+
+    @classmethod
+    def split(cls, triangles: Iterable[np.ndarray], grid: Grid, folder: Path, origin: np.ndarray) -> MeshParts:
+        """triangles: chunks (T, 3, 3) float64 world. Each triangle goes to the tile of its first corner. Parts that are there already are taken as they are."""
+        index = folder / "boxes.npz"
+        if not index.exists():
+            for old in folder.iterdir():
+                old.unlink()
+            boxes: dict[int, np.ndarray] = {}
+            for chunk in triangles:
+                tiles, local = grid.tile_of(chunk[:, 0]), (chunk - origin).astype(np.float32)
+                for tile in np.unique(tiles):
+                    mine = local[tiles == tile]
+                    box = np.stack([mine.min(axis=(0, 1)), mine.max(axis=(0, 1))]).astype(np.float64)
+                    old = boxes.get(int(tile), box)
+                    boxes[int(tile)] = np.stack([np.minimum(old[0], box[0]), np.maximum(old[1], box[1])])
+                    with (folder / f"{tile}.bin").open("ab") as file:
+                        file.write(np.ascontiguousarray(mine))
+            with atomic_path(index) as temporary:
+                np.savez(temporary, parts=np.array(sorted(boxes), np.int64), boxes=np.array([boxes[part] for part in sorted(boxes)]).reshape(-1, 2, 3))
+        stored = np.load(index, allow_pickle=False)
+        return cls(folder, np.asarray(origin, np.float64), dict(zip(stored["parts"].tolist(), stored["boxes"], strict=True)))
+
+    def surface(self, part: int) -> Surface:
+        corners = np.fromfile(self.folder / f"{part}.bin", np.float32).reshape(-1, 3)
+        return Surface(Surface.from_mesh(corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3), np.zeros(3)).scene, self.origin)
+
+
+def read_triangles(path: Path) -> Iterator[np.ndarray]:
+    """Corners (T, 3, 3) float64, world, of the triangles of a binary PLY, in chunks; the vertices stay on disk."""
+    header = check_ply(path)
+    vertex, face = header.element("vertex"), header.element("face")
+    corners = next((entry for entry in face.properties if entry.count), None) if face is not None else None
+    if not header.order or vertex is None or vertex.has_lists or corners is None or [element.name for element in header.elements] != ["vertex", "face"]:
+        raise InputError(f"{path} does not fit into --max-memory, and can be read in parts as binary PLY of vertices and triangles only: write it anew")
+    table = np.dtype([(entry.name, header.order + entry.dtype) for entry in vertex.properties])
+    row = np.dtype([field for entry in face.properties for field in _fields(entry, corners, header.order)])
+    start = header.size + table.itemsize * vertex.rows
+    for first in range(0, face.rows, CHUNK):
+        count = min(CHUNK, face.rows - first)
+        faces = np.fromfile(path, row, count, offset=start + first * row.itemsize)
+        if len(faces) < count or (faces["count"] != 3).any():
+            raise InputError(f"{path} has faces that are not triangles: cut them into triangles, or allow more --max-memory")
+        used, inverse = np.unique(faces["corners"], return_inverse=True)
+        vertices = positions(np.memmap(path, table, "r", header.size, (vertex.rows,))[used])  # mapped anew each time, so that its pages can go
+        yield vertices[inverse.reshape(-1, 3)]
+
+
+def _fields(entry, corners, order: str) -> list[tuple]:  # noqa: ANN001 - formats.ply.Property
+    if entry is corners:
+        return [("count", order + entry.count), ("corners", order + entry.dtype, (3,))]
+    if entry.count:
+        raise InputError("the faces of the mesh have more than one list: write it anew with triangles only")
+    return [(entry.name, order + entry.dtype)]
+
+
+def _cast(parts: MeshParts, part: int, surface: Surface, view: View, directions: np.ndarray, nearest: np.ndarray) -> None:
+    """Lower `nearest` (H * W,) to the hits in one part."""
+    low, high = parts.boxes[part]
+    slack = SLACK * (1 + np.abs(view.centre - parts.origin).max() + (high - low).max())
+    reached = np.empty(len(nearest), np.bool_)
+    _reach(directions, view.cam_from_world, view.centre - parts.origin, low - slack, high + slack, nearest, reached)
+    pixels = np.flatnonzero(reached)
+    if len(pixels):
+        nearest[pixels] = np.minimum(nearest[pixels], surface.cast(view, directions[pixels])[0])
+
+
+@numba.njit(parallel=True, cache=True, error_model="numpy")
+def _reach(directions, cam_from_world, start, low, high, nearest, reached):  # noqa: ANN001, ANN202 - numba kernel
+    """Which rays (K, 3), camera frame, enter the box before their nearest hit so far."""
+    for k in numba.prange(len(directions)):
+        enter, leave = 0.0, np.inf
+        for axis in range(3):
+            slope = np.float64(directions[k, 0]) * cam_from_world[0, axis]
+            slope += np.float64(directions[k, 1]) * cam_from_world[1, axis] + np.float64(directions[k, 2]) * cam_from_world[2, axis]
+            if abs(slope) < 1e-12:
+                if start[axis] < low[axis] or start[axis] > high[axis]:
+                    leave = -1.0
+                continue
+            first, second = (low[axis] - start[axis]) / slope, (high[axis] - start[axis]) / slope
+            enter, leave = max(enter, min(first, second)), min(leave, max(first, second))
+        reached[k] = enter <= leave and enter <= nearest[k] * (1 + SLACK) and np.isfinite(directions[k, 2])
+
+
+@dataclass(frozen=True)
+class RangeMaps:
+    """Ranges that are computed already, as a `RayTarget`: folder/<number of the view>.npy; numbers: {name of the view: number}."""
+
+    folder: Path
+    numbers: dict[str, int]
+
+    def path(self, view: View) -> Path:
+        return self.folder / f"{self.numbers[view.name]}.npy"
+
+    def write(self, view: View, ranges: np.ndarray) -> None:
+        with atomic_path(self.path(view)) as temporary, temporary.open("wb") as file:
+            np.lib.format.write_array(file, ranges, allow_pickle=False)
+
+    def cast(self, view: View, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `RayTarget.cast`, for all pixels of the view in order; the incidence is not known, NaN."""
+        ranges = np.load(self.path(view), allow_pickle=False).ravel()
+        if len(ranges) != len(directions):
+            raise ValueError(f"{view.name}: ranges of {len(ranges)} pixels, asked for {len(directions)}")
+        return ranges, np.full_like(ranges, np.nan)
+
+
+def write_ranges(parts: MeshParts, views: list[View], maps: RangeMaps) -> None:
+    """Ranges of a group of views, sized as they shall be; a part of the mesh is loaded once for all of them. Memory: one part and the maps of the group."""
+    views = [view for view in views if not maps.path(view).exists()]
+    rays_of = {view.name: np.full(view.height * view.width, np.inf, np.float32) for view in views}
+    for part, (low, high) in parts.boxes.items():
+        seeing = [view for view in views if may_see(view, low + parts.origin, high + parts.origin)]
+        surface = parts.surface(part) if seeing else None
+        for view in seeing:
+            _cast(parts, part, surface, view, camera_rays(view.camera), rays_of[view.name])
+    for view in views:
+        maps.write(view, rays_of[view.name].reshape(view.height, view.width))

@@ -1,0 +1,134 @@
+"""What a viewer shows of a cloud: positions near zero, in an order whose beginnings thin it evenly, and its colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sc3d.scene.class_table import ClassTable
+from sc3d.errors import InputError
+from sc3d.scene.labelled_cloud import VOTES, spacing_of
+from sc3d.view.colors import COLOURINGS, Colouring, can_color, color_points, shaded
+from sc3d.view.progressive_order import even_order
+
+if TYPE_CHECKING:
+    import open3d as o3d
+
+_CHUNKS = 16  # steps in which points come and go; each is a node per class
+_SMALLEST_CHUNK = 20_000
+_SAMPLE = 50_000  # points from which the spacing is found
+
+
+@dataclass(frozen=True)
+class ShownCloud:
+    """N points in the order in which they are shown.
+
+    points: (N, 3) float32, world minus `origin` (3,) float64, so that UTM coordinates keep their millimetres
+    rows: (N,) int64 rows of the points in `cloud`; label: (N,) uint8 ids, 0 without labels
+    spacing: distance between neighbours of the whole cloud, world units
+    """
+
+    cloud: o3d.t.geometry.PointCloud
+    origin: np.ndarray
+    points: np.ndarray
+    rows: np.ndarray
+    label: np.ndarray
+    spacing: float
+    class_table: ClassTable | None = None
+    _colors: dict[tuple[str, bool], np.ndarray] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, cloud: o3d.t.geometry.PointCloud, origin: np.ndarray, class_table: ClassTable | None) -> ShownCloud:
+        """origin: (3,) world, near the cloud"""
+        world = cloud.point.positions.cpu().numpy()
+        rows = even_order(world)
+        points = (world[rows].astype(np.float64) - origin).astype(np.float32)
+        label = cloud.point["label"].cpu().numpy().ravel().astype(np.uint8)[rows] if "label" in cloud.point else np.zeros(len(rows), np.uint8)
+        sample = points[:_SAMPLE]
+        return cls(cloud, origin, points, rows, label, spacing_of(sample) * np.sqrt(len(sample) / len(points)), class_table)
+
+    @property
+    def colourings(self) -> tuple[Colouring, ...]:
+        """What the cloud can be coloured by."""
+        return tuple(by for by in COLOURINGS if can_color(self.cloud, by) and (by != "label" or self.class_table is not None))
+
+    @property
+    def has_relief(self) -> bool:
+        """Whether the cloud has normals, so that it can be shaded."""
+        return "normals" in self.cloud.point
+
+    def colors(self, by: Colouring, relief: bool = False) -> np.ndarray:
+        """(N, 3) uint8 RGB; kept once made. relief: shaded by the normals, but for the colours of the photos, which have light and shade"""
+        if relief and (by == "photo" or not self.has_relief):
+            return self.colors(by)
+        if (by, relief) not in self._colors:
+            if relief:
+                self._colors[by, True] = shaded(self.colors(by), self.cloud.point.normals.cpu().numpy()[self.rows])
+            else:
+                self._colors[by, False] = color_points(self.cloud, by, self.class_table)[self.rows]
+        return self._colors[by, relief]
+
+    @property
+    def middle(self) -> np.ndarray:
+        """(3,) mean of the points, in their frame."""
+        return self.points[:_SAMPLE].mean(axis=0, dtype=np.float64)
+
+    @property
+    def extent(self) -> float:
+        """Diagonal of the box around most of the points, world units."""
+        return float(np.linalg.norm(np.ptp(np.quantile(self.points[:_SAMPLE], [0.01, 0.99], axis=0), axis=0)))
+
+    @property
+    def class_counts(self) -> dict[int, int]:
+        """Number of points by class id, of the classes that occur."""
+        counts = np.bincount(self.label, minlength=256)
+        return {int(label): int(counts[label]) for label in np.flatnonzero(counts)}
+
+    @property
+    def chunk(self) -> int:
+        """Number of points that come and go together."""
+        return min(len(self.points), max(_SMALLEST_CHUNK, -(-len(self.points) // _CHUNKS)))
+
+    def spacing_at(self, count: int) -> float:
+        """Distance between neighbours of the first `count` points, world units."""
+        return self.spacing * float(np.sqrt(len(self.points) / max(count, 1)))
+
+
+def class_ids(class_table: ClassTable | None, names: tuple[str, ...]) -> set[int] | None:
+    """Ids of the named classes, "unlabelled" being 0; None without names, for all. InputError for a name that the table does not have."""
+    if not names:
+        return None
+    if class_table is None:
+        raise InputError("--classes needs the class table of the scene (classes.json)")
+    ids = {entry.name: entry.id for entry in class_table} | {"unlabelled": 0}
+    unknown = next((name for name in names if name not in ids), None)
+    if unknown is not None:
+        raise InputError(f"there is no class {unknown!r}: choose from {', '.join(ids)}")
+    return {ids[name] for name in names}
+
+
+def only_classes(cloud: o3d.t.geometry.PointCloud, ids: set[int] | None) -> o3d.t.geometry.PointCloud:
+    """The points of some classes; InputError if there are none. ids: None = all"""
+    if ids is None:
+        return cloud
+    if "label" not in cloud.point:
+        raise InputError("--classes needs labels: run `sc3d label SCENE` and `sc3d propagate SCENE`")
+    import open3d as o3d
+
+    chosen = np.isin(cloud.point["label"].cpu().numpy().ravel(), sorted(ids))
+    if not chosen.any():
+        raise InputError("no point has one of the chosen classes: nothing to show")
+    return cloud.select_by_mask(o3d.core.Tensor(chosen))
+
+
+def with_votes(cloud: o3d.t.geometry.PointCloud, seeds: o3d.t.geometry.PointCloud) -> o3d.t.geometry.PointCloud:
+    """The cloud with the votes that `label` left in the seeds it was made from; InputError if the seeds are other points."""
+    positions, others = (one.point.positions.cpu().numpy() for one in (cloud, seeds))
+    if positions.shape != others.shape or not np.array_equal(positions, others):
+        raise InputError("the labelled cloud and seeds.ply hold different points: run `sc3d propagate SCENE --overwrite`, or pass --file")
+    result = cloud.clone()
+    for name in [name for name in seeds.point if name.startswith(VOTES)]:
+        result.point[name] = seeds.point[name]
+    return result

@@ -1,0 +1,79 @@
+"""Two-way verification: views that contradict the fused labels nearby lose their say."""
+
+import numpy as np
+
+from sc3d.geometry.voxels import BLOCK, VOXELS, sort_by_voxel
+from sc3d.labelling.verification import MIN_RELIABILITY, PRIOR_SHARE, PRIOR_VIEWS, Places, VoteLog, neighbor_blocks, verify
+
+FULL = 4096
+
+
+def log_of(*views: tuple) -> VoteLog:
+    log = VoteLog()
+    for labels, weights in views:
+        log.append(np.asarray(labels, np.uint8), np.asarray(weights, np.uint16))
+    return log
+
+
+def one_block(count: int) -> Places:
+    return Places(np.zeros(count, np.int64), neighbor_blocks(np.array([12345], np.int64)))
+
+
+def test_the_log_gives_back_what_was_written_as_often_as_asked():
+    log = log_of(([0, 3, 0, 1], [9, 8, 7, 6]), ([0, 0, 0, 0], [1, 1, 1, 1]), ([2, 0, 0, 0], [4096, 0, 0, 0]))
+    for _ in range(2):
+        first, empty, last = log
+        np.testing.assert_array_equal(first[0], [1, 3])
+        np.testing.assert_array_equal(first[1], [3, 1])
+        np.testing.assert_array_equal(first[2], [8, 6])
+        assert len(empty[0]) == 0 and last[2][0] == 4096
+
+
+def test_votes_are_weighed_by_the_square_of_the_share_that_agrees():
+    winner = np.full(100, 1, np.uint8)
+    labels = np.where(np.arange(100) < 25, 1, 2)  # agrees at a quarter of the cells
+    votes = np.zeros((100, 3), np.int32)
+    votes[:, 0] = 7
+    passed = verify(log_of((labels, np.full(100, FULL))), winner, one_block(100), FULL, votes)
+    reliability = (25 + PRIOR_VIEWS * PRIOR_SHARE) / (100 + PRIOR_VIEWS)
+    assert reliability > MIN_RELIABILITY
+    np.testing.assert_array_equal(votes[np.arange(100), labels], round(FULL * reliability**2))
+    assert (votes[:, 0] == 7).all()  # the number of views stays
+    np.testing.assert_array_equal(passed, labels == 2)  # where the label rests on this view alone, it is doubted
+
+
+def test_a_view_that_errs_all_around_a_place_is_overruled_there_by_one_that_does_not():
+    """Where only two views look they contradict each other; elsewhere in the block the other views show which of them errs."""
+    count = 200
+    good, bad = np.full(count, 1), np.full(count, 2)
+    others = np.where(np.arange(count) < 150, 1, 0)
+    winner = np.where(np.arange(count) < 150, 1, 2).astype(np.uint8)  # a tie at first: the wrong one won
+    votes = np.zeros((count, 3), np.int32)
+    weights = np.full(count, FULL)
+    verify(log_of((bad, weights), (good, weights), (others, weights), (others, weights)), winner, one_block(count), FULL, votes)
+    assert (votes[150:, 1] > 5 * votes[150:, 2]).all()
+
+
+def test_reliability_is_a_matter_of_place():
+    """A view that errs in one block keeps its say in a block far away, and less of it next door."""
+    points = np.array([[0.5, 0.5, 0.5], [BLOCK + 0.5, 0.5, 0.5], [5 * BLOCK + 0.5, 0.5, 0.5]]).repeat(50, axis=0)
+    sorting = sort_by_voxel(points, 1.0, np.zeros(3))
+    keys = np.unique(sorting.keys // VOXELS)
+    neighbors = neighbor_blocks(keys)
+    assert (neighbors[:, 13] == [0, 1, 2]).all() and sorted(neighbors[0][neighbors[0] >= 0]) == [0, 1] and (neighbors[2] >= 0).sum() == 1
+    labels = np.r_[np.full(50, 2), np.full(100, 1)]
+    votes = np.zeros((150, 3), np.int32)
+    verify(log_of((labels, np.full(150, FULL))), np.full(150, 1, np.uint8), Places(np.arange(3).repeat(50), neighbors), FULL, votes)
+    here, next_door, far = votes[0, 2], votes[50, 1], votes[100, 1]
+    assert here < 0.3 * FULL and 0.3 * FULL < next_door < 0.6 * FULL and far > 0.95 * FULL
+
+
+def test_the_order_of_views_does_not_matter():
+    rng = np.random.default_rng(0)
+    views = [(rng.integers(0, 4, 300), rng.integers(1, FULL, 300)) for _ in range(5)]
+    winner, results = rng.integers(0, 4, 300).astype(np.uint8), []
+    for order in (views, views[::-1]):
+        votes = np.zeros((300, 4), np.int32)
+        results.append((verify(log_of(*order), winner, one_block(300), FULL, votes), votes))
+    np.testing.assert_array_equal(results[0][0], results[1][0])
+    np.testing.assert_array_equal(results[0][1], results[1][1])

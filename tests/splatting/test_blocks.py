@@ -1,0 +1,186 @@
+"""Training by blocks: the cut of the plane, what a block's photos show, and the merged model against training everything at once."""
+
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+import torch
+
+from sc3d.cli import main
+from sc3d.errors import InputError
+from sc3d.geometry.cameras import rays
+from sc3d.io import read_json
+from sc3d.scene.scene import Scene
+from sc3d.settings import Train
+from sc3d.splatting import block_tasks
+from sc3d.splatting.blocks import restrict, share_settings, split_blocks, views_of
+from sc3d.splatting.dataset import scene_data
+from sc3d.splatting.gaussians import Gaussians
+from sc3d.splatting.trainer import Trainer
+from sc3d.runner import sidecar
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+OPTIONS = ["--iterations", "90", "--max-gaussians", "3000", "--test-every", "4", "--checkpoint-every", "20"]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    main(["synthesize", str(folder), "--views", "8", "--width", "160"])
+    return folder
+
+
+def trained(site, folder, *options):
+    """A scene folder of its own with the site's photos and cameras, trained."""
+    folder.mkdir(exist_ok=True)
+    for name in ("images", "sparse"):
+        if not (folder / name).exists():
+            (folder / name).symlink_to(site / name)
+    main(["train", str(folder), *OPTIONS, *options])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def blocked(site, tmp_path_factory, one_thread):
+    return trained(site, tmp_path_factory.mktemp("blocked"), "--blocks", "2")
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 16])
+def test_cores_fill_the_plane_and_hold_equal_shares(count):
+    random = np.random.default_rng(count)
+    points = random.normal(size=(4000, 3)) * (30, 10, 1)
+    blocks = split_blocks(points, count)
+    assert len(blocks) == count and blocks[0].axes == (0, 1)
+    anywhere = np.concatenate([points, random.uniform(-1e4, 1e4, (4000, 3)), [[block.low[0], block.low[1], 0] for block in blocks if np.isfinite(block.low).all()] or points[:1]])
+    assert (np.sum([block.holds(anywhere) for block in blocks], axis=0) == 1).all()
+    held = np.array([block.holds(points).sum() for block in blocks])
+    assert np.abs(held / (len(points) / count) - 1).max() < 0.02
+    assert split_blocks(points[:, [0, 2, 1]], count)[0].axes == (0, 2)  # worlds whose y points up
+    for block in blocks:
+        around = block.holds(points, border=True)
+        assert (around >= block.holds(points)).all() and (count == 1 or around.sum() > block.holds(points).sum())
+
+
+def test_too_many_blocks_are_refused_before_work(site, tmp_path, capsys):
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    for bad in (points, np.repeat(points[:1], 5000, axis=0)):
+        with pytest.raises(InputError, match="lower --blocks"):
+            split_blocks(bad, 16)
+    with pytest.raises(SystemExit) as status:
+        trained(site, tmp_path / "scene", "--blocks", "100000")
+    assert status.value.code == 2 and "lower --blocks" in capsys.readouterr().err
+    with pytest.raises(InputError):
+        Train(blocks=-1)
+
+
+def test_masks_show_core_and_border_as_the_exact_depth_does(site):
+    scene = Scene(site)
+    data, origin = scene_data(scene, Train())
+    agreed, shown = [], []
+    for block in split_blocks(data.points, 3):
+        views = views_of(data, block)
+        part = restrict(data, block, views)
+        assert len(part.points) == block.holds(data.points, border=True).sum() and len(views) >= 2
+        for row, (view, track) in enumerate(zip(part.views, part.tracks, strict=True)):
+            np.testing.assert_array_equal(part.points[track], data.points[data.tracks[views[row]]][block.holds(data.points, border=True)[data.tracks[views[row]]]])
+            directions, along = rays(view)
+            depth = np.load(site / "depth" / f"{Path(view.name).stem}.npy").ravel()
+            known = depth > 0
+            surface = view.centre + directions * (depth / along)[:, None]
+            truth = block.holds(surface, border=True)
+            agreed.append((part.mask(row).ravel() == truth)[known].mean())
+            shown.append(truth[known].mean())
+    assert np.mean(agreed) > 0.95 and min(agreed) > 0.85, (np.mean(agreed), min(agreed))
+    assert min(shown) < 0.7  # there was something to tell apart
+
+
+def test_pixels_outside_the_mask_leave_no_trace(site):
+    """The loss of a block must not depend on what the photos show elsewhere."""
+    data, _ = scene_data(Scene(site), Train())
+    block = split_blocks(data.points, 2)[0]
+    views = views_of(data, block)
+    part = restrict(data, block, views)
+    settings = share_settings(Train(iterations=40, max_gaussians=1500, surface_from=1.0, coarse_until=0.0, fill=False).training, data, block, views)
+    noise = np.random.default_rng(0)
+
+    def spoiled(row):
+        image = part.image(row).copy()
+        inner = torch.nn.functional.max_pool2d(torch.from_numpy(part.mask(row))[None, None].float(), 31, 1, 15)[0, 0].numpy() > 0  # SSIM looks 5 px around, twice
+        image[~inner] = noise.integers(0, 256, (int((~inner).sum()), 3))
+        return image
+
+    other = type(part)(part.views, spoiled, part.points, part.colors, part.tracks, part.masks)
+    results = []
+    for source in (part, other):
+        trainer = Trainer(source, settings)
+        for _ in range(8):
+            trainer.step()
+        results.append(trainer.gaussians.detached())
+    for name, tensor in results[0].parameters().items():
+        assert torch.equal(tensor, results[1].parameters()[name]), name
+
+
+def test_merged_blocks_are_as_good_as_the_whole_and_have_no_seam(site, blocked, tmp_path):
+    whole = trained(site, tmp_path / "whole")
+    summaries = [read_json(sidecar(folder / "gaussians.ply"))["summary"] for folder in (whole, blocked)]
+    assert summaries[1]["held_out_psnr"] > summaries[0]["held_out_psnr"] - 0.4
+    data, _ = scene_data(Scene(site), Train())
+    low, high = split_blocks(data.points, 2)
+    axis = int(np.nonzero(np.isfinite(low.high))[0][0])
+    width, counts = max(low.border[axis], high.border[axis]), []
+    for folder in (whole, blocked):
+        places = Gaussians.load(folder / "gaussians.ply")[0].means.numpy()[:, low.axes[axis]]
+        counts.append([(np.abs(places - low.high[axis]) < width).sum(), len(places)])
+    seam = np.array(counts)
+    assert 0.8 < seam[1, 0] / seam[0, 0] < 1.25, seam  # twice as many if both blocks kept theirs
+    assert sum(summaries[1]["block_gaussians"]) > seam[1, 1] + 0.5 * seam[1, 0]  # which they had
+    assert (blocked / "train.csv").read_text().splitlines()[0].startswith("block,iteration,") and (blocked / "train.jpg").exists()
+    assert not list(blocked.glob("train.*.blocks"))
+
+
+def test_two_workers_of_which_one_is_killed_give_the_same_bytes(site, blocked, tmp_path):
+    killed = []
+
+    def kill():
+        while not killed:
+            if list((tmp_path / "scene").glob("train.*.blocks/*.checkpoint")):
+                workers = [child for child in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(child.cmdline())]
+                os.kill(workers[0].pid, signal.SIGKILL)
+                killed.append(workers[0].pid)
+            time.sleep(0.01)
+
+    (tmp_path / "scene").mkdir()
+    killer = threading.Thread(target=kill, daemon=True)
+    killer.start()
+    folder = trained(site, tmp_path / "scene", "--blocks", "2", "--workers", "2")
+    assert killed and (folder / "gaussians.ply").read_bytes() == (blocked / "gaussians.ply").read_bytes()
+
+
+def test_an_interrupted_run_goes_on_where_it_was(site, blocked, tmp_path, monkeypatch):
+    step, begun = Trainer.step, []
+
+    def dying(self):
+        if self.iteration == 30 and begun:
+            raise KeyboardInterrupt
+        row = step(self)
+        begun.extend([1] if self.iteration == self.settings.iterations else [])
+        return row
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", dying)
+        with pytest.raises(SystemExit):
+            trained(site, tmp_path / "scene", "--blocks", "2")
+    (left,) = (tmp_path / "scene").glob("train.*.blocks")
+    assert {file.name for file in left.iterdir()} == {"0.ply", "0.json", "1.checkpoint"}
+    seen = []
+    monkeypatch.setattr(Trainer, "resume", lambda self, path, resume=Trainer.resume: (resume(self, path), seen.append((path.name, self.iteration))))
+    monkeypatch.setattr(block_tasks, "restrict", lambda data, block, views, known=restrict: (seen.append(block), known(data, block, views))[1])
+    folder = trained(site, tmp_path / "scene", "--blocks", "2")
+    assert len(seen) == 2 and seen[1] == ("1.checkpoint", 20)  # block 0 was not trained again
+    assert (folder / "gaussians.ply").read_bytes() == (blocked / "gaussians.ply").read_bytes()

@@ -1,0 +1,227 @@
+"""Loss terms on analytic planes, where the right answer is known."""
+
+import numpy as np
+import pytest
+import torch
+
+from sc3d.geometry.cameras import look_at, pinhole_view, pixel_centres, rays
+from sc3d.splatting import losses
+from sc3d.splatting.consistency import consistent, pinhole, pixel_rays, reprojection_error
+from sc3d.splatting.cpu.normal_loss import depth_normal_loss
+from sc3d.geometry.view_selection import nearest_views, neighbour_views
+
+SIZE, CALIBRATION = (96, 64), (90.0, 85.0, 50.0, 30.0)
+PLANE = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
+
+
+def camera(x: float, y: float, z: float = 10.0, size=SIZE, calibration=CALIBRATION):
+    return pinhole_view(f"{x},{y}", size, calibration, look_at(np.array([x, y, z]), np.array([0.1 * x, 0.2 * y, 0.0])))
+
+
+def plane_depth(view) -> torch.Tensor:
+    """Depth of the plane PLANE . x = 0."""
+    directions, along = rays(view)
+    distance = -(view.centre @ PLANE) / (directions @ PLANE)
+    return torch.from_numpy((distance * along).reshape(view.height, view.width)).float()
+
+
+def texture(points: np.ndarray) -> np.ndarray:
+    x, y = points[..., 0], points[..., 1]
+    return 0.5 + 0.2 * np.sin(3.1 * x + 0.5 * y) + 0.2 * np.cos(2.3 * y - x) + 0.1 * np.sin(5 * x * 0.7 + 4 * y)
+
+
+def plane_photo(view) -> torch.Tensor:
+    directions, _ = rays(view)
+    distance = -(view.centre @ PLANE) / (directions @ PLANE)
+    return torch.from_numpy(texture(view.centre + distance[:, None] * directions).reshape(view.height, view.width)).float()
+
+
+def plane_maps(view) -> tuple[torch.Tensor, torch.Tensor]:
+    """N (H, W, 3) and D (H, W) of the plane, scaled by an arbitrary alpha."""
+    normal = view.cam_from_world[:3, :3] @ PLANE
+    alpha = 0.3 + 0.7 * torch.rand(view.height, view.width, generator=torch.Generator().manual_seed(0))
+    return alpha[..., None] * torch.from_numpy(normal).float(), alpha * float(view.centre @ PLANE)
+
+
+def test_rays_are_those_of_the_camera_module():
+    view = camera(2, 1)
+    points = (pixel_rays(view) * plane_depth(view)[..., None]).reshape(-1, 3).double().numpy()
+    world = (points - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
+    assert np.abs(world @ PLANE).max() < 1e-4
+
+
+def test_plane_has_no_geometric_error():
+    view, other = camera(2, 1), camera(-1, 2, 12, (80, 70), (100.0, 99.0, 41.0, 33.0))
+    depth, other_depth = plane_depth(view), plane_depth(other)
+    points_cam = (pixel_rays(view) * depth[..., None]).reshape(-1, 3)
+    error, valid = reprojection_error(points_cam, view, other_depth, other)
+    assert valid.float().mean() > 0.5
+    assert error[valid].max() < 2e-3
+    assert losses.geometric_loss(error, valid) < 1e-3
+
+
+def test_wrong_depth_has_the_epipolar_error_and_useful_gradients():
+    view, other = camera(2, 1), camera(-1, 2)
+    depth = (plane_depth(view) * 1.01).requires_grad_()
+    error, valid = reprojection_error((pixel_rays(view) * depth[..., None]).reshape(-1, 3), view, plane_depth(other), other)
+    assert 0.05 < error[valid].median() < 1
+    losses.geometric_loss(error, valid).backward()
+    assert torch.isfinite(depth.grad).all()
+    assert (depth.grad[depth.grad != 0] > 0).float().mean() > 0.95  # all depths are too large
+
+
+def test_depth_that_is_missing_is_not_compared():
+    view, other = camera(2, 1), camera(-1, 2)
+    other_depth = plane_depth(other)
+    other_depth[:, :40] = 0
+    depth = plane_depth(view)
+    points_cam = (pixel_rays(view) * depth[..., None]).reshape(-1, 3)
+    _, all_valid = reprojection_error(points_cam, view, plane_depth(other), other)
+    error, valid = reprojection_error(points_cam, view, other_depth, other)
+    assert 0.1 < valid.sum() / all_valid.sum() < 0.9
+    assert error[valid].max() < 2e-3
+    behind = pixel_rays(view).reshape(-1, 3) * -5.0
+    assert not reprojection_error(behind, view, other_depth, camera(3, 0))[1].any()
+
+
+def test_consistency_counts_views():
+    view, others = camera(2, 1), [camera(-1, 2), camera(0, -1), camera(1, 3)]
+    depth = plane_depth(view)
+    depth[:5] = 0
+    depth[30:40] *= 1.08
+    maps = [(plane_depth(other), other) for other in others]
+    maps[2] = (maps[2][0] * 0.9, others[2])
+    count = consistent(depth, view, maps)
+    assert (count[:5] == 0).all() and (count[30:40] == 0).all()
+    assert (count[15:25, 30:60] == 2).all() and count.max() == 2
+
+
+def test_normals_from_depth_are_exact_on_a_tilted_plane():
+    view = camera(2, 1)
+    normals = losses.normals_from_depth(plane_depth(view).requires_grad_(), view).detach()
+    expected = torch.from_numpy(view.cam_from_world[:3, :3] @ PLANE).float()
+    assert expected[2] < 0  # towards the camera
+    assert (normals[1:-1, 1:-1] - expected).abs().max() < 1e-3
+    assert not normals[0].any() and not normals[:, -1].any()
+
+
+def test_normal_loss_is_zero_on_a_plane_and_positive_off_it():
+    view = camera(2, 1)
+    normal, distance = plane_maps(view)
+    alpha, edges = normal.norm(dim=2), torch.zeros(view.height, view.width)
+    depth_normals = losses.normals_from_depth(plane_depth(view), view)
+    assert losses.normal_loss(normal, depth_normals, alpha, edges) < 1e-3
+    tilted = normal @ torch.from_numpy(look_at(np.zeros(3), np.array([0.1, 1.0, 0.2]))[:3, :3]).float()
+    assert losses.normal_loss(tilted, depth_normals, alpha, edges) > 0.1
+    assert losses.normal_loss(tilted, depth_normals, alpha, edges + 1) == 0
+
+
+def test_normal_kernel_equals_its_reference():
+    view = camera(2, 1)
+    generator = torch.Generator().manual_seed(0)
+    start = plane_depth(view) * (1 + 0.02 * torch.rand(view.height, view.width, generator=generator))
+    start[10:14, 20:25] = 0
+    normal, _ = plane_maps(view)
+    alpha, edges = torch.rand(view.height, view.width, generator=generator), torch.rand(view.height, view.width, generator=generator)
+    results = []
+    for fused in (True, False):
+        depth, normals = start.clone().requires_grad_(), normal.clone().requires_grad_()
+        loss = depth_normal_loss(normals, depth, alpha, edges, pinhole(view)) if fused else losses.normal_loss(
+            normals, losses.normals_from_depth(depth, view), alpha, edges)
+        (3 * loss).backward()
+        results.append((loss.detach(), depth.grad, normals.grad))
+    for one, other in zip(*results, strict=True):
+        assert torch.allclose(one, other, atol=2e-4 * float(other.abs().max()), rtol=1e-3)
+
+
+def test_warped_plane_correlates():
+    view, other = camera(2, 1), camera(-1, 2, 11)
+    normal, distance = plane_maps(view)
+    pixels = torch.from_numpy(pixel_centres(*SIZE).astype(np.int64))
+    planes = normal.reshape(-1, 3).requires_grad_(), distance.reshape(-1).requires_grad_()
+    dissimilarity, inside = losses.patch_dissimilarity(planes, pixels, (plane_photo(view), view), (plane_photo(other), other))
+    assert inside.float().mean() > 0.4
+    assert dissimilarity[inside].median() < 0.005 and dissimilarity[inside].quantile(0.9) < 0.01  # NCC > 0.99
+    wrong = planes[0], planes[1] * 1.1
+    assert losses.patch_dissimilarity(wrong, pixels, (plane_photo(view), view), (plane_photo(other), other))[0][inside].median() > 0.05
+
+
+def test_patch_kernel_equals_its_reference():
+    view, other = camera(2, 1), camera(-1, 2, 11, (80, 70), (100.0, 99.0, 41.0, 33.0))
+    normal, distance = plane_maps(view)
+    pixels = torch.from_numpy(pixel_centres(*SIZE).astype(np.int64))
+    greys = (plane_photo(view), view), (plane_photo(other), other)
+    results = []
+    for function in (losses.patch_dissimilarity, losses.patch_dissimilarity_reference):
+        planes = (normal * torch.tensor([1.0, 1.1, 0.98])).reshape(-1, 3).requires_grad_(), (distance * 1.02).reshape(-1).requires_grad_()
+        values, inside = function(planes, pixels, *greys)
+        (values * inside * torch.linspace(0, 1, len(values))).sum().backward()
+        results.append((values.detach() * inside, inside, planes[0].grad, planes[1].grad))
+    ours, reference = results
+    assert torch.equal(ours[1], reference[1])
+    assert torch.allclose(ours[0], reference[0], atol=1e-4)
+    for one, other in zip(ours[2:], reference[2:], strict=True):
+        assert torch.allclose(one, other, atol=2e-3 * other.abs().max(), rtol=1e-2)
+
+
+def test_photometric_gradient_leads_to_the_plane():
+    view, other = camera(2, 1), camera(-1, 2, 11)
+    normal, distance = plane_maps(view)
+    pixels = torch.from_numpy(pixel_centres(*SIZE).astype(np.int64))
+    for factor, sign in ((1.01, 1), (0.99, -1)):
+        planes = normal.reshape(-1, 3), (distance.reshape(-1) * factor).requires_grad_()
+        loss = losses.photometric_loss(planes, pixels, torch.ones(len(pixels)), (plane_photo(view), view), (plane_photo(other), other))
+        loss.backward()
+        gradient = planes[1].grad
+        assert torch.isfinite(gradient).all() and loss > 0
+        assert (gradient[gradient != 0].sign() == sign).float().mean() > 0.8
+
+
+def test_flat_patches_do_not_correlate_and_do_not_explode():
+    flat = torch.full((5, 49), 0.4, requires_grad=True)
+    correlation = losses.normalised_correlation(flat, torch.rand(5, 49))
+    correlation.sum().backward()
+    assert correlation.abs().max() < 1e-3 and torch.isfinite(flat.grad).all()
+
+
+def test_flatten_loss_presses_the_smallest_scale_only():
+    log_scales = torch.log(torch.tensor([[1.0, 2.0, 3.0], [4.0, 0.5, 6.0], [0.1, 0.1, 0.1]])).requires_grad_()
+    loss = losses.flatten_loss(log_scales, torch.tensor([True, True, False]), extent=10.0)
+    assert loss.item() == pytest.approx((1.0 + 0.5) / 2 / 10)
+    loss.backward()
+    assert (log_scales.grad != 0).nonzero().tolist() == [[0, 0], [1, 1]]
+    assert losses.flatten_loss(log_scales, torch.zeros(3, dtype=torch.bool), 10.0) == 0
+
+
+def test_exposure_is_recovered():
+    image = torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0))
+    exposure = torch.tensor([0.2, -0.05])
+    photo = losses.apply_exposure(image, exposure)
+    assert torch.allclose(losses.fit_exposure(image, photo), exposure, atol=1e-5)
+    assert torch.equal(losses.apply_exposure(image, torch.zeros(2)), image)
+
+
+def test_image_edges_are_relative():
+    image = torch.zeros(10, 12, 3)
+    image[:, 6:] = 0.3
+    edges = losses.image_edges(image)
+    assert edges.max() == 1 and not edges[:, :5].any() and not edges[:, 7:].any()
+
+
+def test_neighbours_share_points_at_a_good_angle():
+    points = np.random.default_rng(0).uniform(-5, 5, (200, 3)) * [1, 1, 0]
+    centres = np.array([[0, 0, 20], [0.2, 0, 20], [4, 0, 20], [-4, 0, 20], [0, 30, 5], [6, 0, 20]], float)
+    everything = np.arange(200)
+    tracks = [everything, everything, everything[:150], everything[:100], everything[:120], np.zeros(0, int)]
+    found = neighbour_views(tracks, points, centres, count=2)
+    assert found[0].tolist() == [2, 3]  # 1 is too close, 4 too oblique, 5 shares nothing
+    assert found[5].tolist()[0] == 2  # without tracks: the nearest
+    assert [len(others) for others in neighbour_views(None, points, centres, count=3)] == [3] * 6
+
+
+def test_nearest_views_do_not_depend_on_units():
+    centres = np.random.default_rng(1).uniform(0, 10, (20, 3))
+    for one, other in zip(nearest_views(centres), nearest_views(centres * 1000 + 5e5), strict=True):
+        assert one.tolist() == other.tolist()
+    assert nearest_views(np.zeros((1, 3)))[0].size == 0
+    assert nearest_views(np.eye(3)[:2])[0].tolist() == [1]

@@ -1,0 +1,358 @@
+"""Tile by tile equals in one piece: labels, votes, propagated labels and judged pixels, here and on Dask workers, whole and after a kill."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import laspy
+import numpy as np
+import open3d as o3d
+import pytest
+
+from sc3d.errors import InputError
+from sc3d.io import read_cloud, write_geometry
+from sc3d.scene.scene import Scene
+from sc3d.settings import Evaluate, Label, Propagate
+from sc3d.stages import evaluate, label, propagate
+from sc3d.synthetic import SynthesizeSettings, synthesize
+from sc3d.tiling import evaluate as tiled_evaluate
+from sc3d.tiling import label as tiled_label
+from sc3d.tiling import memory as plan
+from sc3d.tiling import propagate as tiled_propagate
+from sc3d.io.chunked_clouds import CloudFile, write_ply
+from sc3d.tiling.memory import Parts, memory_of
+from sc3d.tiling.ranges import MeshParts, RangeMaps, read_triangles, write_ranges
+from sc3d.tiling.store import Survey, TileStore
+
+POINTS = 60_000
+TILES = 25_000  # points of a tile with its margin
+NAMES = ("label", "confidence", "state", "num_views")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("site") / "scene"
+    synthesize(folder, SynthesizeSettings(views=8, width=240, num_points=POINTS, seed=3))
+    for name, target in (("cloud.ply", "truth.ply"), ("mesh.ply", "truth_mesh.ply")):
+        shutil.copy(folder / target, folder / name)
+    return folder
+
+
+@pytest.fixture
+def small_tiles(monkeypatch):
+    """Room for TILES points only, whatever a point needs."""
+    def room(resources, _):  # noqa: ANN001, ANN202
+        return TILES if resources.max_memory == "2G" else 10**9
+
+    for module in (tiled_label, tiled_propagate, tiled_evaluate):
+        monkeypatch.setattr(module, "max_points", room)
+    for module in (label, propagate, evaluate):
+        monkeypatch.setattr(module, "fits", lambda _, resources: resources.max_memory != "2G")
+
+
+def columns(path: Path) -> dict[str, np.ndarray]:
+    return {name: values.numpy() for name, values in read_cloud(path).point.items()}
+
+
+def run_label(site: Path, name: str, **options) -> dict[str, np.ndarray]:
+    label.run(Scene(site), Label(output=site / f"{name}.ply", **options))
+    return columns(site / f"{name}.ply")
+
+
+def assert_same(first: dict[str, np.ndarray], second: dict[str, np.ndarray], but: tuple[str, ...] = ()) -> None:
+    assert first.keys() == second.keys()
+    for name in first:
+        if name not in but:
+            np.testing.assert_array_equal(first[name], second[name], err_msg=name)
+
+
+def blocks(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and counts of a voxel field's blocks, sorted, as Open3D reads them."""
+    grid = o3d.t.geometry.VoxelBlockGrid.load(str(path))
+    rows = grid.hashmap().active_buf_indices().numpy()
+    keys, votes = grid.hashmap().key_tensor().numpy()[rows], grid.attribute("votes").numpy()[rows]
+    order = np.lexsort(keys.T)
+    return keys[order], votes[order]
+
+
+@pytest.mark.parametrize("options", [{}, {"reproject": True, "incidence": True, "density": True}, {"method": "direct"}, {"depth_filter": False}])
+def test_labels_and_votes_by_tile_are_those_of_the_whole_to_the_bit(site, small_tiles, options):
+    whole, tiled = run_label(site, "whole", **options), run_label(site, "tiled", max_memory="2G", **options)
+    assert_same(whole, tiled)
+    for first, second in zip(blocks(site / "whole.votes.npz"), blocks(site / "tiled.votes.npz"), strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert not list(site.glob(".*.parts"))
+
+
+def test_there_are_several_tiles_of_the_size_asked_for(site):
+    cloud = CloudFile.open(site / "cloud.ply")
+    grid = Survey.of(cloud).grid(TILES, 18.0)
+    assert grid.shape[0] * grid.shape[1] >= 9
+    points = read_cloud(site / "cloud.ply").point.positions.numpy()
+    held = [grid.within(points, tile, 18.0).sum() for tile in range(grid.shape[0] * grid.shape[1])]
+    assert max(held) <= 1.1 * TILES
+    assert (np.bincount(grid.tile_of(points), minlength=len(held)) <= held).all()
+
+
+def test_without_a_mesh_the_surfels_by_tile_are_those_of_the_whole(site, small_tiles, tmp_path):
+    shutil.copytree(site, tmp_path / "bare", ignore=shutil.ignore_patterns("*mesh.ply", ".*"))
+    whole = run_label(tmp_path / "bare", "whole", surface="surfels")
+    assert_same(whole, run_label(tmp_path / "bare", "tiled", surface="surfels", max_memory="2G"))
+    with pytest.raises(InputError, match="surface"):
+        run_label(tmp_path / "bare", "tiled", surface="voxels", max_memory="2G")
+
+
+@pytest.mark.parametrize("options", [{}, {"rounds": 1, "color": False}, {"fill": True}])
+def test_map_by_tile_is_that_of_the_whole(site, small_tiles, options):
+    seeds = site / "seeds_for_map.ply"
+    label.run(Scene(site), Label(output=seeds))
+    results = []
+    for name, memory in (("whole", ""), ("tiled", "2G")):
+        propagate.run(Scene(site), Propagate(seeds=seeds, output=site / f"{name}_map.ply", max_memory=memory, **options))
+        results.append(columns(site / f"{name}_map.ply"))
+    whole, tiled = results
+    assert (whole["label"] != tiled["label"]).mean() <= 1e-4 and (whole["state"] != tiled["state"]).mean() <= 1e-4
+    assert (np.abs(whole["confidence"] - tiled["confidence"]) > 1e-3).mean() <= 1e-3
+    assert (whole["label"] > 0).mean() > 0.95
+    assert_same(whole, tiled, but=("label", "state", "confidence"))
+
+
+@pytest.mark.parametrize("method", ["geometry", "knn"])
+def test_other_methods_by_tile_differ_in_few_points(site, small_tiles, method):
+    seeds = site / "seeds_for_others.ply"
+    label.run(Scene(site), Label(output=seeds))
+    results = []
+    for name, memory in (("whole", ""), ("tiled", "2G")):
+        propagate.run(Scene(site), Propagate(method=method, seeds=seeds, output=site / f"{name}_{method}.ply", max_memory=memory))
+        results.append(columns(site / f"{name}_{method}.ply")["label"])
+    assert (results[0] != results[1]).mean() < 0.002
+
+
+def test_points_that_hang_on_a_seed_only_through_other_tiles_are_reached(site, small_tiles, tmp_path):
+    """A band of ground around an empty middle, with seeds at one end only, and an island without any."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 60, (60_000, 3)) * [1, 1, 0]
+    points = points[(np.abs(points[:, :2] - 30) > 12).any(axis=1)]
+    island = rng.uniform(24, 36, (3_000, 3)) * [1, 1, 0]
+    points = np.concatenate([points, island])
+    votes = np.zeros((len(points), 3), np.float32)
+    seeded = points[:, 0] < 1
+    votes[seeded, 0], votes[seeded, 1] = 2, 2
+    cloud = o3d.t.geometry.PointCloud(points)
+    cloud.point.normals = np.tile(np.float32([0, 0, 1]), (len(points), 1))
+    attributes = {"label": seeded.astype(np.uint8), "confidence": seeded.astype(np.float32), "state": seeded.astype(np.uint8), "num_views": (2 * seeded).astype(np.int32)}
+    attributes |= {f"votes_{number}": votes[:, number] for number in range(3)}
+    for name, values in attributes.items():
+        cloud.point[name] = o3d.core.Tensor(values[:, None].copy())
+    write_geometry(tmp_path / "seeds.ply", cloud)
+    found = []
+    for name, memory in (("whole", ""), ("tiled", "2G")):
+        propagate.run(Scene(tmp_path), Propagate(appearance=False, output=tmp_path / f"{name}.ply", max_memory=memory))
+        found.append(columns(tmp_path / f"{name}.ply")["label"].ravel() > 0)
+    for labelled in found:
+        assert labelled[: -len(island)].all() and not labelled[-len(island) :].any()
+
+
+def test_evaluation_by_tile_judges_the_same_pixels(site, small_tiles):
+    label.run(Scene(site), Label(output=site / "judged.ply"))
+    figures = []
+    for memory in ("", "2G"):
+        settings = Evaluate(labelled=site / "judged.ply", output=site / f"metrics{memory}.json", max_memory=memory)
+        evaluate.run(Scene(site), settings)
+        figures.append(json.loads(settings.output.read_text()))
+    for part in ("labels", "masks", "labels_near_edges"):
+        assert figures[0][part]["oa"] == pytest.approx(figures[1][part]["oa"], abs=1e-5)
+        assert figures[0][part]["coverage"] == pytest.approx(figures[1][part]["coverage"], abs=1e-5)
+
+
+def test_ranges_over_parts_of_a_mesh_are_those_of_the_whole(site, tmp_path):
+    from sc3d.geometry.cameras import local_origin
+    from sc3d.geometry.raycast import Surface, first_surface
+
+    views = Scene(site).model.views
+    origin, triangles = local_origin(views), np.concatenate(list(read_triangles(site / "mesh.ply")))
+    grid = Survey.of(CloudFile.open(site / "mesh.ply")).grid(2_000)
+    parts = MeshParts.split([triangles[:5000], triangles[5000:]], grid, tmp_path, origin)
+    assert len(parts.boxes) > 4
+    maps = RangeMaps(tmp_path, {view.name: number for number, view in enumerate(views)})
+    write_ranges(parts, views, maps)
+    whole = Surface.from_mesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), origin)
+    for view in views:
+        np.testing.assert_array_equal(first_surface(maps, view).range, first_surface(whole, view).range)
+
+
+@pytest.fixture
+def command(site):
+    """Runs `label` in a process of its own with room for few points, on `workers` Dask workers."""
+    program = "import sys\nfrom sc3d.tiling import label\nlabel.max_points = lambda *_: %d\nfrom sc3d.cli import main\nif __name__ == '__main__':\n    main()\n" % TILES
+    script = site.parent / "few_points.py"
+    script.write_text(program)
+
+    def start(workers: int, output: Path) -> subprocess.Popen:
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+        options = ["--workers", str(workers), "--max-memory", "12G", "--output", str(output)]
+        return subprocess.Popen([sys.executable, str(script), "label", str(site), *options], env=environment, stderr=subprocess.PIPE, text=True)
+
+    return start
+
+
+def test_workers_give_the_same_bytes_also_if_one_is_killed(site, command, small_tiles):
+    pytest.importorskip("distributed")
+    run_label(site, "here", max_memory="2G")
+    for workers, killed in ((1, False), (2, True)):
+        output = site / f"workers{workers}.ply"
+        process = command(workers, output)
+        if killed:
+            assert kill_a_worker(process.pid, site)
+        _, said = process.communicate(timeout=240)
+        assert process.returncode == 0, said
+        assert output.read_bytes() == (site / "here.ply").read_bytes()
+        assert output.with_suffix(".votes.npz").read_bytes() == (site / "here.votes.npz").read_bytes()
+
+
+def kill_a_worker(parent: int, site: Path, seconds: float = 120) -> bool:
+    """SIGKILL one Dask worker as soon as the first tile has its labels; whether one was killed."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        if any(folder.glob("results/label.*.npy") for folder in site.glob(".workers2.ply.*.parts")):
+            for folder in Path("/proc").iterdir():
+                if folder.name.isdigit() and "spawn_main" in _said_by(folder, "cmdline") and f"PPid:\t{parent}\n" in _said_by(folder, "status"):
+                    os.kill(int(folder.name), signal.SIGKILL)
+                    return True
+        time.sleep(0.02)
+    return False
+
+
+def _said_by(folder: Path, name: str) -> str:
+    try:
+        return (folder / name).read_text().replace("\0", " ")
+    except OSError:
+        return ""
+
+
+def test_a_killed_run_keeps_its_finished_tiles(site, small_tiles, monkeypatch):
+    expected = run_label(site, "uninterrupted", max_memory="2G")
+    original, done = tiled_label.label_tile, []
+
+    def stops(job, tile):  # noqa: ANN001, ANN202
+        if len(done) == 3:
+            raise KeyboardInterrupt
+        original(job, tile)
+        done.append(tile)
+
+    monkeypatch.setattr(tiled_label, "label_tile", stops)
+    with pytest.raises(KeyboardInterrupt):
+        run_label(site, "resumed", max_memory="2G")
+    assert not (site / "resumed.ply").exists()
+    fused = []
+    monkeypatch.setattr(tiled_label, "label_tile", original)
+    monkeypatch.setattr(tiled_label, "fuse", lambda *given, fuse=tiled_label.fuse: (fused.append(1), fuse(*given))[1])
+    assert_same(expected, run_label(site, "resumed", max_memory="2G"))
+    number = len(CloudFileTiles.of(site))
+    assert len(fused) == number - 3
+
+
+class CloudFileTiles:
+    """Tiles that hold points, as `label` makes them."""
+
+    @staticmethod
+    def of(site: Path) -> list[int]:
+        cloud = CloudFile.open(site / "cloud.ply")
+        survey = Survey.of(cloud)
+        grid = survey.grid(TILES, tiled_label.BLOCKS * tiled_label.BLOCK * tiled_label.VOXEL * survey.spacing)
+        return np.unique(grid.tile_of(read_cloud(site / "cloud.ply").point.positions.numpy())).tolist()
+
+
+def test_parts_of_other_inputs_are_not_taken(tmp_path):
+    source = tmp_path / "cloud.ply"
+    source.write_text("one")
+    first = Parts(tmp_path / "out.ply", "label", [source], Label())
+    first.subfolder("tiles")
+    assert Parts(tmp_path / "out.ply", "label", [source], replace(Label(), workers=3, max_memory="9G")).folder == first.folder
+    assert Parts(tmp_path / "out.ply", "label", [source], Label(consensus=0.9)).folder != first.folder
+    assert not first.folder.exists()  # of no use any more
+    source.write_text("other")
+    assert Parts(tmp_path / "out.ply", "label", [source], Label()).folder != first.folder
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_las_is_read_in_chunks(tmp_path, monkeypatch, suffix):
+    monkeypatch.setattr("sc3d.io.chunked_clouds.CHUNK", 700)
+    points = np.random.default_rng(0).uniform(0, 100, (3000, 3)) + [5e5, 5e6, 0]
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.offsets, header.scales = np.floor(points.min(axis=0)), [1e-3] * 3
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = points.T
+    las.red = las.green = las.blue = np.full(3000, 77 << 8, np.uint16)
+    las.write(tmp_path / f"cloud{suffix}")
+    cloud = CloudFile.open(tmp_path / f"cloud{suffix}")
+    chunks = list(cloud.chunks())
+    assert [start for start, _ in chunks] == [0, 700, 1400, 2100, 2800] and cloud.num_points == 3000
+    read = np.concatenate([records for _, records in chunks])
+    np.testing.assert_allclose(np.stack([read[axis] for axis in "xyz"], axis=1), points, atol=5.1e-4)
+    assert (read["red"] == 77).all()
+
+
+def test_a_store_gives_back_every_point_once_and_the_margin(site, tmp_path):
+    cloud = CloudFile.open(site / "cloud.ply")
+    points = read_cloud(site / "cloud.ply").point.positions.numpy()
+    store = TileStore.build(cloud, Survey.of(cloud).grid(TILES, 18.0), tmp_path)
+    np.testing.assert_array_equal(np.sort(np.concatenate([store.rows(tile) for tile in store.tiles])), np.arange(POINTS))
+    for tile in store.tiles:
+        window = store.window(tile, 2.0)
+        np.testing.assert_array_equal(window.rows, np.flatnonzero(store.grid.within(points, tile, 2.0)))
+        np.testing.assert_array_equal(window.rows[window.core], np.flatnonzero(store.grid.tile_of(points) == tile))
+        np.testing.assert_array_equal(window.gather(store.records)["x"], points[window.rows, 0])
+
+
+def test_ply_in_chunks_is_what_open3d_reads(tmp_path):
+    dtype = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("label", "u1")])
+    records = np.zeros(10, dtype)
+    records["x"], records["label"] = np.arange(10) + 5e5 + 1e-3, np.arange(10)
+    write_ply(tmp_path / "made.ply", dtype, 10, [records[:4], records[4:]])
+    read = read_cloud(tmp_path / "made.ply")
+    np.testing.assert_array_equal(read.point.positions.numpy()[:, 0], records["x"])
+    np.testing.assert_array_equal(read.point.label.numpy().ravel(), records["label"])
+    with pytest.raises(ValueError, match="instead of"):
+        write_ply(tmp_path / "made.ply", dtype, 11, [records])
+
+
+@pytest.mark.parametrize(("text", "amount"), [("6G", 6 << 30), ("1500M", 1500 << 20), ("2.5 GiB", 5 << 29), ("", None)])
+def test_amounts_of_memory(text, amount):
+    assert memory_of(Label(max_memory=text)) == (amount or memory_of(Label()))
+
+
+@pytest.mark.parametrize("text", ["lots", "6X", "200M", "-1G", "nan"])
+def test_memory_that_is_none_or_too_little_is_refused(text):
+    with pytest.raises(InputError, match="max-memory"):
+        memory_of(Label(max_memory=text))
+    assert plan.BASE < memory_of(Label(max_memory="2G", workers=1)) + 1
+
+
+def test_a_cloud_that_cannot_be_read_in_parts_is_refused(tmp_path):
+    (tmp_path / "text.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n")
+    with pytest.raises(InputError, match="binary PLY"):
+        CloudFile.open(tmp_path / "text.ply")
+    with pytest.raises(InputError, match="PLY, LAS or LAZ"):
+        CloudFile.open(tmp_path / "cloud.xyz")
+
+
+def test_a_laz_cloud_is_labelled(site, tmp_path):
+    """Normals are estimated by tile; positions are rounded to a millimetre."""
+    source = read_cloud(site / "cloud.ply")
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = [1e-3] * 3
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = source.point.positions.numpy().T
+    las.write(tmp_path / "cloud.laz")
+    label.run(Scene(site), Label(cloud=tmp_path / "cloud.laz", output=tmp_path / "laz.ply"))
+    found, expected = columns(tmp_path / "laz.ply"), run_label(site, "from_ply")
+    both = (found["label"] > 0) & (expected["label"] > 0)
+    assert both.mean() > 0.7 and (found["label"] == expected["label"])[both].mean() > 0.98
+    np.testing.assert_allclose(found["positions"], source.point.positions.numpy(), atol=1e-3)

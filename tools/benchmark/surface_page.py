@@ -1,0 +1,50 @@
+"""`sc3d benchmark surface`: the figures of `surface` as JSON and Markdown."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+from tools.benchmark.publish import check_output, publish
+from tools.benchmark.surface import MIN_ALPHA, WITHIN, SurfaceFigures, surface_figures
+from sc3d.errors import InputError
+from sc3d.io import read_json
+from sc3d.scene.scene import Scene
+from sc3d.settings import BenchmarkSurface
+from sc3d.runner import sidecar, versions
+
+
+def run_surface(command: BenchmarkSurface) -> None:
+    """Measure, show the table, write it if wanted."""
+    check_output(command.output)
+    scene, truth = Scene(command.scene), Scene(command.truth)
+    scene.require(scene.gaussians, scene.mesh, hint="run `sc3d train` and `sc3d extract` first")
+    exact = (truth.path / "depth", truth.truth, truth.path / "truth.ply", truth.path / "truth_mesh.ply", truth.classes)
+    truth.require(*exact, hint="the exact surface comes from `sc3d synthesize`")
+    figures = surface_figures(scene, truth, command.voxel_size or voxel_size_of(scene))
+    record = {"benchmark": "surface", "scene": scene.path.resolve().name, "truth": truth.path.resolve().name, "versions": versions(), "figures": asdict(figures)}
+    publish(record, page(record["scene"], figures), command.output)
+
+
+def voxel_size_of(scene: Scene) -> float:
+    """The voxel size that `extract` noted beside the mesh, world units. Raises InputError if it did not."""
+    record = read_json(sidecar(scene.mesh)) if sidecar(scene.mesh).exists() else {}
+    size = record.get("summary", {}).get("voxel_size")
+    if not isinstance(size, int | float) or size <= 0:
+        raise InputError(f"{sidecar(scene.mesh)} does not tell the voxel size of the mesh: pass --voxel-size")
+    return float(size)
+
+
+def page(name: str, figures: SurfaceFigures) -> str:
+    """One row per figure."""
+    rows = [
+        ("relative depth error, median, outside trees", f"{100 * figures.depth_median:.3f} %"),
+        ("relative depth error, 90th percentile, outside trees", f"{100 * figures.depth_p90:.3f} %"),
+        ("relative depth error, median, trees", f"{100 * figures.tree_median:.3f} %"),
+        (f"pixels with alpha > {MIN_ALPHA:g}", f"{figures.opaque:.1%}"),
+        ("pixels that see the mesh", f"{figures.hit:.1%}"),
+        ("pixels of trees that see the mesh", f"{figures.tree_hit:.1%}"),
+        (f"area of the mesh within {WITHIN:g} voxels of the truth", f"{figures.accuracy:.1%}"),
+        *((f"true surface within {WITHIN:g} voxels of the mesh, {label}", f"{share:.1%}") for label, share in figures.completeness.items()),
+        ("voxel", f"{figures.voxel_size:g}"),
+    ]
+    return "\n".join([f"# Surface: {name}\n", "| | |", "| --- | ---: |", *(f"| {title} | {value} |" for title, value in rows)]) + "\n"
