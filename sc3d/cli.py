@@ -80,7 +80,7 @@ def _dispatch(name: str, command: object) -> None:
     from sc3d.runner import execute, require_writable
 
     if name in COMMANDS:
-        importlib.import_module(f"sc3d.runner.{MODULES.get(name, name)}").main(command)
+        importlib.import_module(MODULES.get(name, f"sc3d.commands.{name}")).main(command)
         return
     require_writable(command.scene)
     execute(name, Scene(command.scene), command.settings, command.overwrite)

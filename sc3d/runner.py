@@ -41,7 +41,7 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
 
     Up to date: every output and its sidecar exist, made by the same settings from inputs of the same content.
     """
-    stage = importlib.import_module(f"sc3d.runner.{name}")
+    stage = importlib.import_module(f"sc3d.stages.{name}")
     record = {"stage": name, "settings": _decisive(settings), "inputs": {str(path): digest(path) for path in stage.inputs(scene, settings)}}
     outputs = stage.outputs(scene, settings)
     previous = _finished(record, outputs)

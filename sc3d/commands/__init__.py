@@ -22,5 +22,7 @@ COMMANDS: dict[str, type] = {
     "reconstruct": options.ReconstructCommand, "import": options.ImportCommand, "run": options.Run, "view": options.View, "annotate": options.Annotate,
     "doctor": options.Doctor, "manual": options.Manual, "benchmark": options.Benchmark,
 }
-MODULES = {"import": "import_project"}  # stage modules that cannot be named like their command
+MODULES = {  # of the commands that are not in this package
+    "reconstruct": "sc3d.stages.reconstruct", "import": "sc3d.stages.import_project", "manual": "tools.manual_stage", "benchmark": "tools.benchmark.__main__",
+}
 DESCRIPTIONS = {options.Benchmark: "Measure sc3d on this machine."}  # of commands with subcommands: a union of records has no docstring of its own
