@@ -7,20 +7,21 @@ import importlib
 import logging
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
-from sc3d.commands import COMMANDS, DESCRIPTIONS, MODULES, STAGES
+from sc3d.commands import COMMANDS, MODULES, STAGES
 from sc3d.errors import InputError, Sc3dError
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and exit: 0 done, 1 failed, 2 bad input, 130 interrupted by Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `sc3d ... | head` ends quietly
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.stdout.write(usage())
         sys.exit(0 if arguments else 2)
@@ -28,11 +29,20 @@ def main(arguments: list[str] | None = None) -> None:
     if name not in STAGES and name not in COMMANDS:
         sys.exit(_fail(f"unknown command {name!r}: one of {', '.join(sorted(STAGES | COMMANDS))}"))
     command = parse(name, arguments[1:])
+    with reporting_errors():
+        _dispatch(name, command)
+
+
+@contextmanager
+def reporting_errors() -> Iterator[None]:
+    """Log to stderr in the block; what goes wrong in it is told in one line and ends the process, see `main`."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `sc3d ... | head` ends quietly
     logging.basicConfig(format="%(message)s", stream=sys.stderr)
     logging.getLogger("sc3d").setLevel(logging.INFO)  # of other packages, warnings only
+    logging.getLogger("tools").setLevel(logging.INFO)
     logging.captureWarnings(True)
     try:
-        _dispatch(name, command)
+        yield
     except InputError as error:
         sys.exit(_fail(str(error)))
     except PermissionError as error:
@@ -46,7 +56,8 @@ def main(arguments: list[str] | None = None) -> None:
 def usage() -> str:
     """The list of commands."""
     lines = ["usage: sc3d COMMAND ...   (sc3d COMMAND --help shows the options)", ""]
-    lines += [f"  {name:12s}{_describe(record).splitlines()[0]}" for name, record in ({"reconstruct": COMMANDS["reconstruct"]} | STAGES | COMMANDS).items()]
+    records = {"reconstruct": COMMANDS["reconstruct"]} | STAGES | COMMANDS
+    lines += [f"  {name:12s}{_describe(record).splitlines()[0]}" for name, record in records.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -72,16 +83,17 @@ def scene_command(record: type) -> type:
 
 
 def _describe(record: type) -> str:
-    return DESCRIPTIONS.get(record) or (record.__doc__ or "").strip()
+    return (record.__doc__ or "").strip()
 
 
 def _dispatch(name: str, command: object) -> None:
-    from sc3d.scene.scene import Scene
-    from sc3d.runner import execute, require_writable
-
     if name in COMMANDS:
         importlib.import_module(MODULES.get(name, f"sc3d.commands.{name}")).main(command)
         return
+    from sc3d.io.atomic import require_writable
+    from sc3d.runner import execute
+    from sc3d.scene.scene import Scene
+
     require_writable(command.scene)
     execute(name, Scene(command.scene), command.settings, command.overwrite)
 

@@ -14,12 +14,12 @@ import torch
 from tqdm import tqdm
 
 from sc3d.errors import Sc3dError
-from sc3d.io.atomic import temporary_name
 from sc3d.geometry.cameras import View
 from sc3d.geometry.neighbors import orient_normals
 from sc3d.geometry.raycast import FirstSurface, Surface, first_surface
 from sc3d.geometry.tsdf import DepthFusion, Part, cloud_in_order, drop_small_parts, near_mesh, pixel_squares
-from sc3d.settings import Extract
+from sc3d.io.atomic import temporary_name
+from sc3d.settings.reconstruction import Extract
 from sc3d.splatting.consistency import blocking, consistent, pixel_rays
 from sc3d.splatting.evaluation import depth_map
 from sc3d.splatting.gaussians import Gaussians

@@ -12,27 +12,22 @@ from __future__ import annotations
 import errno
 import importlib
 import logging
-import os
-import platform
-import resource
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, fields
-from importlib import metadata
 from pathlib import Path
 
-import sc3d
 from sc3d.errors import InputError, Sc3dError
 from sc3d.io.atomic import remove_leftovers, require_inside, temporary_name
-from sc3d.io import digest, read_json, write_json
+from sc3d.io.json_files import read_json, write_json
+from sc3d.io.provenance import digest, peak_memory_mb, reset_peak_memory, versions
 from sc3d.scene.scene import Scene
-from sc3d.settings import Resources, Workers
+from sc3d.settings.common import Resources, Workers
 
 logger = logging.getLogger(__name__)
 
-PACKAGES = ("open3d", "numpy", "scipy", "torch", "numba", "pycolmap", "opencv-python-headless")
 MAX_SIDECAR = 64 << 20  # bytes: names of all photos may be in it
 
 
@@ -117,38 +112,6 @@ def _decisive(settings: object) -> dict[str, object]:
 def sidecar(output: Path) -> Path:
     """`<output>.json`: settings, versions and input hashes of an output."""
     return output.with_name(output.name + ".json")
-
-
-def versions() -> dict[str, str]:
-    """Versions of sc3d, Python and the packages that decide results."""
-    found = {"sc3d": sc3d.__version__, "python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
-
-
-def reset_peak_memory() -> None:
-    """Start measuring the peak anew (Linux; elsewhere it stays that of the whole process)."""
-    with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
-
-
-def peak_memory_mb() -> int:
-    """Largest resident memory since `reset_peak_memory`, MB."""
-    with suppress(OSError, StopIteration):
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) // 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-
-
-def require_writable(folder: Path) -> None:
-    """Raise InputError, before any work, if a scene folder cannot be written."""
-    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK, effective_ids=True):
-        raise InputError(f"cannot write to {existing}: check its permissions or choose another folder")
 
 
 def _finished(record: dict, outputs: list[Path]) -> dict | None:

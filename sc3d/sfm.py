@@ -15,15 +15,14 @@ import numpy as np
 import pycolmap
 from tqdm import tqdm
 
+from sc3d.errors import InputError, Sc3dError
 from sc3d.georeferencing.alignment import Similarity, main_plane
 from sc3d.georeferencing.control_points import ControlPoints, align_to_control_points, transform
-from sc3d.errors import InputError, Sc3dError
-from sc3d.io.atomic import require_room, telling_of_full_disk, temporary_name
 from sc3d.georeferencing.focal import anchor_focal, tells_focal
 from sc3d.georeferencing.georeference import Georeference, from_origin
 from sc3d.georeferencing.gps import Flight, place, read_flight, residuals
-from sc3d.io import atomic_path
-from sc3d.settings import Reconstruct
+from sc3d.io.atomic import atomic_path, require_room, telling_of_full_disk, temporary_name
+from sc3d.settings.reconstruction import Reconstruct
 
 logger = logging.getLogger(__name__)
 

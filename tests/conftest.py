@@ -37,7 +37,13 @@ def tiny_models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _save_grounding_dino(path: Path) -> None:
     import torch
-    from transformers import BertConfig, BertTokenizer, GroundingDinoConfig, GroundingDinoForObjectDetection, SwinConfig
+    from transformers import (
+        BertConfig,
+        BertTokenizer,
+        GroundingDinoConfig,
+        GroundingDinoForObjectDetection,
+        SwinConfig,
+    )
 
     words = ["building", "house", "roof", "road", "parking", "lot", "tree", "grass", "solar", "panel", "##s"]
     vocabulary = [f"[unused{index}]" for index in range(1100)]

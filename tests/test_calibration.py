@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sc3d.calibration import Reliability, reliability
+from sc3d.metrics import Reliability, reliability
 
 
 def test_by_hand():

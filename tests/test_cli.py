@@ -12,10 +12,11 @@ import numpy as np
 import open3d as o3d
 import pytest
 from PIL import Image
-from tests.builders import write_bare_scene
 
 import sc3d.stages.label  # noqa: F401 - loaded before a test gives up its rights
-from sc3d.cli import COMMANDS, STAGES, main
+from sc3d.cli import main
+from sc3d.commands import COMMANDS, STAGES
+from tests.builders import write_bare_scene
 
 
 @pytest.fixture
@@ -23,11 +24,11 @@ def scene(tmp_path):
     return write_bare_scene(tmp_path / "scene")
 
 
-def fails(capsys, *arguments, status: int = 2) -> str:
+def fails(capsys, *arguments, status: int = 2, command=main) -> str:
     """Run a command that must fail; returns its one line."""
     capsys.readouterr()
     with pytest.raises(SystemExit) as stopped:
-        main([str(argument) for argument in arguments])
+        command([str(argument) for argument in arguments])
     error = capsys.readouterr().err
     assert stopped.value.code == status, error
     lines = [line for line in error.splitlines() if line.startswith("sc3d:")]
@@ -186,7 +187,7 @@ class TestBadInput:
 
 
 def test_interrupted_output_leaves_the_old_file(tmp_path):
-    from sc3d.io import atomic_path
+    from sc3d.io.atomic import atomic_path
 
     target = tmp_path / "cloud.ply"
     target.write_text("old")

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from sc3d.errors import Sc3dError
-from sc3d.geometry.cameras import look_at, pinhole_view
-from sc3d.settings import Extract
 from sc3d.extraction import DepthViews, centre_cloud, extract_surface, wanted_coverage
+from sc3d.geometry.cameras import look_at, pinhole_view
+from sc3d.settings.reconstruction import Extract
 from sc3d.splatting.gaussians import Gaussians
 
 STEP = 0.1

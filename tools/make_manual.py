@@ -1,9 +1,11 @@
-"""The manual's pages of commands, from the same records as `--help`."""
+"""Writes the manual's pages of commands, from the same records as `--help`: `python tools/make_manual.py [FOLDER]`."""
 
 from __future__ import annotations
 
+import argparse
 import ast
 import inspect
+import sys
 import textwrap
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
@@ -11,9 +13,13 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from sc3d.io import write_text
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
 
-NOTE = "<!-- Written by `sc3d manual`; edit sc3d/settings.py instead. -->"
+from sc3d.commands import COMMANDS, STAGES
+from sc3d.io.json_files import write_text
+
+NOTE = "<!-- Written by `python tools/make_manual.py`; edit sc3d/settings instead. -->"
 
 
 @dataclass(frozen=True)
@@ -103,7 +109,7 @@ def _escaped(text: str) -> str:
     return text.replace("|", "\\|")
 
 
-def _values(kind: Any) -> str:  # noqa: ANN401 - any type of a field
+def _values(kind: Any) -> str:
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
         return _values(arguments[0])
@@ -120,3 +126,21 @@ def _shown(value: object) -> str:
     if value is None or value == ():
         return "none"
     return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Write all pages."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "data" / "manual" / "commands")
+    folder = parser.parse_args(arguments).folder
+    commands = {name: _command(record, name in STAGES) for name, record in sorted((STAGES | COMMANDS).items())}
+    written = write_pages(folder, commands)
+    sys.stdout.write(f"wrote {len(written)} pages to {folder}\n")
+
+
+def _command(record: type, scene: bool) -> Command:
+    return Command(" ".join((record.__doc__ or "").split()), {"": record}, scene)
+
+
+if __name__ == "__main__":
+    main()

@@ -97,10 +97,10 @@ class Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "sc3d", ""
     timeout = 60  # s that a connection may stay silent
 
-    def do_GET(self) -> None:  # noqa: N802 - the name that http.server calls
+    def do_GET(self) -> None:
         self._respond(self._get)
 
-    def do_POST(self) -> None:  # noqa: N802
+    def do_POST(self) -> None:
         self._respond(self._post)
 
     def _respond(self, answer: Callable[[str], Answer]) -> None:
@@ -181,7 +181,7 @@ class Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(answer.body)
 
-    def log_message(self, format: str, *values: object) -> None:  # noqa: A002 - as in http.server
+    def log_message(self, format: str, *values: object) -> None:
         logger.debug(format, *values)
 
 

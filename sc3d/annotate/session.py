@@ -10,10 +10,12 @@ import cv2
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io import digest, find_photos, image_size, read_image, read_json, write_json
+from sc3d.io.images import find_photos, image_size, read_image
+from sc3d.io.json_files import read_json, write_json
+from sc3d.io.provenance import digest
 from sc3d.scene.scene import Scene
-from sc3d.segmentation.strokes.files import BACKGROUND, parse_shapes
 from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, reduced
+from sc3d.segmentation.strokes.files import BACKGROUND, parse_shapes
 
 SHOWN = 4096  # px, longest side of the photo in the browser
 TRIED = 2048  # px, longest side of the mask that is tried out

@@ -1,28 +1,32 @@
-"""Every command and the record of its options."""
+"""Every command, the record of its options, and the module that runs it."""
 
 from __future__ import annotations
 
-from sc3d import settings as options
+from sc3d.settings import labels, outputs, reconstruction, synthesize, train
 
 # stages that are one settings record applied to one scene folder, in the order of the data flow
 STAGES: dict[str, type] = {
-    "synthesize": options.Synthesize,
-    "georeference": options.Georeference,
-    "train": options.Train,
-    "extract": options.Extract,
-    "segment": options.Segment,
-    "label": options.Label,
-    "propagate": options.Propagate,
-    "evaluate": options.Evaluate,
-    "export": options.Export,
-    "report": options.Report,
+    "synthesize": synthesize.Synthesize,
+    "georeference": reconstruction.Georeference,
+    "train": train.Train,
+    "extract": reconstruction.Extract,
+    "segment": labels.Segment,
+    "label": labels.Label,
+    "propagate": labels.Propagate,
+    "evaluate": labels.Evaluate,
+    "export": outputs.Export,
+    "report": outputs.Report,
 }
 # commands with arguments of their own
 COMMANDS: dict[str, type] = {
-    "reconstruct": options.ReconstructCommand, "import": options.ImportCommand, "run": options.Run, "view": options.View, "annotate": options.Annotate,
-    "doctor": options.Doctor, "manual": options.Manual, "benchmark": options.Benchmark,
+    "reconstruct": reconstruction.ReconstructCommand,
+    "import": reconstruction.ImportCommand,
+    "run": outputs.Run,
+    "view": outputs.View,
+    "annotate": labels.Annotate,
+    "doctor": outputs.Doctor,
 }
 MODULES = {  # of the commands that are not in this package
-    "reconstruct": "sc3d.stages.reconstruct", "import": "sc3d.stages.import_project", "manual": "tools.manual_stage", "benchmark": "tools.benchmark.__main__",
+    "reconstruct": "sc3d.stages.reconstruct",
+    "import": "sc3d.stages.import_project",
 }
-DESCRIPTIONS = {options.Benchmark: "Measure sc3d on this machine."}  # of commands with subcommands: a union of records has no docstring of its own

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 
+from sc3d.io.atomic import require_writable
 from sc3d.scene.scene import Scene
-from sc3d.settings import Annotate
-from sc3d.runner import require_writable
+from sc3d.settings.labels import Annotate
 
 logger = logging.getLogger(__name__)
 

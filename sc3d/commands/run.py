@@ -7,18 +7,19 @@ import shutil
 import time
 from dataclasses import replace
 
-from sc3d import settings as options
-from sc3d.scene.class_table import read_classes
 from sc3d.errors import InputError
-from sc3d.io import atomic_path
-from sc3d.scene.scene import Scene, match_masks, photo_sizes
+from sc3d.io.atomic import atomic_path
 from sc3d.runner import execute
+from sc3d.scene.class_table import read_classes
+from sc3d.scene.scene import Scene, match_masks, photo_sizes
+from sc3d.settings.labels import Evaluate, Segment
+from sc3d.settings.outputs import Report, Run
 from sc3d.stages.reconstruct import prepare
 
 logger = logging.getLogger(__name__)
 
 
-def main(command: options.Run) -> None:
+def main(command: Run) -> None:
     started = time.perf_counter()
     scene = Scene(command.scene)
     segment = replace(command.segment, masks=command.masks or command.segment.masks, confidence=command.confidence or command.segment.confidence)
@@ -29,16 +30,16 @@ def main(command: options.Run) -> None:
             shutil.copyfile(command.classes, temporary)
     stages = [
         ("reconstruct", command.reconstruct), ("train", command.train), ("extract", command.extract), ("segment", replace(segment, refine=False)),
-        *([("segment", options.Segment(refine=True))] if segment.refine else []), ("label", command.label), ("propagate", command.propagate),
+        *([("segment", Segment(refine=True))] if segment.refine else []), ("label", command.label), ("propagate", command.propagate),
     ]
     if command.truth is not None:
-        stages.append(("evaluate", options.Evaluate(truth=command.truth)))
-    for name, settings in [*stages, ("report", options.Report())]:
+        stages.append(("evaluate", Evaluate(truth=command.truth)))
+    for name, settings in [*stages, ("report", Report())]:
         execute(name, scene, settings, command.overwrite)
     logger.info("run: %.0f s; look at %s", time.perf_counter() - started, scene.report)
 
 
-def check(command: options.Run, segment: options.Segment) -> None:
+def check(command: Run, segment: Segment) -> None:
     """Find what would stop a late stage before the first one starts."""
     sizes = photo_sizes(command.photos)
     classes = command.classes or Scene(command.scene).classes
@@ -46,7 +47,8 @@ def check(command: options.Run, segment: options.Segment) -> None:
         raise InputError(f"{classes} is missing: pass --classes FILE (data/classes.json of the sc3d repository is one to start from)")
     class_table = read_classes(classes)
     if segment.backend == "files":
-        from sc3d.segmentation.mask_formats.import_masks import MaskFiles, check_masks
+        from sc3d.segmentation.mask_formats.import_masks import check_masks
+        from sc3d.segmentation.mask_formats.source import MaskFiles
 
         masks = segment.masks or Scene(command.scene).masks
         if not masks.exists():

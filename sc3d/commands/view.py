@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io import IMAGE_SUFFIXES, read_cloud, read_image, read_json, write_image
-from sc3d.scene.scene import Scene
-from sc3d.settings import View
+from sc3d.io.clouds import read_cloud
+from sc3d.io.images import IMAGE_SUFFIXES, read_image, write_image
+from sc3d.io.json_files import read_json
 from sc3d.runner import sidecar
+from sc3d.scene.scene import Scene
+from sc3d.settings.outputs import View
 
 if TYPE_CHECKING:
     import open3d as o3d
 
-    from sc3d.scene.class_table import ClassTable
     from sc3d.geometry.cameras import View as Camera
-    from sc3d.view.picking import Inspector
+    from sc3d.scene.class_table import ClassTable
     from sc3d.view.display_splats import ShownSplats
+    from sc3d.view.picking import Inspector
 
 logger = logging.getLogger(__name__)
 
@@ -76,8 +78,8 @@ def _check(command: View) -> None:
 
 def _picture_of_cloud(command: View, scene: Scene, views: list[Camera], photo: Camera | None) -> np.ndarray:
     """(H, W, 3) uint8 RGB"""
-    from sc3d.view.screenshot import Style, screenshot
     from sc3d.view.display_cloud import class_ids, only_classes
+    from sc3d.view.screenshot import Style, screenshot
 
     cloud, table = _read_cloud(command, scene, votes=command.by == "disagreement"), _class_table(scene)
     cloud = only_classes(cloud, class_ids(table, command.classes))
@@ -189,10 +191,10 @@ def _splats(command: View, scene: Scene) -> ShownSplats:
 def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.ndarray:
     """(H, W, 3) uint8 RGB: the splats from the air, or beside a photo; in class colours or by confidence where they have labels."""
     from sc3d.geometry.cameras import resample
-    from sc3d.view.splat_images import compare, rendered
-    from sc3d.view.viewpoints import aerial_view, fitted, without_outliers
     from sc3d.view.captions import add_legend
     from sc3d.view.contact_sheet import half_of, side_by_side
+    from sc3d.view.splat_images import compare, rendered
+    from sc3d.view.viewpoints import aerial_view, fitted, without_outliers
 
     splats = _splats(command, scene)
     table = scene.class_table() if splats.label is not None and command.by != "photo" else None
@@ -216,8 +218,8 @@ def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.
 def _write_flight(command: View, scene: Scene) -> None:
     from tqdm import tqdm
 
-    from sc3d.view.splat_images import rendered
     from sc3d.view.flight_video import flight_path, write_video
+    from sc3d.view.splat_images import rendered
 
     splats = _splats(command, scene)
     gaussians = splats.painted(command.by, scene.class_table()) if command.splats and splats.label is not None else splats.gaussians

@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 from scipy import ndimage
 
-from sc3d.geometry.raster import Grid, highest_points
 from sc3d.exporters.regions import cells_by_number, connected_cells, disk, neighbors, renumbered
+from sc3d.geometry.raster import Grid, highest_points
 
 CLOSING, OPENING = 0.6, 0.5  # gaps and strips narrower than about twice this vanish, m
 SMOOTHING = 0.4  # standard deviation of the Gaussian that evens the border out, m

@@ -12,7 +12,9 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.georeferencing.georeference import read_georeference, write_georeference
 from sc3d.importers.nerfstudio import OPENGL, camera_parameters
-from sc3d.io import atomic_path, write_geometry, write_json
+from sc3d.io.atomic import atomic_path
+from sc3d.io.clouds import write_geometry
+from sc3d.io.json_files import write_json
 from sc3d.scene.scene import Scene
 
 
@@ -45,7 +47,7 @@ def write_transforms(scene: Scene) -> dict[str, object]:
 
 def write_colmap_text(scene: Scene) -> dict[str, object]:
     """`export/colmap-text/cameras.txt`, `images.txt`, `points3D.txt` and what else COLMAP writes."""
-    scene.model  # noqa: B018 - its checks come first
+    scene.model
     model = pycolmap.Reconstruction(str(scene.sparse))
     with atomic_path(colmap_text_folder(scene)) as temporary:
         temporary.mkdir()

@@ -10,9 +10,10 @@ import open3d as o3d
 
 from sc3d.errors import InputError
 from sc3d.exporters.projected_cloud import chosen_classes, read_placed_cloud
-from sc3d.io import atomic_path, write_geometry
+from sc3d.io.atomic import atomic_path
+from sc3d.io.clouds import write_geometry
 from sc3d.scene.scene import Scene
-from sc3d.settings import Export
+from sc3d.settings.outputs import Export
 
 
 def outputs(scene: Scene, settings: Export) -> list[Path]:

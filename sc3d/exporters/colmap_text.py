@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sc3d.exporters.cameras import colmap_text_folder, write_colmap_text
 from sc3d.scene.scene import Scene
-from sc3d.settings import Export
+from sc3d.settings.outputs import Export
 
 
 def outputs(scene: Scene, settings: Export) -> list[Path]:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import open3d as o3d
 
-from sc3d.geometry.raster import Grid, close_gaps, highest_points, spacing_of_all
 from sc3d.exporters.projected_cloud import PlacedCloud
 from sc3d.geometry.neighbors import NeighborIndex
+from sc3d.geometry.raster import Grid, close_gaps, highest_points, spacing_of_all
 from sc3d.geometry.raycast import Surface
-from sc3d.io import read_mesh
+from sc3d.io.clouds import read_mesh
 from sc3d.scene.labelled_cloud import REACH
 from sc3d.scene.scene import Scene
 

@@ -8,12 +8,12 @@ import laspy
 import numpy as np
 
 import sc3d
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
 from sc3d.exporters.projected_cloud import PlacedCloud, chosen_classes, placed_chunks
-from sc3d.io import atomic_path
+from sc3d.io.atomic import atomic_path
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
-from sc3d.settings import Export
+from sc3d.settings.outputs import Export
 
 CHUNK = 1_000_000  # points written at a time
 SCALE = 0.001  # of the stored whole numbers, units of the CRS

@@ -9,12 +9,12 @@ import numpy as np
 from tqdm import tqdm
 
 from sc3d.geometry.cameras import View
-from sc3d.io import atomic_path, read_image, read_index_image, write_image
+from sc3d.io.atomic import atomic_path
+from sc3d.io.images import read_image, read_index_image, write_image
 from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
-from sc3d.settings import Export
+from sc3d.settings.outputs import Export
 from sc3d.view.contact_sheet import side_by_side
-
 
 SHOWN, PANEL = 4, 600  # photos in masks.jpg, and the width of each picture there, px
 

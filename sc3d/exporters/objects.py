@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
-from sc3d.exporters.trees import canopy_height, split_crowns
-from sc3d.exporters.vector_files import MapObject, has_geopackage, shapely, write_geojson, write_geopackage
 from sc3d.exporters.buildings import roof_heights, roof_tops, split_buildings
-from sc3d.geometry.raster import Grid, spacing_of_all
 from sc3d.exporters.polygonize import simplified, squared, trace
 from sc3d.exporters.projected_cloud import PlacedCloud, find_placement, read_placed_cloud
 from sc3d.exporters.regions import cells_by_number
 from sc3d.exporters.terrain import ground_height
+from sc3d.exporters.trees import canopy_height, split_crowns
+from sc3d.exporters.vector_files import MapObject, has_geopackage, shapely, write_geojson, write_geopackage
+from sc3d.geometry.raster import Grid, spacing_of_all
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
-from sc3d.settings import Export
+from sc3d.settings.outputs import Export
 
 LAYERS = ("buildings", "trees")
 CELL = 1.5  # side of the cells, in point spacings

@@ -8,14 +8,14 @@ from xml.sax.saxutils import escape
 import numpy as np
 from tqdm import tqdm
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.exporters.from_above import FromAbove
-from sc3d.geometry.raster import Grid, spacing_of_all
 from sc3d.exporters.packages import load
 from sc3d.exporters.projected_cloud import PlacedCloud, read_placed_cloud
-from sc3d.io import atomic_path
+from sc3d.geometry.raster import Grid, spacing_of_all
+from sc3d.io.atomic import atomic_path
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
-from sc3d.settings import Export
+from sc3d.settings.outputs import Export
 
 rasterio = load("rasterio")
 enums, transforms = load("rasterio.enums"), load("rasterio.transform")
@@ -92,7 +92,7 @@ def _colors(placed: PlacedCloud, rows: np.ndarray) -> np.ndarray:
     return image
 
 
-def _open(file: Path, placed: PlacedCloud, grid: Grid, **profile: object):  # noqa: ANN202 - rasterio's writer
+def _open(file: Path, placed: PlacedCloud, grid: Grid, **profile: object):
     transform = transforms.from_origin(grid.left, grid.top, grid.pixel, grid.pixel)
     crs = placed.placement.crs
     return rasterio.open(

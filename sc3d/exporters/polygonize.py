@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sc3d.geometry.raster import Grid
 from sc3d.exporters.packages import load
+from sc3d.geometry.raster import Grid
 
 features, transforms, shapely = load("rasterio.features"), load("rasterio.transform"), load("shapely")
 

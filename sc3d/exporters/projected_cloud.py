@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import open3d as o3d
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
-from sc3d.labelling.fusion import Labels
 from sc3d.georeferencing.georeference import Georeference, projected_crs, read_georeference
-from sc3d.scene.labelled_cloud import read_labelled, take_labels
-from sc3d.scene.scene import Scene
-from sc3d.settings import Export, Resources
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
+from sc3d.scene.class_table import ClassTable
+from sc3d.scene.labelled_cloud import read_labelled, take_labels
+from sc3d.scene.labels import Labels
+from sc3d.scene.scene import Scene
+from sc3d.settings.common import Resources
+from sc3d.settings.outputs import Export
 from sc3d.tiling.memory import fits, num_points
 
 if TYPE_CHECKING:

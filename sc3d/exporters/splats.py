@@ -7,19 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
 from sc3d.exporters.masks import render_mask
 from sc3d.exporters.projected_cloud import Placement, chosen_classes, find_placement
 from sc3d.geometry.cameras import undistorted
 from sc3d.geometry.neighbors import NeighborIndex
-from sc3d.io import atomic_path, read_cloud
+from sc3d.io.atomic import atomic_path
+from sc3d.io.clouds import read_cloud
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import REACH, LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
-from sc3d.settings import Export
+from sc3d.settings.outputs import Export
+from sc3d.splatting.dataset import load_gaussians
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.lifting import lift, winners
-from sc3d.view.splat_images import load_gaussians
 
 LIFTED_SIZE = 800  # longest side of the masks whose labels are lifted, px; Gaussians are trained at about that size
 GUARD = 32.0  # point spacings: farther from all points of its class, a splat floats before or behind what it was labelled for

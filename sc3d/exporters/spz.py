@@ -9,9 +9,9 @@ import open3d as o3d
 
 from sc3d.exporters import splats
 from sc3d.exporters.projected_cloud import chosen_classes, find_placement
-from sc3d.io import atomic_path
+from sc3d.io.atomic import atomic_path
 from sc3d.scene.scene import Scene
-from sc3d.settings import Export
+from sc3d.settings.outputs import Export
 from sc3d.splatting.gaussians import Gaussians
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from sc3d.geometry.raster import Grid, close_gaps, highest_points
 from sc3d.exporters.regions import disk, renumbered
+from sc3d.geometry.raster import Grid, close_gaps, highest_points
 
 GAP = 0.5  # gaps of the canopy narrower than about twice this are filled, m
 SMOOTHING = 0.4  # standard deviation of the Gaussian that joins the lobes of a crown, m

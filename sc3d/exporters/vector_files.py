@@ -12,7 +12,7 @@ import numpy as np
 
 from sc3d.exporters.packages import load
 from sc3d.exporters.projected_cloud import Placement
-from sc3d.io import atomic_path
+from sc3d.io.atomic import atomic_path
 
 shapely = load("shapely")
 

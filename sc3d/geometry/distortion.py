@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 
 from sc3d.errors import InputError
-from sc3d.io.images import MAX_PIXELS, MAX_SIDE
+from sc3d.io.limits import MAX_PIXELS, MAX_SIDE
 
 NUM_RADII = 400  # samples along the image diagonal on which a lens is compared with its replacement
 

@@ -129,7 +129,7 @@ def _others(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @numba.njit(cache=True, parallel=True)
-def _drop_self(neighbors, distances, first, kept, lengths):  # noqa: ANN001, ANN202 - numba kernel, see _others; rows are points from `first` on
+def _drop_self(neighbors, distances, first, kept, lengths):
     for i in numba.prange(len(neighbors)):
         position = 0
         for k in range(neighbors.shape[1]):
@@ -139,7 +139,7 @@ def _drop_self(neighbors, distances, first, kept, lengths):  # noqa: ANN001, ANN
 
 
 @numba.njit(cache=True, parallel=True)
-def _shape(points, normals, neighbors, distances):  # noqa: ANN001, ANN202
+def _shape(points, normals, neighbors, distances):
     """Curvature (eq. 6, signs aligned as in `neighbors.curvature`) and roughness of each point."""
     count = neighbors.shape[1]
     bend, roughness = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
@@ -163,7 +163,7 @@ def _shape(points, normals, neighbors, distances):  # noqa: ANN001, ANN202
 
 
 @numba.njit(cache=True)
-def _edge(normals, bend, i, j, oriented):  # noqa: ANN001, ANN202 - eq. 7
+def _edge(normals, bend, i, j, oriented):
     cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
     cosine = min(max(cosine, np.float32(-1)), np.float32(1))
     angle = np.arccos(cosine) if oriented else 2 * np.arccos(abs(cosine))
@@ -171,7 +171,7 @@ def _edge(normals, bend, i, j, oriented):  # noqa: ANN001, ANN202 - eq. 7
 
 
 @numba.njit(cache=True)
-def _similarities(normals, bend, rows, columns, oriented):  # noqa: ANN001, ANN202
+def _similarities(normals, bend, rows, columns, oriented):
     result = np.empty(len(rows), np.float32)
     for edge in range(len(rows)):
         result[edge] = _edge(normals, bend, rows[edge], columns[edge], oriented)
@@ -179,7 +179,7 @@ def _similarities(normals, bend, rows, columns, oriented):  # noqa: ANN001, ANN2
 
 
 @numba.njit(cache=True, parallel=True)
-def _cut(neighbors, distances, reach):  # noqa: ANN001, ANN202 - neighbours out of reach become -1
+def _cut(neighbors, distances, reach):
     for i in numba.prange(len(neighbors)):
         for k in range(neighbors.shape[1]):
             if distances[i, k] > reach[i]:
@@ -187,7 +187,7 @@ def _cut(neighbors, distances, reach):  # noqa: ANN001, ANN202 - neighbours out 
 
 
 @numba.njit(cache=True)
-def _one_way(neighbors, i, k):  # noqa: ANN001, ANN202 - does the other end lack this edge?
+def _one_way(neighbors, i, k):
     for m in range(neighbors.shape[1]):
         if neighbors[neighbors[i, k], m] == i:
             return False
@@ -195,7 +195,7 @@ def _one_way(neighbors, i, k):  # noqa: ANN001, ANN202 - does the other end lack
 
 
 @numba.njit(cache=True)
-def _link(neighbors):  # noqa: ANN001, ANN202
+def _link(neighbors):
     """CSR arrays of the union of both directions of the edges: starts (N + 1,) int64, columns (E,) int32."""
     starts = np.zeros(len(neighbors) + 1, np.int64)
     for i in range(len(neighbors)):
@@ -219,7 +219,7 @@ def _link(neighbors):  # noqa: ANN001, ANN202
 
 
 @numba.njit(cache=True, parallel=True)
-def _weigh(starts, columns, normals, bend, shades, oriented, weights):  # noqa: ANN001, ANN202 - eq. 7 is symmetric to the bit: each end computes the same
+def _weigh(starts, columns, normals, bend, shades, oriented, weights):
     for i in numba.prange(len(starts) - 1):
         for edge in range(starts[i], starts[i + 1]):
             j, squared = columns[edge], 0.0

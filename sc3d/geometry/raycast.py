@@ -92,7 +92,7 @@ def first_surface(surface: RayTarget, view: View) -> FirstSurface:
 
 
 @numba.njit(parallel=True, cache=True)
-def _aim(directions, cam_from_world, origin, bundle):  # noqa: ANN001, ANN202 - numba kernel
+def _aim(directions, cam_from_world, origin, bundle):
     """Rays (K, 6) from `origin` (3,) along directions (K, 3) turned from the camera into the world; those without direction point nowhere."""
     for k in numba.prange(len(directions)):
         x, y, z = np.float64(directions[k, 0]), np.float64(directions[k, 1]), np.float64(directions[k, 2])
@@ -103,7 +103,7 @@ def _aim(directions, cam_from_world, origin, bundle):  # noqa: ANN001, ANN202 - 
 
 
 @numba.njit(parallel=True, cache=True)
-def _measure(directions, bundle, t_hit, normals, distance, incidence):  # noqa: ANN001, ANN202 - numba kernel
+def _measure(directions, bundle, t_hit, normals, distance, incidence):
     """Range (K,), infinite without a ray or a hit, and |cosine| (K,) between ray and surface normal."""
     for k in numba.prange(len(directions)):
         distance[k] = t_hit[k] if np.isfinite(directions[k, 2]) else np.float32(np.inf)

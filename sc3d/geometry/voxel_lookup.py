@@ -44,12 +44,12 @@ def voxel_lookup(keys: np.ndarray) -> VoxelLookup:
 
 
 @numba.njit(cache=True)
-def _place(block, size):  # noqa: ANN001, ANN202 - numba kernel, scalars
+def _place(block, size):
     return np.int64((np.uint64(block) * np.uint64(MIXER)) >> np.uint64(20)) & (size - 1)
 
 
 @numba.njit(cache=True)
-def _enter(table, blocks):  # noqa: ANN001, ANN202 - numba kernel, arrays as in VoxelLookup
+def _enter(table, blocks):
     for row in range(len(blocks)):
         place = _place(blocks[row], len(table))
         while table[place, 0] != NOTHING:
@@ -58,7 +58,7 @@ def _enter(table, blocks):  # noqa: ANN001, ANN202 - numba kernel, arrays as in 
 
 
 @numba.njit(cache=True, inline="always")
-def find_block(table, x, y, z):  # noqa: ANN001, ANN201 - numba kernel; row of the block at x, y, z (blocks), or -1
+def find_block(table, x, y, z):
     block = ((x << AXIS_BITS | y) << AXIS_BITS) | z
     place = _place(block, len(table))
     while table[place, 0] != NOTHING and table[place, 0] != block:
@@ -67,18 +67,18 @@ def find_block(table, x, y, z):  # noqa: ANN001, ANN201 - numba kernel; row of t
 
 
 @numba.njit(cache=True)
-def find_voxel(lookup, x, y, z):  # noqa: ANN001, ANN201 - numba kernel; row of the voxel at x, y, z >= 0 (voxels), or -1
+def find_voxel(lookup, x, y, z):
     block = find_block(lookup.table, x // BLOCK, y // BLOCK, z // BLOCK)
     return lookup.rows[block, ((z % BLOCK) * BLOCK + y % BLOCK) * BLOCK + x % BLOCK] if block >= 0 else NOTHING
 
 
 @numba.njit(cache=True)
-def voxel_key(x, y, z):  # noqa: ANN001, ANN201 - numba kernel, scalars >= 0, voxels
+def voxel_key(x, y, z):
     return ((((x // BLOCK << AXIS_BITS | y // BLOCK) << AXIS_BITS) | z // BLOCK) * VOXELS) + ((z % BLOCK) * BLOCK + y % BLOCK) * BLOCK + x % BLOCK
 
 
 @numba.njit(cache=True)
-def voxel_position(key):  # noqa: ANN001, ANN201 - numba kernel; x, y, z in voxels
+def voxel_position(key):
     block, place = key // VOXELS, key % VOXELS
     x, y, z = block >> 2 * AXIS_BITS, block >> AXIS_BITS & AXIS_MASK, block & AXIS_MASK
     return x * BLOCK + place % BLOCK, y * BLOCK + place // BLOCK % BLOCK, z * BLOCK + place // (BLOCK * BLOCK)

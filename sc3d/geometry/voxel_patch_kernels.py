@@ -37,7 +37,7 @@ class Matter(NamedTuple):
 
 
 @numba.njit(parallel=True, cache=True)
-def sum_up(vectors, sides, starts, keys, moments, shapes):  # noqa: ANN001, ANN201 - numba kernel
+def sum_up(vectors, sides, starts, keys, moments, shapes):
     """Fill moments as in Matter and shapes (V, 2, 12) as in `Patches`, with boxes that just hold the points.
 
     vectors: positions (N, 3) float64 in voxels from the grid's zero, and normals (N, 3) float32; points sorted by voxel
@@ -60,7 +60,7 @@ def sum_up(vectors, sides, starts, keys, moments, shapes):  # noqa: ANN001, ANN2
 
 
 @numba.njit(parallel=True, cache=True)
-def support(matter, lookup, supported):  # noqa: ANN001, ANN201 - numba kernel
+def support(matter, lookup, supported):
     """supported (V,): has a voxel points enough, alone or with those around it?"""
     for voxel in numba.prange(len(matter.keys)):
         x, y, z = voxel_position(matter.keys[voxel])
@@ -72,7 +72,7 @@ def support(matter, lookup, supported):  # noqa: ANN001, ANN201 - numba kernel
 
 
 @numba.njit(parallel=True, cache=True)
-def empty_around(matter, lookup, found):  # noqa: ANN001, ANN201 - numba kernel
+def empty_around(matter, lookup, found):
     """found (V, 27): keys of the voxels without points around each flat one, 0 = none."""
     for voxel in numba.prange(len(matter.keys)):
         x, y, z = voxel_position(matter.keys[voxel])
@@ -83,7 +83,7 @@ def empty_around(matter, lookup, found):  # noqa: ANN001, ANN201 - numba kernel
 
 
 @numba.njit(parallel=True, cache=True)
-def close_gaps(matter, lookup, keys, closed, shapes):  # noqa: ANN001, ANN201 - numba kernel
+def close_gaps(matter, lookup, keys, closed, shapes):
     """closed (C,): does a voxel without points lie amid points of one plane that crosses it? Then shapes (C, 2, 12) gets that plane."""
     for row in numba.prange(len(keys)):
         total, shape = np.zeros(7, np.int64), shapes[row, 0]
@@ -96,7 +96,7 @@ def close_gaps(matter, lookup, keys, closed, shapes):  # noqa: ANN001, ANN201 - 
 
 
 @numba.njit(cache=True)
-def _sum_around(matter, lookup, key, total):  # noqa: ANN001, ANN202 - numba kernel
+def _sum_around(matter, lookup, key, total):
     """Add to total (7,) the moments of the flat voxels around `key` whose sides face as the fullest of them does; returns the number of sides."""
     x, y, z = voxel_position(key)
     rows, reference, most, num = np.full(27, -1, np.int64), np.zeros(3), 0, 0
@@ -123,7 +123,7 @@ def _sum_around(matter, lookup, key, total):  # noqa: ANN001, ANN202 - numba ker
 
 
 @numba.njit(parallel=True, cache=True)
-def widen(keys, lookup, flat, shapes):  # noqa: ANN001, ANN201 - numba kernel
+def widen(keys, lookup, flat, shapes):
     """Let the boxes of shapes (V, 2, 12) reach beyond their points: planes to where the next voxel goes on with them, all by a margin."""
     for voxel in numba.prange(len(keys)):
         x, y, z = voxel_position(keys[voxel])
@@ -142,7 +142,7 @@ def widen(keys, lookup, flat, shapes):  # noqa: ANN001, ANN201 - numba kernel
 
 
 @numba.njit(cache=True)
-def _write_plane(total, shape):  # noqa: ANN001, ANN202 - numba kernel
+def _write_plane(total, shape):
     """Write mean position and unit mean normal of moments (7,) to shape (6 or more,); returns the length of the mean normal."""
     length = _length(total[4:])
     for axis in range(3):
@@ -152,5 +152,5 @@ def _write_plane(total, shape):  # noqa: ANN001, ANN202 - numba kernel
 
 
 @numba.njit(cache=True)
-def _length(vector):  # noqa: ANN001, ANN202 - numba kernel; (3,), at least 1e-9 so that it can divide
+def _length(vector):
     return max(np.sqrt(float(vector[0]) ** 2 + float(vector[1]) ** 2 + float(vector[2]) ** 2), 1e-9)

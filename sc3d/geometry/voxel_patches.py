@@ -10,8 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sc3d.geometry.voxel_patch_kernels import GAP_VOXELS, Matter, close_gaps, empty_around, sum_up, support, widen
 from sc3d.geometry.voxel_lookup import VoxelLookup, voxel_lookup
+from sc3d.geometry.voxel_patch_kernels import (
+    GAP_VOXELS,
+    Matter,
+    close_gaps,
+    empty_around,
+    sum_up,
+    support,
+    widen,
+)
 from sc3d.geometry.voxels import BLOCK, ORIGIN_SHIFT, SIDES, normal_sides, sort_by_voxel
 
 

@@ -43,7 +43,7 @@ class Ray(NamedTuple):
 
 
 @numba.njit(cache=True)
-def _locate(axis, position, direction, inverse, time, by):  # noqa: ANN001, ANN202 - numba kernel, scalars
+def _locate(axis, position, direction, inverse, time, by):
     """Voxel of a ray along `axis` after all crossings before that of axis `by` at `time`; of crossings at the same time, the lower axis comes first."""
     start = np.int64(np.floor(position))
     if direction == 0.0:
@@ -59,19 +59,19 @@ def _locate(axis, position, direction, inverse, time, by):  # noqa: ANN001, ANN2
 
 
 @numba.njit(cache=True)
-def _before(crossing, axis, time, by):  # noqa: ANN001, ANN202 - numba kernel, scalars
+def _before(crossing, axis, time, by):
     return crossing < time or (crossing == time and axis < by)
 
 
 @numba.njit(cache=True)
-def _earliest(tx, ty, tz):  # noqa: ANN001, ANN202 - numba kernel, scalars; the axis
+def _earliest(tx, ty, tz):
     if tx <= ty:
         return 0 if tx <= tz else 2
     return 1 if ty <= tz else 2
 
 
 @numba.njit(cache=True)
-def _entry(low, high, position, direction, inverse):  # noqa: ANN001, ANN202 - numba kernel, scalars in voxels
+def _entry(low, high, position, direction, inverse):
     """When a ray comes between low and high: -1 = it starts there, infinity = never."""
     start = np.floor(position)
     if low <= start < high:
@@ -82,7 +82,7 @@ def _entry(low, high, position, direction, inverse):  # noqa: ANN001, ANN202 - n
 
 
 @numba.njit(cache=True, inline="always")
-def _hit(shapes, ray, voxel, x, y, z):  # noqa: ANN001, ANN202 - numba kernel
+def _hit(shapes, ray, voxel, x, y, z):
     """Range in voxels, infinity = none, and |cosine| of the nearer patch of a voxel at x, y, z; shapes as in `Patches`."""
     px, py, pz = ray.px - x, ray.py - y, ray.pz - z
     nearest, incidence = np.inf, 0.0
@@ -106,7 +106,7 @@ def _hit(shapes, ray, voxel, x, y, z):  # noqa: ANN001, ANN202 - numba kernel
 
 
 @numba.njit(cache=True, inline="always")
-def _walk(grid, ray, slot, bx, by, bz, time, side):  # noqa: ANN001, ANN202 - numba kernel
+def _walk(grid, ray, slot, bx, by, bz, time, side):
     """First hit inside a block, which the ray enters at `time` by a face of axis `side` (-1 = it starts inside)."""
     x = _locate(0, ray.px, ray.dx, ray.ix, time, side) if side != 0 else bx * BLOCK + (0 if ray.dx > 0 else BLOCK - 1)
     y = _locate(1, ray.py, ray.dy, ray.iy, time, side) if side != 1 else by * BLOCK + (0 if ray.dy > 0 else BLOCK - 1)
@@ -134,7 +134,7 @@ def _walk(grid, ray, slot, bx, by, bz, time, side):  # noqa: ANN001, ANN202 - nu
 
 
 @numba.njit(cache=True, inline="always")
-def _trace(grid, ray):  # noqa: ANN001, ANN202 - numba kernel
+def _trace(grid, ray):
     """First hit of a ray: range in voxels, infinity = none, and |cosine|."""
     lx, ly, lz = grid.low[0], grid.low[1], grid.low[2]
     hx, hy, hz = grid.high[0], grid.high[1], grid.high[2]
@@ -176,13 +176,13 @@ def _trace(grid, ray):  # noqa: ANN001, ANN202 - numba kernel
 
 
 @numba.njit(cache=True)
-def _ray(start, x, y, z):  # noqa: ANN001, ANN202 - numba kernel
+def _ray(start, x, y, z):
     x, y, z = x if abs(x) >= STILL else 0.0, y if abs(y) >= STILL else 0.0, z if abs(z) >= STILL else 0.0
     return Ray(start[0], start[1], start[2], x, y, z, 1 / x if x != 0 else NEVER, 1 / y if y != 0 else NEVER, 1 / z if z != 0 else NEVER)
 
 
 @numba.njit(parallel=True, cache=True)
-def cast_rays(directions, cam_from_world, start, voxel_size, grid, result):  # noqa: ANN001, ANN201 - numba kernel
+def cast_rays(directions, cam_from_world, start, voxel_size, grid, result):
     """Fill result (2, K): range in world units and |cosine| of the first hit along directions (K, 3), camera frame; start: (3,) voxels of the grid."""
     for k in numba.prange(len(directions)):
         x, y, z = np.float64(directions[k, 0]), np.float64(directions[k, 1]), np.float64(directions[k, 2])

@@ -152,7 +152,7 @@ def normal_sides(normals: np.ndarray, sorting: VoxelOrder) -> tuple[np.ndarray, 
 
 
 @numba.njit(parallel=True, cache=True)
-def _pack(points, origin, voxel_size):  # noqa: ANN001, ANN202 - numba kernel, arrays as in voxel_keys
+def _pack(points, origin, voxel_size):
     keys = np.empty(len(points), np.int64)
     for row in numba.prange(len(points)):
         x = np.int64(np.floor((points[row, 0] - origin[0]) / voxel_size))
@@ -174,7 +174,7 @@ def _unpack(blocks: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(parallel=True, cache=True)
-def _split_sides(normals, order, starts, sides, flat):  # noqa: ANN001, ANN202 - numba kernel, arrays as in normal_sides
+def _split_sides(normals, order, starts, sides, flat):
     for voxel in numba.prange(len(starts) - 1):
         xx = xy = xz = yy = yz = zz = 0  # integers: the sums do not depend on the order of the points
         for k in range(starts[voxel], starts[voxel + 1]):
@@ -194,7 +194,7 @@ def _split_sides(normals, order, starts, sides, flat):  # noqa: ANN001, ANN202 -
 
 
 @numba.njit(cache=True)
-def main_axis(xx, xy, xz, yy, yz, zz):  # noqa: ANN001, ANN201 - numba kernel, scalars
+def main_axis(xx, xy, xz, yy, yz, zz):
     """Largest eigenvector of a symmetric positive 3 x 3 matrix, given by its upper half; its largest component is positive.
 
     Squared 6 times, the matrix is the projector on it up to the 64th power of the eigenvalues' ratio.

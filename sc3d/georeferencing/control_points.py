@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pycolmap
 
-from sc3d.georeferencing.alignment import Similarity, fit_similarity, fit_similarity_robust
 from sc3d.errors import InputError
+from sc3d.georeferencing.alignment import Similarity, fit_similarity, fit_similarity_robust
 from sc3d.georeferencing.georeference import crs_to_geodetic, geodetic_to_enu
 
 if TYPE_CHECKING:

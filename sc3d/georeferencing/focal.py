@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sc3d.io.images import open_image
 from sc3d.georeferencing.geotags import read_dji_xmp
 from sc3d.georeferencing.gps import Flight
+from sc3d.io.images import open_image
 
 logger = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io import read_json, write_json
+from sc3d.io.json_files import read_json, write_json
 
 if TYPE_CHECKING:
     import pyproj

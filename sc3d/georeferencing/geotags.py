@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.io.images import open_image
 from sc3d.georeferencing.georeference import geodetic_to_enu
+from sc3d.io.images import open_image
 
 STANDARD_DEVIATION = (1.0, 1.0, 1.0)  # m, of GPS that states none: what positions of one flight are worth against one another
 SMALLEST_DEVIATION = 0.05  # m; RTK states the antenna's, but shutter and antenna are neither at one time nor in one place

@@ -9,8 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.georeferencing.alignment import Similarity, fit_similarity_robust, flight_shape, main_plane, roll_upright
-from sc3d.georeferencing.georeference import Georeference, crs_to_geodetic, enu_to_geodetic, from_origin, utm_epsg
+from sc3d.georeferencing.alignment import (
+    Similarity,
+    fit_similarity_robust,
+    flight_shape,
+    main_plane,
+    roll_upright,
+)
+from sc3d.georeferencing.georeference import (
+    Georeference,
+    crs_to_geodetic,
+    enu_to_geodetic,
+    from_origin,
+    utm_epsg,
+)
 from sc3d.georeferencing.geotags import Geotag, enu_positions, read_geotags
 
 logger = logging.getLogger(__name__)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.las import check_las
-from sc3d.io import read_cloud, read_mesh
 
 if TYPE_CHECKING:
     import laspy

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sc3d.io.colmap import load_model
 from sc3d.geometry.cameras import View
 from sc3d.importers.project import Project
-from sc3d.settings import Import
+from sc3d.io.colmap import load_model
+from sc3d.settings.reconstruction import Import
 
 EXPECTED = "a folder with cameras.bin or cameras.txt, or one in which sparse/0 or sparse is such a folder, is expected"
 

@@ -16,13 +16,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pyproj
 
-from sc3d.georeferencing.alignment import Similarity, fit_similarity
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.georeferencing.georeference import Georeference, crs_to_geodetic, from_origin, geodetic_to_enu
 from sc3d.geometry.distortion import Lens, to_camera
+from sc3d.georeferencing.alignment import Similarity, fit_similarity
+from sc3d.georeferencing.georeference import Georeference, crs_to_geodetic, from_origin, geodetic_to_enu
 from sc3d.importers.project import Project, rigid
-from sc3d.settings import Import
+from sc3d.settings.reconstruction import Import
 
 logger = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ def read(path: Path, settings: Import) -> Project:
 
 def _chunk(path: Path) -> ElementTree.Element:
     try:
-        root = ElementTree.parse(path, ElementTree.XMLParser(target=_Builder())).getroot()  # noqa: S314 - document types are refused
+        root = ElementTree.parse(path, ElementTree.XMLParser(target=_Builder())).getroot()
     except (ElementTree.ParseError, LookupError, ValueError) as error:
         raise InputError(f"{path} is not valid XML ({error})") from None
     chunks = [root] if root.tag == "chunk" else list(root.iter("chunk"))

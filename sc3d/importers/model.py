@@ -9,7 +9,7 @@ import pycolmap
 
 from sc3d.geometry.cameras import View, in_image, project
 from sc3d.importers.project import Project
-from sc3d.io import atomic_path
+from sc3d.io.atomic import atomic_path
 
 MAX_POINTS = 100_000  # sparse points that are made from a cloud
 CELLS = 64  # along the longer side of a photo: where tracks are guessed, the nearest points of a cell are seen

@@ -15,8 +15,10 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import Lens, to_camera
 from sc3d.importers.project import Project, rigid
-from sc3d.io import image_size, read_cloud, read_json
-from sc3d.settings import Import
+from sc3d.io.clouds import read_cloud
+from sc3d.io.images import image_size
+from sc3d.io.json_files import read_json
+from sc3d.settings.reconstruction import Import
 
 EXPECTED = "a transforms.json or its folder is expected"
 FILE = "transforms.json"

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sc3d.georeferencing.control_points import parse_crs
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.georeferencing.georeference import Georeference, from_origin
 from sc3d.geometry.distortion import Lens, to_camera
+from sc3d.georeferencing.control_points import parse_crs
+from sc3d.georeferencing.georeference import Georeference, from_origin
 from sc3d.importers.project import Project, rigid
-from sc3d.io import read_json
-from sc3d.settings import Import
+from sc3d.io.json_files import read_json
+from sc3d.settings.reconstruction import Import
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.importers.project import Project
-from sc3d.io import find_photos, image_size
+from sc3d.io.images import find_photos, image_size
 
 
 def locate_photos(project: Project, folder: Path | None) -> tuple[Project, Path | None]:

@@ -13,10 +13,10 @@ import pyproj
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.georeferencing.georeference import Georeference
 from sc3d.geometry.distortion import Lens, to_camera
+from sc3d.georeferencing.georeference import Georeference
 from sc3d.importers.project import Project, rigid
-from sc3d.settings import Import
+from sc3d.settings.reconstruction import Import
 
 logger = logging.getLogger(__name__)
 

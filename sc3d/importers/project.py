@@ -11,11 +11,11 @@ import numpy as np
 import pycolmap
 
 from sc3d.errors import InputError
-from sc3d.io.limits import FARTHEST
 from sc3d.geometry.cameras import View
 from sc3d.georeferencing.georeference import Georeference, read_georeference
+from sc3d.io.limits import FARTHEST
 from sc3d.scene.scene import Scene
-from sc3d.settings import Import
+from sc3d.settings.reconstruction import Import
 
 PROGRAMS = ("nerfstudio", "opensfm", "odm", "metashape", "pix4d", "colmap")  # in the order in which they are tried
 MODULES = {"odm": "opensfm"}

@@ -171,3 +171,10 @@ def _sync_one(path: Path) -> None:
             raise
     finally:
         os.close(handle)
+
+
+def require_writable(folder: Path) -> None:
+    """Raise InputError, before any work, if a scene folder cannot be written."""
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK, effective_ids=True):
+        raise InputError(f"cannot write to {existing}: check its permissions or choose another folder")

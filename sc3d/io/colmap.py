@@ -17,8 +17,7 @@ import numpy as np
 import pycolmap
 
 from sc3d.errors import InputError
-from sc3d.io.limits import FARTHEST
-from sc3d.io.images import MAX_PIXELS, MAX_SIDE
+from sc3d.io.limits import FARTHEST, MAX_PIXELS, MAX_SIDE
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")  # rigs and frames only in newer models
 LARGEST = 1 << 62  # count of a list: bounded by the size of the file alone

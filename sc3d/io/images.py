@@ -11,7 +11,11 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from sc3d.errors import InputError
+from sc3d.io.atomic import atomic_path
+from sc3d.io.limits import MAX_PIXELS, MAX_SIDE
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -19,8 +23,6 @@ if TYPE_CHECKING:
     from PIL import Image
 
 FORMATS = ("JPEG", "PNG", "TIFF")  # JPEG holds MPO as well; Pillow knows many more, of which one runs a program
-MAX_PIXELS = 160_000_000  # the largest cameras of drones have 151 megapixels; what a few bytes can announce must fit into the memory
-MAX_SIDE = 100_000
 END_OF_IMAGE, START_OF_SCAN = b"\xff\xd9", 0xDA
 
 
@@ -80,3 +82,74 @@ def _find_scan(data: mmap.mmap) -> int:
             continue
         position += 2 + struct.unpack_from(">H", data, position + 2)[0]
     return -1
+IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """Photos of a folder and its subfolders, by name; InputError if there are none, two share a stem, or one is a link that leads elsewhere."""
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder: give the folder that holds the photos")
+    photos = sorted(file for file in folder.rglob("*") if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".") and file.is_file())
+    if not photos:
+        raise InputError(f"no photos in {folder}: JPEG, PNG or TIFF files are expected")
+    by_stem: dict[str, Path] = {}
+    for photo in photos:
+        other = by_stem.setdefault(photo.stem, photo)
+        if other is not photo:
+            raise InputError(f"{other} and {photo} share the name {photo.stem!r}, by which masks are found: rename one")
+        require_within(photo, folder)
+    return photos
+
+
+def require_within(file: Path, folder: Path) -> None:
+    """InputError if a file of a folder is a link to a file outside of it; the folder itself may be a link."""
+    if not file.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"{file} is a link that leads out of {folder}: copy the file there, or make the whole folder a link")
+
+
+def read_image(path: Path) -> np.ndarray:
+    """(H, W, 3) uint8 RGB, as stored (EXIF orientation is not applied, as in COLMAP); InputError if it is damaged, cut off or too large."""
+    import cv2
+
+    check_photo(path)
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise InputError(f"cannot read the photo {path}: it is missing, damaged or not an image")
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def check_photo(path: Path) -> tuple[int, int]:
+    """(width, height) of a photo whose header can be read and that is not cut off; InputError for any other."""
+    size = image_size(path)
+    check_end(path)
+    return size
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) from the header; InputError if the file is not an image, or too large a one."""
+    with open_image(path) as image:
+        return image.size
+
+
+def read_index_image(path: Path) -> np.ndarray:
+    """(H, W) uint8 of a grey or palette PNG (labels or confidence)."""
+    with open_image(path, "mask") as image:
+        if image.mode.startswith("I"):
+            raise InputError(f"{path} has 16 bits per pixel: an 8-bit PNG with one id per pixel is expected")
+        if image.mode not in ("L", "P", "1"):
+            raise InputError(f"{path} has colours ({image.mode}): an 8-bit PNG with one id per pixel is expected")
+        return np.array(image.convert("L") if image.mode == "1" else image, dtype=np.uint8)
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Write (H, W) or (H, W, 3) uint8 RGB; the suffix chooses the format."""
+    import cv2
+
+    done, encoded = cv2.imencode(path.suffix, image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
+    if not done:
+        raise OSError(f"could not encode {path}")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encoded)  # not by cv2.imwrite, which does not always notice that a disk is full

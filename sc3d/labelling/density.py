@@ -63,7 +63,7 @@ def voxel_shares(density: np.ndarray, sorting: VoxelOrder) -> np.ndarray:
 
 
 @numba.njit(parallel=True, cache=True)
-def _around_mean(points, order, starts, voxel_size, result):  # noqa: ANN001, ANN202 - numba kernel, arrays as in VoxelOrder
+def _around_mean(points, order, starts, voxel_size, result):
     for voxel in numba.prange(len(starts) - 1):
         first = order[starts[voxel]]
         count = starts[voxel + 1] - starts[voxel]

@@ -17,14 +17,13 @@ from tqdm import tqdm
 from sc3d.geometry.cameras import View, may_see
 from sc3d.geometry.raycast import RayTarget, first_surface
 from sc3d.geometry.voxels import VoxelField, voxel_origin
-from sc3d.settings import Label
 from sc3d.labelling.voting import Ballot, open_ballot
 from sc3d.labelling.voting_kernels import SCALE, Picture, Rules
+from sc3d.scene.labels import LOCKED, SEED, UNLOCKED, UNSEEN, Labels
+from sc3d.settings.labels import Label
 
-UNSEEN, SEED, LOCKED, PROPAGATED, UNLOCKED = range(5)  # `state` of a point
 DISTANCE_STEPS = 16  # of a pixel
 MIDDLE_STEPS = 1 << 16
-STATE_NAMES = ("unseen", "seed", "locked", "propagated", "unlocked")
 
 AS_PRINTED = {  # the paper's own choices, whatever the defaults are
     "consensus": 1.0, "edge_width": 3.0, "depth_excess": True, "incidence": True, "range": True, "verify": "lock", "reproject": True,
@@ -65,16 +64,6 @@ class Cloud:
     @property
     def extent(self) -> Extent:
         return self.whole or Extent.of(self.points)
-
-
-@dataclass(frozen=True)
-class Labels:
-    """One entry per point: label uint8 (0 = none), confidence float32 in [0, 1], state uint8, num_views int32."""
-
-    label: np.ndarray
-    confidence: np.ndarray
-    state: np.ndarray
-    num_views: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -174,7 +163,7 @@ def distance_weights(width: float) -> np.ndarray:
 
 
 @numba.njit(parallel=True, cache=True)
-def weigh_distance(distance, table, weights):  # noqa: ANN001, ANN201 - numba kernel
+def weigh_distance(distance, table, weights):
     """Multiply weights (H, W) float32 by the table's entry for each distance (H, W) float32, px; exponentials of all pixels would cost 5 times as much."""
     for row in numba.prange(distance.shape[0]):
         for column in range(distance.shape[1]):

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 
-from sc3d.labelling.density import GaussianField, gaussian_density, kernel_density
 from sc3d.errors import InputError
-from sc3d.labelling.fusion import Mask
 from sc3d.geometry.cameras import View
-from sc3d.io import image_size, read_cloud, read_index_image
+from sc3d.io.clouds import read_cloud
+from sc3d.io.images import image_size, read_index_image
+from sc3d.labelling.density import GaussianField, gaussian_density, kernel_density
+from sc3d.labelling.fusion import Mask
 from sc3d.scene.labelled_cloud import spacing_of
 from sc3d.scene.scene import Scene
-
 
 FOOTPRINT_SAMPLE = 1000
 
@@ -79,7 +79,7 @@ def point_density(scene: Scene, points: np.ndarray, voxel_size: float, origin: n
     """(N,) density of the Gaussians at the points, or of the points themselves where there are none; origin: (3,) of the label voxels, None = the points' own."""
     if not scene.gaussians.exists():
         return kernel_density(points, voxel_size, origin)
-    from sc3d.view.splat_images import load_gaussians  # loads torch
+    from sc3d.splatting.dataset import load_gaussians  # loads torch
 
     gaussians, origin = load_gaussians(scene)
     rotations, scales, opacities = (values.numpy() for values in (gaussians.rotations, gaussians.scales, gaussians.opacities))

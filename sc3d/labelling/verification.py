@@ -75,7 +75,7 @@ def neighbor_blocks(keys: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _reliability(cells, labels, weights, winner, block_of_cell, neighbors, prior):  # noqa: ANN001, ANN202 - numba kernel
+def _reliability(cells, labels, weights, winner, block_of_cell, neighbors, prior):
     """(B,) share of the view's votes in and around each block that agree with the winners; integer sums, so no order matters."""
     sums = np.zeros((len(neighbors), 2), np.int64)
     for k in range(len(cells)):
@@ -98,7 +98,7 @@ def _reliability(cells, labels, weights, winner, block_of_cell, neighbors, prior
 
 
 @numba.njit(cache=True)
-def _add(cells, labels, weights, winner, reliability, votes, balance):  # noqa: ANN001, ANN202 - numba kernel
+def _add(cells, labels, weights, winner, reliability, votes, balance):
     """Add a view's votes (channel `label`) and whether it is reliable where it voted for the winner (balance)."""
     for k in range(len(cells)):
         trusted = max(reliability[k], MIN_RELIABILITY)

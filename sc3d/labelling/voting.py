@@ -11,9 +11,9 @@ from typing import NamedTuple, Protocol
 import numba
 import numpy as np
 
-from sc3d.labelling.density import voxel_shares
 from sc3d.geometry.cameras import View, opencv_parameters, project
 from sc3d.geometry.voxels import SIDES, VOXELS, VoxelField, VoxelOrder, normal_sides, sort_by_voxel
+from sc3d.labelling.density import voxel_shares
 from sc3d.labelling.verification import Places, VoteLog, neighbor_blocks, verify
 from sc3d.labelling.voting_kernels import SCALE, Lens, Picture, Rules, SortedCloud, cast_votes
 
@@ -117,7 +117,7 @@ def _cells(sorting: VoxelOrder, normals: np.ndarray | None, field: VoxelField) -
 
 
 @numba.njit(parallel=True, cache=True)
-def _partition(order, starts, sides, result, counts):  # noqa: ANN001, ANN202 - numba kernel
+def _partition(order, starts, sides, result, counts):
     """Within each voxel, points of side 0 before those of side 1."""
     for voxel in numba.prange(len(starts) - 1):
         at = starts[voxel]
@@ -131,7 +131,7 @@ def _partition(order, starts, sides, result, counts):  # noqa: ANN001, ANN202 - 
 
 
 @numba.njit(parallel=True, cache=True)
-def _bound(points, cells, blocks, centres, radii):  # noqa: ANN001, ANN202 - numba kernel, arrays as in SortedCloud
+def _bound(points, cells, blocks, centres, radii):
     for block in numba.prange(len(blocks) - 1):
         first, last = cells[blocks[block]], cells[blocks[block + 1]]
         squared = 0.0

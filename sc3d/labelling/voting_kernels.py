@@ -83,7 +83,7 @@ class Rules(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def to_camera(lens, x, y, z):  # noqa: ANN001, ANN201 - numba kernel, scalars
+def to_camera(lens, x, y, z):
     """Camera frame of a world position."""
     pose = lens.cam_from_world
     return (
@@ -94,7 +94,7 @@ def to_camera(lens, x, y, z):  # noqa: ANN001, ANN201 - numba kernel, scalars
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def to_pixel(parameters, x, y, z):  # noqa: ANN001, ANN201 - numba kernel, scalars
+def to_pixel(parameters, x, y, z):
     """Pixel of a position in the camera frame, z > 0, by COLMAP's OPENCV model."""
     u, v = x / z, y / z
     k1, k2, p1, p2 = parameters[4], parameters[5], parameters[6], parameters[7]
@@ -106,7 +106,7 @@ def to_pixel(parameters, x, y, z):  # noqa: ANN001, ANN201 - numba kernel, scala
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _in_frustum(lens, centre, radius):  # noqa: ANN001, ANN202 - numba kernel
+def _in_frustum(lens, centre, radius):
     """Whether a sphere may reach into the pyramid that holds the image."""
     x, y, z = to_camera(lens, centre[0], centre[1], centre[2])
     inside = True
@@ -116,7 +116,7 @@ def _in_frustum(lens, centre, radius):  # noqa: ANN001, ANN202 - numba kernel
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _see(cloud, lens, picture, rules, cell, point):  # noqa: ANN001, ANN202 - numba kernel
+def _see(cloud, lens, picture, rules, cell, point):
     """Row (-1 = not seen), column, weight and whether the sighting is strict, of one point."""
     nothing = -1, -1, 0.0, False
     x, y, z = cloud.points[point, 0], cloud.points[point, 1], cloud.points[point, 2]
@@ -154,7 +154,7 @@ def _see(cloud, lens, picture, rules, cell, point):  # noqa: ANN001, ANN202 - nu
 
 
 @numba.njit(parallel=True, cache=True, error_model="numpy")
-def cast_votes(cloud, lens, picture, rules, votes, strict, overlay, said_labels, said_weights):  # noqa: ANN001, ANN202 - numba kernel, arrays as in Ballot
+def cast_votes(cloud, lens, picture, rules, votes, strict, overlay, said_labels, said_weights):
     num_ids = votes.shape[1]
     for block in numba.prange(len(cloud.blocks) - 1):
         if not _in_frustum(lens, cloud.centres[block], cloud.radii[block]):
@@ -182,7 +182,7 @@ def cast_votes(cloud, lens, picture, rules, votes, strict, overlay, said_labels,
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _add_mean(sums, which, count, votes, cell):  # noqa: ANN001, ANN202 - numba kernel
+def _add_mean(sums, which, count, votes, cell):
     """Add a view's mean sighting, row `which` of the sums, to a cell's votes and clear it; returns the label with the most weight, and that weight."""
     votes[cell, 0] += 1
     best = most = 0

@@ -60,7 +60,7 @@ def softmax(values: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, field):  # noqa: ANN001, ANN202 - fills field (C,)
+def _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, field):
     for c in range(len(field)):
         field[c] = 0
     for edge in range(starts[i], starts[i + 1]):
@@ -80,13 +80,13 @@ def _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, f
 
 
 @numba.njit(cache=True, parallel=True)
-def _step(starts, neighbors, weights, log_likelihood, smoothness, belief, result):  # noqa: ANN001, ANN202 - see mean_field
+def _step(starts, neighbors, weights, log_likelihood, smoothness, belief, result):
     for i in numba.prange(len(starts) - 1):
         _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, result[i])
 
 
 @numba.njit(cache=True)
-def _sweep(starts, neighbors, weights, log_likelihood, smoothness, belief):  # noqa: ANN001, ANN202 - see mean_field_sequential
+def _sweep(starts, neighbors, weights, log_likelihood, smoothness, belief):
     field = np.empty(belief.shape[1], np.float32)
     for i in range(len(starts) - 1):
         _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, field)

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from sc3d.labelling.fusion import LOCKED, PROPAGATED, SEED, UNLOCKED, Labels
 from sc3d.geometry.graph import Graph, build_graph
-from sc3d.propagation.region_growing import grow, vote_nearest
-from sc3d.propagation.potts import mean_field, softmax
 from sc3d.propagation.appearance import MIN_EXAMPLES, MIN_SKILL, Lesson, Raters, folds_of, skill_of
+from sc3d.propagation.potts import mean_field, softmax
+from sc3d.propagation.region_growing import grow, vote_nearest
 from sc3d.propagation.terrain import relief_features
-from sc3d.settings import Propagate
+from sc3d.scene.labels import LOCKED, PROPAGATED, SEED, UNLOCKED, Labels
+from sc3d.settings.labels import Propagate
 
 logger = logging.getLogger(__name__)
 
@@ -225,7 +225,7 @@ def reachable(graph: Graph, start: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def _flood(starts, neighbors, reached):  # noqa: ANN001, ANN202 - see reachable; changes and returns `reached` (N,) bool
+def _flood(starts, neighbors, reached):
     stack = np.empty(len(reached), np.int64)
     size = 0
     for i in range(len(reached)):

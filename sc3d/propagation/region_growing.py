@@ -46,7 +46,7 @@ def vote_rows(graph: Graph, rows: np.ndarray, label: np.ndarray, num_ids: int) -
 
 
 @numba.njit(cache=True, parallel=True)
-def _vote(starts, neighbors, weights, rows, label, num_ids, best, share):  # noqa: ANN001, ANN202 - see vote_rows
+def _vote(starts, neighbors, weights, rows, label, num_ids, best, share):
     for row in numba.prange(len(rows)):
         votes, total = np.zeros(num_ids, np.float32), np.float32(0)
         for edge in range(starts[rows[row]], starts[rows[row] + 1]):

@@ -8,7 +8,7 @@ import string
 from importlib import resources
 from pathlib import Path
 
-from sc3d.io import atomic_path
+from sc3d.io.atomic import atomic_path
 from sc3d.report.data import gather
 from sc3d.report.sections import headline, sections, summary_line
 from sc3d.scene.scene import Scene

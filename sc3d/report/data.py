@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
-from sc3d.io import read_cloud, read_json, read_mesh
+from sc3d.io.clouds import read_cloud, read_mesh
+from sc3d.io.json_files import read_json
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 
 if TYPE_CHECKING:

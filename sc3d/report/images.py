@@ -13,10 +13,12 @@ import numpy as np
 
 from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View
-from sc3d.io import read_image, read_index_image
+from sc3d.io.images import read_image, read_index_image
 from sc3d.report.data import Material
 from sc3d.scene.labelled_cloud import LabelledSurface
-from sc3d.view import COLOURINGS, Style, color_points, draw_points, screenshot
+from sc3d.view import screenshot
+from sc3d.view.colors import COLOURINGS, color_points
+from sc3d.view.screenshot import Style, draw_points
 
 logger = logging.getLogger(__name__)
 

@@ -8,16 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.io import read_image
+from sc3d.io.images import read_image
 from sc3d.report.certainty import certainty_section
 from sc3d.report.charts import css_color, flight_map, number, paired_bars
-from sc3d.report.objects import found_section, iou_of
-from sc3d.report.images import cloud_pictures, comparison, ground_picture, jpeg
 from sc3d.report.data import Material
+from sc3d.report.images import cloud_pictures, comparison, ground_picture, jpeg
+from sc3d.report.objects import found_section, iou_of
 from sc3d.report.processing import processing_section
 from sc3d.scene.labelled_cloud import LabelledSurface
-from sc3d.view import color_points
-from sc3d.view.colors import confidence_colors, legend_entries
+from sc3d.view.colors import color_points, confidence_colors, legend_entries
 
 _NUM_PHOTOS = 4
 _COLOURING_NAMES = {"label": "Classes", "photo": "Photo colours", "confidence": "Confidence", "state": "Origin of the label", "mesh": "Mesh"}

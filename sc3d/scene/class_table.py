@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io import read_json
+from sc3d.io.json_files import read_json
 
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # in names: they would act on terminals, or cannot be written
 MAX_NAME, MAX_BYTES = 200, 1 << 20

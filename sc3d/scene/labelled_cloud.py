@@ -10,12 +10,12 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.labelling.fusion import STATE_NAMES, Labels
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, orient_normals, point_spacing
 from sc3d.geometry.raycast import FirstSurface, RayTarget, Surface, first_surface, nearest_points
 from sc3d.geometry.voxel_traversal import VoxelSurface
-from sc3d.io import read_cloud, read_mesh
+from sc3d.io.clouds import read_cloud, read_mesh
+from sc3d.scene.labels import STATE_NAMES, Labels
 
 NORMAL_NEIGHBORS = 30
 SPACING_SAMPLE, SPACING_NEIGHBORS = 100_000, 8

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.scene.class_table import CONTROL, ClassTable, read_classes
 from sc3d.errors import InputError
+from sc3d.io.images import check_photo, find_photos, image_size, read_index_image, require_within
 from sc3d.io.limits import FARTHEST
-from sc3d.io import check_photo, find_photos, image_size, read_index_image, require_within
-
+from sc3d.scene.class_table import CONTROL, ClassTable, read_classes
 
 MAX_MASK = 100_000_000  # pixels of a mask that is larger than its photo
 
@@ -147,8 +146,8 @@ def read_sparse_model(path: Path) -> SparseModel:
     """Read a COLMAP model, binary or text; InputError if it is missing, broken or names photos outside the scene."""
     import pycolmap
 
-    from sc3d.io.colmap import load_model
     from sc3d.geometry.cameras import View
+    from sc3d.io.colmap import load_model
 
     reconstruction = load_model(path)
     images = sorted((reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()), key=lambda image: image.name)

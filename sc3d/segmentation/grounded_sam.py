@@ -8,18 +8,26 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
-from sc3d.io import read_json
+from sc3d.io.json_files import read_json
+from sc3d.scene.class_table import ClassTable
 from sc3d.segmentation.instances import Instance
 from sc3d.segmentation.models import (
-    IMAGENET, check_packages, check_settings, choose_device, inference, load_model, load_tokenizer, outline, to_pixels,
+    IMAGENET,
+    check_packages,
+    check_settings,
+    choose_device,
+    inference,
+    load_model,
+    load_tokenizer,
+    outline,
+    to_pixels,
 )
-from sc3d.segmentation.text_prompts import Caption, Prompt, build_captions, list_prompts, match_prompts
 from sc3d.segmentation.segment import Segmentation
+from sc3d.segmentation.text_prompts import Caption, Prompt, build_captions, list_prompts, match_prompts
 from sc3d.segmentation.tiled_inference import Findings, segment_tiled
 from sc3d.segmentation.weights import find_weights, model_type
-from sc3d.settings import Segment
+from sc3d.settings.labels import Segment
 
 if TYPE_CHECKING:
     import torch

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sc3d.io.json_files import write_json
 from sc3d.scene.class_table import ClassTable
-from sc3d.io import write_json
 from sc3d.segmentation.rle import Window, area, bounds, encode_runs, find_runs, iou, move_runs
 
 SAME_OBJECT = 0.5  # two masks of one class with a larger intersection over union are one object

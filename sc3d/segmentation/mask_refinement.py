@@ -9,16 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm import tqdm
 
-from sc3d.labelling.fusion import Cloud, Labels, Mask, fuse
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex
-from sc3d.scene.labelled_cloud import REACH, LabelledSurface, point_arrays, read_surface, spacing_of
+from sc3d.labelling.fusion import Cloud, Mask, fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size, read_given_cloud
 from sc3d.metrics import Confusion, total
-from sc3d.propagation import Evidence
 from sc3d.propagation import propagate as complete
+from sc3d.propagation.propagate import Evidence
+from sc3d.scene.labelled_cloud import REACH, LabelledSurface, point_arrays, read_surface, spacing_of
+from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
-from sc3d.settings import Label, Propagate
+from sc3d.settings.labels import Label, Propagate
 
 logger = logging.getLogger(__name__)
 

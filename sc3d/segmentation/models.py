@@ -12,7 +12,7 @@ import numpy as np
 from sc3d.errors import InputError, MissingPackageError
 from sc3d.segmentation.rle import find_runs
 from sc3d.segmentation.weights import model_type
-from sc3d.settings import Segment
+from sc3d.settings.labels import Segment
 
 if TYPE_CHECKING:
     import torch
@@ -102,7 +102,7 @@ def load_model(path: Path, classes: dict[str, str], device: str) -> torch.nn.Mod
     return model.to(device).eval()
 
 
-def load_tokenizer(path: Path, name: str):  # noqa: ANN201 - a transformers tokenizer
+def load_tokenizer(path: Path, name: str):
     """Load the tokenizer in a model's folder by the name of its class in transformers; InputError if it is missing or damaged."""
     import transformers
 

@@ -8,9 +8,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
-from sc3d.io import image_size, read_image, write_image
+from sc3d.io.images import image_size, read_image, write_image
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import check_mask_aspect
 from sc3d.segmentation.instances import Instance, write_instances
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
+from sc3d.scene.class_table import ClassTable
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ import numpy as np
 
 from sc3d.segmentation.instances import SAME_OBJECT, Instance, candidates, drop_duplicates, move, useful
 from sc3d.segmentation.merge import Areas, fill_gaps, merge_instances, paint_areas
-from sc3d.segmentation.segment import Segmentation
 from sc3d.segmentation.rle import Window, clip_runs, cut_runs, iou, join_runs
+from sc3d.segmentation.segment import Segmentation
 
 
 class Findings(NamedTuple):

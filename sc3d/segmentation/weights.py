@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from sc3d.errors import InputError
-from sc3d.io import read_json
+from sc3d.io.json_files import read_json
 
 # Only data: no pickles (*.bin, *.pt), no code (*.py).
 _FILES = ["*.json", "*.txt", "*.safetensors"]

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
 
 from sc3d.errors import InputError
 
 
 @dataclass(frozen=True)
-class SynthesizeSettings:
+class Synthesize:
     """What the synthetic scene looks like and how it is photographed."""
 
     seed: int = 0
@@ -40,3 +44,20 @@ class SynthesizeSettings:
     def height(self) -> int:
         """Height of the photos, px."""
         return round(self.width * 534 / 800)
+
+
+@dataclass(frozen=True)
+class SynthesizeCity:
+    """Make a synthetic city to measure on: sites of the generator side by side, with cloud, mesh, cameras, masks and truth, but without photos."""
+
+    scene: Annotated[Positional[Path], arg(help="Scene folder to write; it must not exist, or be empty.")]
+    sites: tuple[int, int] = (6, 5)
+    """Sites from west to east and from south to north, each of 120 m by 120 m."""
+    points_per_site: int = 1_000_000
+    """Points of the cloud on each site."""
+    views: int = 200
+    """Number of views over the whole city: 60 % look straight down, the others obliquely from the four sides."""
+    width: int = 1600
+    """Width of the masks, px; the height follows at 3:2."""
+    seed: int = 0
+    """Fixes the city, the flight and the mask errors."""

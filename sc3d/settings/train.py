@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from sc3d.errors import InputError
+from sc3d.settings.common import Workers
 
 
 @dataclass(frozen=True)
@@ -122,3 +123,22 @@ class TrainSettings:
     def shapes_surface(self, iteration: int) -> bool:
         """Whether the normal and multi-view terms apply."""
         return not self.plain and iteration >= max(self.surface_from, self.coarse_until) * self.iterations
+
+
+@dataclass(frozen=True)
+class Train(Workers, TrainSettings):
+    """Gaussian training. Times are fractions of the run, so that a short run goes through all phases of a long one."""
+
+    blocks: int = 0
+    """cut the ground into so many blocks, which are trained one by one, or side by side on --workers or --cluster, in the memory of a block, and
+    merged; each takes its share of iterations and max_gaussians; 0 = train everything at once"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.blocks < 0 or self.workers < 0:
+            raise InputError("blocks and workers must not be negative")
+
+    @property
+    def training(self) -> TrainSettings:
+        """What decides the result of one training."""
+        return TrainSettings(**{field.name: getattr(self, field.name) for field in fields(TrainSettings)})

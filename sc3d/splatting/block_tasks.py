@@ -17,13 +17,13 @@ import numpy as np
 import torch
 
 from sc3d.errors import InputError
-from sc3d.io import read_json, write_json
+from sc3d.io.json_files import read_json, write_json
 from sc3d.scene.scene import Scene
+from sc3d.settings.train import TrainSettings
 from sc3d.splatting.blocks import MIN_POINTS, Block, merge, restrict, share_settings, views_of
 from sc3d.splatting.dataset import TrainingData, scene_data
 from sc3d.splatting.evaluation import held_out_scores
 from sc3d.splatting.gaussians import Gaussians
-from sc3d.settings.train import TrainSettings
 from sc3d.splatting.train import TrainResult, train
 from sc3d.tiling.executor import Tasks
 

@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, project
+from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.gaussians import Gaussians
-from sc3d.settings.train import TrainSettings
 
 BORDER = 0.125  # of a block's side, on each side
 SHARE = 0.05  # of the sparse points that a photo sees, or of those in the block: fewer, and the photo is not worth its time

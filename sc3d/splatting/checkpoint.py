@@ -7,8 +7,8 @@ from dataclasses import fields
 import torch
 
 from sc3d.geometry.cameras import View
-from sc3d.splatting.strategy import Statistics
 from sc3d.splatting.gaussians import Gaussians
+from sc3d.splatting.strategy import Statistics
 
 
 def check_state(state: dict, parameters: dict[str, torch.Tensor], views: list[View], path: str) -> None:

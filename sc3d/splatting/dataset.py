@@ -12,9 +12,10 @@ import torch
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, local_origin, project, resample, undistorted
-from sc3d.io import read_image
+from sc3d.io.images import read_image
 from sc3d.scene.scene import Scene
 from sc3d.settings.train import TrainSettings
+from sc3d.splatting.gaussians import Gaussians
 
 CACHED_PIXELS = 500_000_000  # undistorted photos kept in memory: 1.5 GB
 
@@ -94,3 +95,16 @@ def _item(source: Sequence | Callable | None, index: int) -> np.ndarray | None:
     if source is None:
         return None
     return source(index) if callable(source) else source[index]
+
+
+def load_gaussians(scene: Scene) -> tuple[Gaussians, np.ndarray]:
+    """The trained Gaussians of a scene and the (3,) world position of their local origin.
+
+    Raises InputError that says what to run if there are none, or if they belong to other cameras than the scene's.
+    """
+    scene.require(scene.gaussians, hint=f"run `sc3d train {scene.path}` first")
+    gaussians, comments = Gaussians.load(scene.gaussians)
+    origin = local_origin(scene.model.views)
+    if any(line.startswith("sc3d origin") for line in comments) and f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}" not in comments:
+        raise InputError(f"{scene.gaussians} was trained with other cameras than those in {scene.sparse}: run `sc3d train {scene.path} --overwrite`")
+    return gaussians, origin

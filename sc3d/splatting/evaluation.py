@@ -6,12 +6,12 @@ import numpy as np
 import torch
 
 from sc3d.geometry.cameras import View
+from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses
+from sc3d.splatting.cpu.ssim import ssim_loss
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.rendering import render, unbiased_depth
-from sc3d.settings.train import TrainSettings
-from sc3d.splatting.cpu.ssim import ssim_loss
 
 
 def psnr(image: torch.Tensor, target: torch.Tensor) -> float:

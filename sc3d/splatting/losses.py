@@ -11,9 +11,9 @@ import torch
 
 from sc3d.geometry.cameras import View
 from sc3d.splatting import device
+from sc3d.splatting.consistency import pinhole, pixel_rays, relative_pose, sample
 from sc3d.splatting.cpu import normal_loss as kernels_normals
 from sc3d.splatting.cpu import patch_ncc as kernels_patches
-from sc3d.splatting.consistency import pinhole, pixel_rays, relative_pose, sample
 
 PATCH_RADIUS = 3
 GREY = (0.299, 0.587, 0.114)

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from sc3d.geometry.cameras import View
 from sc3d.splatting import device
-from sc3d.splatting.cpu import projection_backward as kernels_backproject
-from sc3d.splatting.cpu import tile_binning as kernels_bin
 from sc3d.splatting.cpu import projection as kernels_project
+from sc3d.splatting.cpu import projection_backward as kernels_backproject
 from sc3d.splatting.cpu import rasterization as kernels_raster
 from sc3d.splatting.cpu import rasterization_backward as kernels_unraster
+from sc3d.splatting.cpu import tile_binning as kernels_bin
 from sc3d.splatting.gaussians import Gaussians
 
 _JACOBIAN_MARGIN = 0.3  # half image sizes that a mean may lie outside the image before its Jacobian is clamped: 1.3 tan(fov / 2)

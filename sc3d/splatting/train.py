@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from sc3d.io import atomic_path
+from sc3d.io.atomic import atomic_path
+from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.gaussians import Gaussians
-from sc3d.settings.train import TrainSettings
 from sc3d.splatting.trainer import Trainer
 
 __all__ = ["TrainResult", "TrainSettings", "TrainingData", "train", "write_log"]

@@ -12,22 +12,22 @@ import torch
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.io import atomic_path
+from sc3d.geometry.view_selection import neighbour_views
+from sc3d.io.atomic import atomic_path
+from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses
 from sc3d.splatting import strategy as densify
 from sc3d.splatting.checkpoint import check_state
+from sc3d.splatting.cpu.ssim import image_loss
 from sc3d.splatting.dataset import TrainingData
-from sc3d.splatting.strategy import DensifyLimits, Statistics
 from sc3d.splatting.device import pick_device
 from sc3d.splatting.evaluation import depth_map, held_out_scores, psnr
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.initialization import fill_points
 from sc3d.splatting.multiview import Neighbour, multi_view_losses, single_view_normal_loss
-from sc3d.geometry.view_selection import neighbour_views
 from sc3d.splatting.optimizer import RowAdam
 from sc3d.splatting.rendering import Rendering, render, unbiased_depth
-from sc3d.settings.train import TrainSettings
-from sc3d.splatting.cpu.ssim import image_loss
+from sc3d.splatting.strategy import DensifyLimits, Statistics
 
 log = logging.getLogger(__name__)
 

@@ -8,16 +8,16 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from sc3d.calibration import Reliability
 from sc3d.geometry.cameras import View
-from sc3d.io import read_index_image, write_json
-from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
-from sc3d.metrics import Confusion, JudgedPixels, depth_edge_band, total
-from sc3d.scene.scene import Scene
-from sc3d.settings import Evaluate
-from sc3d.tiling.executor import open_tasks
-from sc3d.tiling.evaluate import BYTES, TiledSurface, look_by_tiles, read_labels
 from sc3d.io.chunked_clouds import CloudFile
+from sc3d.io.images import read_index_image
+from sc3d.io.json_files import write_json
+from sc3d.metrics import Confusion, JudgedPixels, Reliability, depth_edge_band, total
+from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
+from sc3d.scene.scene import Scene
+from sc3d.settings.labels import Evaluate
+from sc3d.tiling.evaluate import BYTES, TiledSurface, look_by_tiles, read_labels
+from sc3d.tiling.executor import open_tasks
 from sc3d.tiling.memory import TRIANGLE, fits, mesh_triangles, num_points
 
 SOURCES = ("labels", "masks", "labels_near_edges", "labels_elsewhere")  # order of the figures

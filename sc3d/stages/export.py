@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sc3d.georeferencing.georeference import georeference_path
 from sc3d.scene.scene import Scene
-from sc3d.settings import Export
+from sc3d.settings.outputs import Export
 
 MODULES = {"masks": "masks", "laz": "laz", "clouds": "clouds", "splats": "splats", "spz": "spz", "orthophoto": "orthophoto", "objects": "objects",
            "transforms": "transforms", "colmap-text": "colmap_text"}
@@ -31,5 +31,5 @@ def run(scene: Scene, settings: Export) -> dict[str, object]:
     return figures
 
 
-def _module(name: str):  # noqa: ANN202 - a module of sc3d.exporters; its packages load late
+def _module(name: str):
     return importlib.import_module(f"sc3d.exporters.{MODULES[name]}")

@@ -8,13 +8,14 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import project, resample, undistorted
-from sc3d.io import read_image, write_geometry
-from sc3d.scene.scene import Scene, check_photos
-from sc3d.settings import Extract
 from sc3d.extraction import DepthViews, centre_cloud, extract_surface
+from sc3d.geometry.cameras import project, resample, undistorted
 from sc3d.geometry.view_selection import neighbour_views
-from sc3d.view.splat_images import load_gaussians
+from sc3d.io.clouds import write_geometry
+from sc3d.io.images import read_image
+from sc3d.scene.scene import Scene, check_photos
+from sc3d.settings.reconstruction import Extract
+from sc3d.splatting.dataset import load_gaussians
 
 
 def inputs(scene: Scene, settings: Extract) -> list[Path]:
@@ -52,7 +53,7 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
     }
 
 
-def _depth_range(model) -> tuple[float, float]:  # noqa: ANN001 - SparseModel
+def _depth_range(model) -> tuple[float, float]:
     """0.7 times the 1st and 1.2 times the 99th percentile of the sparse points' depths."""
     depths = [project(view, model.points[track])[1] for view, track in zip(model.views, model.tracks, strict=True) if len(track)]
     if not depths:
@@ -61,7 +62,7 @@ def _depth_range(model) -> tuple[float, float]:  # noqa: ANN001 - SparseModel
     return 0.7 * float(near), 1.2 * float(far)
 
 
-def _placed(geometry, origin: np.ndarray):  # noqa: ANN001, ANN202 - tensor PointCloud or TriangleMesh
+def _placed(geometry, origin: np.ndarray):
     """The geometry moved from the local frame to the world, with float64 positions."""
     attributes = geometry.vertex if isinstance(geometry, o3d.t.geometry.TriangleMesh) else geometry.point
     attributes.positions = o3d.core.Tensor(attributes.positions.numpy().astype(np.float64) + origin)

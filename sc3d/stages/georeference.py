@@ -7,10 +7,16 @@ from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.georeferencing.georeference import Georeference as Found
-from sc3d.georeferencing.georeference import from_origin, georeference_path, projected_crs, read_georeference, write_georeference
+from sc3d.georeferencing.georeference import (
+    from_origin,
+    georeference_path,
+    projected_crs,
+    read_georeference,
+    write_georeference,
+)
 from sc3d.georeferencing.gps import find_georeference, read_flight
 from sc3d.scene.scene import Scene
-from sc3d.settings import Georeference
+from sc3d.settings.reconstruction import Georeference
 
 
 def inputs(scene: Scene, settings: Georeference) -> list[Path]:

@@ -11,16 +11,23 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.georeferencing.georeference import Georeference, georeference_path, projected_crs, read_georeference, write_georeference
+from sc3d.georeferencing.georeference import (
+    Georeference,
+    georeference_path,
+    projected_crs,
+    read_georeference,
+    write_georeference,
+)
 from sc3d.importers.clouds import CLOUDS, MESHES, Geometry, is_mesh, read_geometry, to_open3d
 from sc3d.importers.frames import near_origin, to_world, whole_offset
 from sc3d.importers.model import guess_observations, sample, write_copy, write_model
 from sc3d.importers.photos import locate_photos
 from sc3d.importers.project import Project, project_files, read_project
-from sc3d.io import atomic_path, write_geometry
+from sc3d.io.atomic import atomic_path, require_writable
+from sc3d.io.clouds import write_geometry
+from sc3d.runner import execute
 from sc3d.scene.scene import Scene
-from sc3d.settings import Import, ImportCommand
-from sc3d.runner import execute, require_writable
+from sc3d.settings.reconstruction import Import, ImportCommand
 
 
 def main(command: ImportCommand) -> None:

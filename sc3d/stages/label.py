@@ -7,15 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.labelling.fusion import STATE_NAMES, Cloud, fuse
 from sc3d.geometry.cameras import local_origin
-from sc3d.io import atomic_path, write_geometry
-from sc3d.scene.labelled_cloud import point_arrays, read_surface, with_labels
-from sc3d.labelling.inputs import Masks, best_confidence, default_voxel_size, point_density, read_given_cloud
-from sc3d.scene.scene import Scene
-from sc3d.settings import Label
-from sc3d.tiling.executor import open_tasks
+from sc3d.io.atomic import atomic_path
 from sc3d.io.chunked_clouds import CloudFile
+from sc3d.io.clouds import write_geometry
+from sc3d.labelling.fusion import Cloud, fuse
+from sc3d.labelling.inputs import Masks, best_confidence, default_voxel_size, point_density, read_given_cloud
+from sc3d.scene.labelled_cloud import point_arrays, read_surface, with_labels
+from sc3d.scene.labels import STATE_NAMES
+from sc3d.scene.scene import Scene
+from sc3d.settings.labels import Label
+from sc3d.tiling.executor import open_tasks
 from sc3d.tiling.label import BYTES, label_tiles
 from sc3d.tiling.memory import TRIANGLE, fits, mesh_triangles, num_points
 

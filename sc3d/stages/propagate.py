@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.labelling.fusion import PROPAGATED
-from sc3d.io import write_geometry
-from sc3d.scene.labelled_cloud import read_labelled, read_votes, with_labels
-from sc3d.propagation import Evidence
-from sc3d.propagation import propagate as complete
-from sc3d.scene.scene import Scene
-from sc3d.settings import Propagate
-from sc3d.tiling.executor import open_tasks
 from sc3d.io.chunked_clouds import CloudFile
+from sc3d.io.clouds import write_geometry
+from sc3d.propagation import propagate as complete
+from sc3d.propagation.propagate import Evidence
+from sc3d.scene.labelled_cloud import read_labelled, read_votes, with_labels
+from sc3d.scene.labels import PROPAGATED
+from sc3d.scene.scene import Scene
+from sc3d.settings.labels import Propagate
+from sc3d.tiling.executor import open_tasks
 from sc3d.tiling.memory import fits, num_points
 from sc3d.tiling.propagate import BYTES, Summary, propagate_tiles
 

@@ -6,14 +6,15 @@ import os
 import shutil
 from pathlib import Path
 
-from sc3d.georeferencing.control_points import read_control_points
 from sc3d.errors import InputError
+from sc3d.georeferencing.control_points import read_control_points
 from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
-from sc3d.io import atomic_path, find_photos, image_size
+from sc3d.io.atomic import atomic_path, require_writable
+from sc3d.io.images import find_photos, image_size
+from sc3d.runner import execute
 from sc3d.scene.scene import Scene
-from sc3d.settings import Reconstruct, ReconstructCommand
+from sc3d.settings.reconstruction import Reconstruct, ReconstructCommand
 from sc3d.sfm import reconstruct
-from sc3d.runner import execute, require_writable
 
 
 def main(command: ReconstructCommand) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sc3d.report import write_report
 from sc3d.scene.scene import Scene
-from sc3d.settings import Report
+from sc3d.settings.outputs import Report
 
 
 def inputs(scene: Scene, settings: Report) -> list[Path]:

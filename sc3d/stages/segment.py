@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
-from sc3d.io.atomic import discard, remove_leftovers
-from sc3d.io import atomic_path, digest, find_photos, read_json, write_image, write_json
+from sc3d.io.atomic import atomic_path, discard, remove_leftovers
+from sc3d.io.images import find_photos, write_image
+from sc3d.io.json_files import read_json, write_json
+from sc3d.io.provenance import digest
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene, photo_sizes
-from sc3d.settings import Segment
+from sc3d.settings.labels import Segment
 
 if TYPE_CHECKING:
     from sc3d.segmentation.segment import Folders
@@ -84,7 +86,7 @@ def _set_aside(folders: Folders, suffix: str) -> None:
             logger.info("%s is now %s", folder, aside)
 
 
-def _segmenter(scene: Scene, settings: Segment, class_table: ClassTable):  # noqa: ANN202 - a sc3d.segmentation.segment.Segmenter; packages load late
+def _segmenter(scene: Scene, settings: Segment, class_table: ClassTable):
     if settings.backend == "strokes":
         from sc3d.segmentation.strokes.backend import Strokes
 
@@ -129,7 +131,8 @@ def _refine(scene: Scene, settings: Segment) -> dict[str, object]:
 
 
 def _import(scene: Scene, settings: Segment, class_table: ClassTable) -> dict[str, object]:
-    from sc3d.segmentation.mask_formats.import_masks import MaskFiles, import_masks, warn_of_turned
+    from sc3d.segmentation.mask_formats.import_masks import import_masks, warn_of_turned
+    from sc3d.segmentation.mask_formats.source import MaskFiles
 
     if settings.masks is None:
         if settings.mapping is not None or settings.format not in ("auto", "index"):

@@ -7,8 +7,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from sc3d.scene.scene import Scene
-from sc3d.settings import Synthesize
-from sc3d.synthetic import synthesize
+from sc3d.settings.synthesize import Synthesize
+from sc3d.synthetic.generate import synthesize
 
 
 def inputs(scene: Scene, settings: Synthesize) -> list[Path]:

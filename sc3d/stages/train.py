@@ -7,9 +7,9 @@ from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import remove
-from sc3d.io import digest
+from sc3d.io.provenance import digest
 from sc3d.scene.scene import Scene, check_photos
-from sc3d.settings import Train
+from sc3d.settings.train import Train
 from sc3d.splatting.block_tasks import BlockJob, train_blocks
 from sc3d.splatting.blocks import split_blocks
 from sc3d.splatting.dataset import TrainingData, scene_data

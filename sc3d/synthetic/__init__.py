@@ -2,11 +2,11 @@
 
 from importlib import import_module
 
-from sc3d.settings.synthesize import SynthesizeSettings
+from sc3d.settings.synthesize import Synthesize
 
 _HOMES = {"World": "world", "build_world": "world", "fly": "flight", "Photo": "photos", "photograph": "photos", "noisy_mask": "masks",
           "truth_cloud": "cloud", "synthesize": "generate"}
-__all__ = ["SynthesizeSettings", *_HOMES]
+__all__ = ["Synthesize", *_HOMES]
 
 
 def __getattr__(name: str) -> object:

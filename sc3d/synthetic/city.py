@@ -12,16 +12,16 @@ import open3d as o3d
 from tqdm import tqdm
 
 from sc3d.geometry.cameras import View, pixel_centres, rays
-from sc3d.io import write_image, write_json
+from sc3d.io.images import write_image
+from sc3d.io.json_files import write_json
 from sc3d.scene.scene import Scene
-from sc3d.settings import BenchmarkCity
+from sc3d.settings.synthesize import Synthesize, SynthesizeCity
 from sc3d.synthetic.city_files import CloudFile, MeshFile, open_cloud, open_mesh, write_cameras
 from sc3d.synthetic.city_flight import fly_over
 from sc3d.synthetic.cloud import truth_cloud
 from sc3d.synthetic.generate import CLASSES
 from sc3d.synthetic.masks import noisy_mask
 from sc3d.synthetic.mesh import OTHER
-from sc3d.settings.synthesize import SynthesizeSettings
 from sc3d.synthetic.shading import surface_labels
 from sc3d.synthetic.world import World, build_world, ray_tensor
 
@@ -94,15 +94,15 @@ class SiteLabels:
         return surface_labels(local, triangles, self.ints, self.half, EXTENT / 2, self.rasters, self.rects)
 
 
-def make_sites(settings: BenchmarkCity) -> Iterator[Site]:
+def make_sites(settings: SynthesizeCity) -> Iterator[Site]:
     """The sites, each built when it is asked for; level at their edges, so that they meet."""
     columns, rows = settings.sites
     for number in range(columns * rows):
         middle = np.array([(number % columns - (columns - 1) / 2) * EXTENT, (number // columns - (rows - 1) / 2) * EXTENT, 0.0])
-        yield Site(number, middle, build_world(SynthesizeSettings(seed=1000 * settings.seed + number, extent=EXTENT), level_edges=True))
+        yield Site(number, middle, build_world(Synthesize(seed=1000 * settings.seed + number, extent=EXTENT), level_edges=True))
 
 
-def synthesize_city(settings: BenchmarkCity) -> dict[str, object]:
+def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
     """Write cloud.ply (a link to truth.ply, which has the true labels), mesh.ply, sparse/0, truth/, masks/, confidence/ and classes.json.
 
     returns: points, views, triangles, mask_accuracy (over pixels with truth != 0)
@@ -123,7 +123,7 @@ def synthesize_city(settings: BenchmarkCity) -> dict[str, object]:
     return {"points": cloud.rows, "views": len(views), "triangles": mesh.triangles, "mask_accuracy": accuracy}
 
 
-def _write_site(site: Site, settings: BenchmarkCity, cloud: CloudFile, mesh: MeshFile) -> None:
+def _write_site(site: Site, settings: SynthesizeCity, cloud: CloudFile, mesh: MeshFile) -> None:
     made = truth_cloud(site.world, settings.points_per_site, np.random.default_rng([settings.seed, 5, site.number]))
     names = ("normals", "colors", "label")
     cloud.append(made.point.positions.numpy() + site.middle + OFFSET, **{name: made.point[name].numpy() for name in names})
@@ -135,7 +135,7 @@ def _write_masks(scene: Scene, city: City, views: list[View], seed: int) -> floa
     right = labelled = 0
     for number, view in enumerate(tqdm(views, desc="masks", unit="view", disable=None)):
         truth = city.label(view)
-        mask, confidence = noisy_mask(truth, SynthesizeSettings.mask_noise, np.random.default_rng([seed, 4, number]))
+        mask, confidence = noisy_mask(truth, Synthesize.mask_noise, np.random.default_rng([seed, 4, number]))
         right += int(((mask == truth) & (truth != OTHER)).sum())
         labelled += int((truth != OTHER).sum())
         for folder, image in ((scene.truth, truth), (scene.masks, mask), (scene.confidence, confidence)):

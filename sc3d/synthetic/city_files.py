@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 
 from sc3d.geometry.cameras import View
-from sc3d.io import atomic_path
+from sc3d.io.atomic import atomic_path
 from sc3d.synthetic.flight import camera_in_model
 
 CLOUD = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"),

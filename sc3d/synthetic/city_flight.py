@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from sc3d.geometry.cameras import View, look_at, pinhole_view
-from sc3d.settings import BenchmarkCity
+from sc3d.settings.synthesize import Synthesize, SynthesizeCity
 from sc3d.synthetic.flight import focal_length
-from sc3d.settings.synthesize import SynthesizeSettings
 
 ALTITUDE = 120.0  # m
 TILT = np.radians(40.0)  # of oblique photos, from straight down
@@ -15,7 +14,7 @@ MARGIN = 0.25 * ALTITUDE  # m between the outermost photos' middles and the edge
 NADIR = 0.6  # share of the photos
 
 
-def fly_over(size: tuple[float, float], settings: BenchmarkCity) -> list[View]:
+def fly_over(size: tuple[float, float], settings: SynthesizeCity) -> list[View]:
     """`settings.views` true cameras, named view_000.jpg ..., over a city of `size` (west to east, south to north; m) around the origin, z up."""
     rng = np.random.default_rng([settings.seed, 2])
     num_nadir = max(1, round(NADIR * settings.views))
@@ -24,7 +23,7 @@ def fly_over(size: tuple[float, float], settings: BenchmarkCity) -> list[View]:
     for side, members in zip(sides, np.array_split(np.arange(settings.views - num_nadir), 4), strict=True):
         poses += _poses(len(members), size, (side, TILT), rng)
     digits = max(3, len(str(settings.views - 1)))
-    width, height = settings.width, SynthesizeSettings(width=settings.width).height
+    width, height = settings.width, Synthesize(width=settings.width).height
     focal = focal_length(width, height)
     return [pinhole_view(f"view_{i:0{digits}d}.jpg", (width, height), (focal, focal, width / 2, height / 2), pose) for i, pose in enumerate(poses)]
 

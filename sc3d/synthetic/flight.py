@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 
 from sc3d.geometry.cameras import View, look_at, pinhole_view
-from sc3d.settings.synthesize import SynthesizeSettings
+from sc3d.settings.synthesize import Synthesize
 
 FOCAL_35MM = 28  # mm on 36 x 24 mm film; whole, because EXIF stores it so
 
@@ -16,7 +16,7 @@ def focal_length(width: int, height: int) -> float:
     return FOCAL_35MM / 43.27 * float(np.hypot(width, height))
 
 
-def fly(settings: SynthesizeSettings) -> list[View]:
+def fly(settings: Synthesize) -> list[View]:
     """True cameras, `settings.views` of them: names view_000.jpg ..., pinhole, world = site centre, z up, metres."""
     rng = np.random.default_rng([settings.seed, 2])
     num_nadir = settings.views if settings.views < 8 else round(0.6 * settings.views)
@@ -32,7 +32,7 @@ def fly(settings: SynthesizeSettings) -> list[View]:
     return [pinhole_view(f"view_{i:0{digits}d}.jpg", size, calibration, pose) for i, pose in enumerate(poses)]
 
 
-def _nadir_poses(num: int, settings: SynthesizeSettings, rng: np.random.Generator) -> list[np.ndarray]:
+def _nadir_poses(num: int, settings: Synthesize, rng: np.random.Generator) -> list[np.ndarray]:
     """Lines flown to and fro, image top in flight direction, with the unsteadiness of a real drone."""
     num_lines = max(1, round(np.sqrt(num / 1.5)))
     reach = 0.25 * settings.extent

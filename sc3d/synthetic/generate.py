@@ -15,14 +15,17 @@ from PIL import Image
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.io import atomic_path, write_geometry, write_image, write_json
+from sc3d.io.atomic import atomic_path
+from sc3d.io.clouds import write_geometry
+from sc3d.io.images import write_image
+from sc3d.io.json_files import write_json
+from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.cloud import find_tracks, truth_cloud
 from sc3d.synthetic.exif import drone_exif, geodetic
 from sc3d.synthetic.flight import camera_in_model, fly
 from sc3d.synthetic.masks import noisy_mask
 from sc3d.synthetic.mesh import OTHER
 from sc3d.synthetic.photos import Photo, photograph
-from sc3d.settings.synthesize import SynthesizeSettings
 from sc3d.synthetic.shading import display
 from sc3d.synthetic.world import World, build_world
 
@@ -38,7 +41,7 @@ FOLDERS = ("images", "depth", "truth", "masks", "confidence")
 NUM_SPARSE = 16_000  # candidates for sparse points; those seen by three views are kept
 
 
-def synthesize(scene_path: Path, settings: SynthesizeSettings, progress: Callable[[float, str], None] | None = None) -> dict:
+def synthesize(scene_path: Path, settings: Synthesize, progress: Callable[[float, str], None] | None = None) -> dict:
     """Write a complete scene folder.
 
     Writes images/, depth/<stem>.npy (float32 z, m), truth/, masks/, confidence/, sparse/0, truth.ply, truth_mesh.ply and classes.json.
@@ -84,7 +87,7 @@ def _clear(scene_path: Path) -> None:
         file.unlink()
 
 
-def _measured_centres(views: list[View], settings: SynthesizeSettings) -> np.ndarray:
+def _measured_centres(views: list[View], settings: Synthesize) -> np.ndarray:
     """(N, 3) camera centres as the GPS gives them."""
     centres = np.stack([view.centre for view in views])
     return centres + np.random.default_rng([settings.seed, 6]).normal(0, 1, centres.shape) * settings.gps_noise
@@ -105,7 +108,7 @@ def _mesh(world: World) -> o3d.t.geometry.TriangleMesh:
     return o3d.t.geometry.TriangleMesh(o3d.core.Tensor(corners), o3d.core.Tensor(np.arange(len(corners), dtype=np.int32).reshape(-1, 3)))
 
 
-def _write_sparse(path: Path, world: World, views: list[View], settings: SynthesizeSettings) -> int:
+def _write_sparse(path: Path, world: World, views: list[View], settings: Synthesize) -> int:
     """Write the true cameras and points with tracks as a COLMAP model; returns the number of points."""
     points, triangles, observations = find_tracks(world, views, NUM_SPARSE, np.random.default_rng([settings.seed, 7]))
     colors = display(world.light(points.astype(np.float32), triangles, np.full(len(points), 0.1, np.float32)))

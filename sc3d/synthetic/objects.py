@@ -6,8 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sc3d.synthetic.mesh import (BRICK, BUILDING, FLAT_ROOF, GLASS, OTHER, PAINT, PLAIN, TILES, WALL, MeshBuilder, linear, placed,
-                                 upright_pose)
+from sc3d.synthetic.mesh import (
+    BRICK,
+    BUILDING,
+    FLAT_ROOF,
+    GLASS,
+    OTHER,
+    PAINT,
+    PLAIN,
+    TILES,
+    WALL,
+    MeshBuilder,
+    linear,
+    placed,
+    upright_pose,
+)
 
 GABLE, HIP, FLAT = range(3)
 WALL_TINTS = [(214, 200, 176), (196, 180, 160), (160, 96, 76), (222, 216, 206), (172, 140, 112), (150, 108, 90), (190, 196, 190)]

@@ -6,7 +6,16 @@ import numpy as np
 from numba import njit, prange
 
 from sc3d.synthetic.mesh import BRICK, FLAT_ROOF, GLASS, GROUND, LEAF, OTHER, PLAIN, ROAD, TILES, WALL
-from sc3d.synthetic.texture import (LAWN, flat_roof_color, fractal_noise, ground_color, ground_kind, random01, tile_color, wall_color)
+from sc3d.synthetic.texture import (
+    LAWN,
+    flat_roof_color,
+    fractal_noise,
+    ground_color,
+    ground_kind,
+    random01,
+    tile_color,
+    wall_color,
+)
 
 SUN = np.array([-0.48, -0.42, 0.77]) / np.linalg.norm([-0.48, -0.42, 0.77])  # direction to the sun, world
 

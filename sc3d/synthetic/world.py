@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import open3d as o3d
 
+from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.ground import Ground, add_ground, plan_ground
 from sc3d.synthetic.layout import build_fences, park_cars, place_buildings, plant
 from sc3d.synthetic.mesh import LEAF, MeshBuilder, face_normals
 from sc3d.synthetic.objects import Building, add_building
-from sc3d.settings.synthesize import SynthesizeSettings
 from sc3d.synthetic.shading import SUN, shade, surface_labels
 
 
@@ -61,7 +61,7 @@ class World:
         return normals
 
 
-def build_world(settings: SynthesizeSettings, level_edges: bool = False) -> World:
+def build_world(settings: Synthesize, level_edges: bool = False) -> World:
     """Build the site of `settings.seed` and `settings.extent`: ground, roads, buildings, plants, cars. level_edges: as in `Ground`."""
     streams = np.random.default_rng([settings.seed, 1]).spawn(6)
     ground = plan_ground(settings.extent, streams[0], level_edges)

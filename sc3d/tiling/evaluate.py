@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.labelling.fusion import Labels
 from sc3d.geometry.cameras import View, camera_rays, local_origin, may_see
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import FirstSurface, first_surface, surface_points
-from sc3d.io import image_size, read_index_image
-from sc3d.scene.labelled_cloud import REACH
-from sc3d.scene.scene import Scene
-from sc3d.settings import Evaluate
-from sc3d.tiling.executor import Tasks
 from sc3d.io.chunked_clouds import CloudFile, positions
+from sc3d.io.images import image_size, read_index_image
+from sc3d.scene.labelled_cloud import REACH
+from sc3d.scene.labels import Labels
+from sc3d.scene.scene import Scene
+from sc3d.settings.labels import Evaluate
+from sc3d.tiling.executor import Tasks
 from sc3d.tiling.label import sample_spacing
 from sc3d.tiling.memory import Parts, max_points, memory_of
 from sc3d.tiling.ranges import RangeMaps

@@ -16,7 +16,7 @@ from typing import Protocol
 from tqdm import tqdm
 
 from sc3d.errors import InputError, Sc3dError
-from sc3d.settings import Workers
+from sc3d.settings.common import Workers
 
 logger = logging.getLogger(__name__)
 

@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.labelling.fusion import Cloud, Extent, Fusion, fuse
 from sc3d.geometry.cameras import local_origin
 from sc3d.geometry.neighbors import NeighborIndex, point_spacing
 from sc3d.geometry.voxels import BLOCK, VOXELS, sort_by_voxel, voxel_origin
-from sc3d.io import image_size
-from sc3d.scene.labelled_cloud import SPACING_NEIGHBORS, SPACING_SAMPLE, VOTES, unit_normals
-from sc3d.labelling.inputs import FOOTPRINT_SAMPLE, Masks, best_confidence, point_density, voxel_size_for
-from sc3d.scene.scene import Scene
-from sc3d.settings import Label
-from sc3d.tiling.executor import Tasks
 from sc3d.io.chunked_clouds import CloudFile, columns, positions, write_ply
+from sc3d.io.images import image_size
+from sc3d.labelling.fusion import Cloud, Extent, Fusion, fuse
+from sc3d.labelling.inputs import FOOTPRINT_SAMPLE, Masks, best_confidence, point_density, voxel_size_for
+from sc3d.scene.labelled_cloud import SPACING_NEIGHBORS, SPACING_SAMPLE, VOTES, unit_normals
+from sc3d.scene.scene import Scene
+from sc3d.settings.labels import Label
+from sc3d.tiling.executor import Tasks
 from sc3d.tiling.memory import Parts, max_points, memory_of
 from sc3d.tiling.ranges import RangeMaps
 from sc3d.tiling.store import Results, Survey, TileStore
@@ -140,7 +140,7 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndar
     dtype = np.dtype([*kept, ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), *added])
     counts = np.zeros(8, np.int64)
 
-    def chunks():  # noqa: ANN202
+    def chunks():
         fused = job.results.in_order(["label", "confidence", "state", "num_views", "votes", "normals"])
         for (_, records), values in zip(cloud.chunks(), fused, strict=True):
             result = np.empty(len(records), dtype)

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import require_room
-from sc3d.io.ply import read_header
-from sc3d.settings import Resources
 from sc3d.io.chunked_clouds import CloudFile
+from sc3d.io.ply import read_header
+from sc3d.settings.common import Resources
 
 BASE = 900 << 20  # bytes of a process without points: libraries, a photo's masks, a few range maps
 TRIANGLE = 300  # bytes of a triangle while rays are cast

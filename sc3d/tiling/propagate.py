@@ -17,23 +17,33 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sc3d.errors import InputError
-from sc3d.labelling.fusion import PROPAGATED
-from sc3d.scene.labelled_cloud import VOTES
-from sc3d.propagation.propagate import (
-    added, decided, examples_in, final_labels, is_skilled, needs_raters, rated_belief, spread, unrated_belief, verified, views_to_agree,
-)
-from sc3d.propagation.region_growing import vote_nearest
-from sc3d.propagation.potts import STEPS
-from sc3d.propagation.quantile_sketch import Counts
-from sc3d.propagation.appearance import MIN_EXAMPLES, Lesson, Raters, feature_counts, folds_of
-from sc3d.propagation.terrain import WINDOWS, Lean, Terrain
-from sc3d.scene.scene import Scene
-from sc3d.settings import Propagate
-from sc3d.tiling.executor import Tasks
 from sc3d.io.chunked_clouds import CloudFile, write_ply
+from sc3d.propagation.appearance import MIN_EXAMPLES, Lesson, Raters, feature_counts, folds_of
+from sc3d.propagation.potts import STEPS
+from sc3d.propagation.propagate import (
+    added,
+    decided,
+    examples_in,
+    final_labels,
+    is_skilled,
+    needs_raters,
+    rated_belief,
+    spread,
+    unrated_belief,
+    verified,
+    views_to_agree,
+)
+from sc3d.propagation.quantile_sketch import Counts
+from sc3d.propagation.region_growing import vote_nearest
+from sc3d.propagation.terrain import WINDOWS, Lean, Terrain
+from sc3d.scene.labelled_cloud import VOTES
+from sc3d.scene.labels import PROPAGATED
+from sc3d.scene.scene import Scene
+from sc3d.settings.labels import Propagate
+from sc3d.tiling.executor import Tasks
 from sc3d.tiling.label import sample_spacing
-from sc3d.tiling.propagation_tiles import Part, PropagateJob, cells_of
 from sc3d.tiling.memory import Parts, max_points
+from sc3d.tiling.propagation_tiles import Part, PropagateJob, cells_of
 from sc3d.tiling.store import Results, Survey, TileStore
 
 logger = logging.getLogger(__name__)
@@ -233,7 +243,7 @@ def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> Summary:
     kept = [(name, cloud.dtype[name].str[1:]) for name in cloud.dtype.names if not name.startswith(VOTES)]
     counts, confidence = np.zeros(3, np.int64), [0.0]
 
-    def chunks():  # noqa: ANN202
+    def chunks():
         for (_, records), values in zip(cloud.chunks(), job.results.in_order(["label", "confidence", "state"]), strict=True):
             result = np.empty(len(records), np.dtype(kept))
             for name, _ in kept:

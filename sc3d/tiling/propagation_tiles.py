@@ -7,14 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.labelling.fusion import Extent, Labels
 from sc3d.geometry.graph import Graph, build_graph
-from sc3d.scene.labelled_cloud import VOTES
-from sc3d.propagation import Evidence, tie_breakers
-from sc3d.propagation.appearance import COLOR_BINS, COLOR_BLUR, RELIEF_BINS, RELIEF_BLUR, Cells, Raters
-from sc3d.propagation.terrain import NUM_FEATURES
-from sc3d.settings import Propagate
 from sc3d.io.chunked_clouds import columns, positions
+from sc3d.labelling.fusion import Extent
+from sc3d.propagation.appearance import COLOR_BINS, COLOR_BLUR, RELIEF_BINS, RELIEF_BLUR, Cells, Raters
+from sc3d.propagation.propagate import Evidence, tie_breakers
+from sc3d.propagation.terrain import NUM_FEATURES
+from sc3d.scene.labelled_cloud import VOTES
+from sc3d.scene.labels import Labels
+from sc3d.settings.labels import Propagate
 from sc3d.tiling.store import Results, TileStore, Window
 
 GRAPH = tuple(field.name for field in fields(Graph))

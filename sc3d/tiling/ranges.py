@@ -13,11 +13,11 @@ import numba
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.atomic import atomic_path
-from sc3d.io.ply import check_ply
 from sc3d.geometry.cameras import View, camera_rays, may_see
 from sc3d.geometry.raycast import Surface
+from sc3d.io.atomic import atomic_path
 from sc3d.io.chunked_clouds import CHUNK, positions
+from sc3d.io.ply import check_ply
 from sc3d.tiling.store import Grid
 
 SLACK = 1e-5  # of the box around a part, and of a range: rays that only just reach it are cast
@@ -78,7 +78,7 @@ def read_triangles(path: Path) -> Iterator[np.ndarray]:
         yield vertices[inverse.reshape(-1, 3)]
 
 
-def _fields(entry, corners, order: str) -> list[tuple]:  # noqa: ANN001 - formats.ply.Property
+def _fields(entry, corners, order: str) -> list[tuple]:
     if entry is corners:
         return [("count", order + entry.count), ("corners", order + entry.dtype, (3,))]
     if entry.count:
@@ -98,7 +98,7 @@ def _cast(parts: MeshParts, part: int, surface: Surface, view: View, directions:
 
 
 @numba.njit(parallel=True, cache=True, error_model="numpy")
-def _reach(directions, cam_from_world, start, low, high, nearest, reached):  # noqa: ANN001, ANN202 - numba kernel
+def _reach(directions, cam_from_world, start, low, high, nearest, reached):
     """Which rays (K, 3), camera frame, enter the box before their nearest hit so far."""
     for k in numba.prange(len(directions)):
         enter, leave = 0.0, np.inf

@@ -14,8 +14,8 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
-from sc3d.labelling.fusion import MIDDLE_STEPS, Extent, count_steps, middle_of
 from sc3d.io.chunked_clouds import CHUNK, CloudFile, positions
+from sc3d.labelling.fusion import MIDDLE_STEPS, Extent, count_steps, middle_of
 
 RASTER = 512  # cells per side in which points are counted, to choose the tiles
 MAX_TILES = 4096

@@ -11,9 +11,9 @@ import numpy as np
 
 from sc3d.geometry.cameras import View
 from sc3d.geometry.raycast import surfels
+from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.scene.scene import Scene
 from sc3d.tiling.executor import Tasks
-from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.tiling.memory import BASE, TRIANGLE
 from sc3d.tiling.ranges import MeshParts, RangeMaps, read_triangles, write_ranges
 from sc3d.tiling.store import Survey, TileStore

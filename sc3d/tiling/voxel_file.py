@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.io.atomic import atomic_path
 from sc3d.geometry.voxels import BLOCK
+from sc3d.io.atomic import atomic_path
 from sc3d.tiling.store import Results
 
 BLOCKS = 2048  # held at a time

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sc3d.scene.class_table import ClassTable
-from sc3d.view.colors import Colouring, ColorScale, color_scale, legend_entries
+from sc3d.view.colors import ColorScale, Colouring, color_scale, legend_entries
 
 PAPER, INK = (255, 255, 255), (32, 34, 38)
 

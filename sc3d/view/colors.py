@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import cv2
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import read_votes
 
 if TYPE_CHECKING:

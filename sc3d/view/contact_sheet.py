@@ -8,18 +8,19 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from sc3d.io import write_image
-from sc3d.view.colors import confidence_colors
+from sc3d.io.images import write_image
 from sc3d.view.captions import INK, PAPER, caption_font
+from sc3d.view.colors import confidence_colors
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from PIL import Image, ImageDraw
 
-    from sc3d.view.splat_images import Comparison
     from sc3d.settings.train import TrainSettings
-    from sc3d.splatting.train import TrainingData, TrainResult
+    from sc3d.splatting.dataset import TrainingData
+    from sc3d.splatting.train import TrainResult
+    from sc3d.view.splat_images import Comparison
 
 _MARGIN, _GAP = 16, 8  # px
 _SOFT, _WARNING = (100, 107, 117), (190, 70, 0)
@@ -135,7 +136,7 @@ def _heads(sheet: Image.Image, lefts: list[int], middle: int, cell: int, near_fa
         place += 1.4 * size + font.getlength(name + "   ")
 
 
-def _caption(draw: ImageDraw.ImageDraw, row: Comparison, middle: int, cell: int, font) -> None:  # noqa: ANN001 - ImageFont
+def _caption(draw: ImageDraw.ImageDraw, row: Comparison, middle: int, cell: int, font) -> None:
     draw.text((_MARGIN, middle), _shortened(row.name, font, cell), font=font, fill=INK, anchor="lm")
     left, text = _MARGIN + cell + _GAP, f"PSNR {row.psnr:.2f} dB"
     draw.text((left, middle), text, font=font, fill=INK, anchor="lm")
@@ -143,7 +144,7 @@ def _caption(draw: ImageDraw.ImageDraw, row: Comparison, middle: int, cell: int,
         draw.text((left + font.getlength(text + "   "), middle), "held out", font=font, fill=_WARNING, anchor="lm")
 
 
-def _shortened(text: str, font, width: float) -> str:  # noqa: ANN001 - ImageFont
+def _shortened(text: str, font, width: float) -> str:
     """Text that fits into `width` px; names differ at their end, so that is kept."""
     if font.getlength(text) <= width:
         return text

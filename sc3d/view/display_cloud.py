@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import VOTES, spacing_of
 from sc3d.view.colors import COLOURINGS, Colouring, can_color, color_points, shaded
 from sc3d.view.progressive_order import even_order

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import Colouring, confidence_colors
 
@@ -88,7 +88,7 @@ class ShownSplats:
 
 def trained_splats(scene: Scene) -> ShownSplats:
     """gaussians.ply; InputError that says what to run if it is missing or belongs to other cameras."""
-    from sc3d.view.splat_images import load_gaussians
+    from sc3d.splatting.dataset import load_gaussians
 
     return ShownSplats(*load_gaussians(scene))
 

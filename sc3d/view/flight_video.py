@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View, pinhole_view
-from sc3d.io import atomic_path
+from sc3d.io.atomic import atomic_path
 from sc3d.view.viewpoints import fitted
 
 FRAMES_PER_SECOND = 25

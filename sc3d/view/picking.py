@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import open3d as o3d
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.geometry.cameras import View, in_image, local_origin, project, rays
 from sc3d.geometry.neighbors import estimate_normals, orient_normals
 from sc3d.geometry.raycast import FirstSurface, see_points
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import NORMAL_NEIGHBORS, read_surface, read_votes, spacing_of
 from sc3d.view.colors import STATES
 

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Literal
 import cv2
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, local_origin, undistorted
 from sc3d.geometry.neighbors import NeighborIndex
-from sc3d.view.viewpoints import aerial_view, frustum_depth, frusta, without_outliers
-from sc3d.view.colors import Colouring, as_uint8, color_points
+from sc3d.scene.class_table import ClassTable
 from sc3d.view.captions import add_legend
+from sc3d.view.colors import Colouring, as_uint8, color_points
 from sc3d.view.renderers import Drawing, render
+from sc3d.view.viewpoints import aerial_view, frusta, frustum_depth, without_outliers
 
 if TYPE_CHECKING:
     import open3d as o3d

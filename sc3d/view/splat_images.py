@@ -8,15 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from sc3d.errors import InputError
-from sc3d.geometry.cameras import View, local_origin
-from sc3d.scene.scene import Scene
+from sc3d.geometry.cameras import View
+from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.evaluation import depth_map, psnr
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.rendering import render
-from sc3d.settings.train import TrainSettings
 
 NUM_ROWS = 6
 """Photos of a contact sheet."""
@@ -40,19 +38,6 @@ class Comparison:
     normals: np.ndarray
     psnr: float
     held_out: bool = False
-
-
-def load_gaussians(scene: Scene) -> tuple[Gaussians, np.ndarray]:
-    """The trained Gaussians of a scene and the (3,) world position of their local origin.
-
-    Raises InputError that says what to run if there are none, or if they belong to other cameras than the scene's.
-    """
-    scene.require(scene.gaussians, hint=f"run `sc3d train {scene.path}` first")
-    gaussians, comments = Gaussians.load(scene.gaussians)
-    origin = local_origin(scene.model.views)
-    if any(line.startswith("sc3d origin") for line in comments) and f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}" not in comments:
-        raise InputError(f"{scene.gaussians} was trained with other cameras than those in {scene.sparse}: run `sc3d train {scene.path} --overwrite`")
-    return gaussians, origin
 
 
 @torch.no_grad()

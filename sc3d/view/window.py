@@ -9,13 +9,13 @@ from functools import partial
 import numpy as np
 
 from sc3d.geometry.cameras import View, local_origin
-from sc3d.view.viewpoints import frusta, frustum_depth
 from sc3d.view.colors import Colouring, color_points, color_scale, legend_entries
 from sc3d.view.display import check_display
-from sc3d.view.picking import Inspector, PickedPoint, position_at
-from sc3d.view.screenshot import LINE_COLOR
-from sc3d.view.renderers import vulkan_works
 from sc3d.view.display_cloud import ShownCloud
+from sc3d.view.picking import Inspector, PickedPoint, position_at
+from sc3d.view.renderers import vulkan_works
+from sc3d.view.screenshot import LINE_COLOR
+from sc3d.view.viewpoints import frusta, frustum_depth
 
 logger = logging.getLogger(__name__)
 

@@ -9,9 +9,9 @@ import open3d as o3d
 
 from sc3d.errors import Sc3dError
 from sc3d.view.colors import Colouring, legend_entries
+from sc3d.view.display_cloud import ShownCloud
 from sc3d.view.picking import Inspector, point_on_ray
 from sc3d.view.screenshot import LINE_COLOR
-from sc3d.view.display_cloud import ShownCloud
 
 logger = logging.getLogger(__name__)
 

@@ -19,8 +19,8 @@ from sc3d.annotate.session import Session
 from sc3d.cli import main
 from sc3d.errors import InputError
 from sc3d.scene.scene import Scene
-from sc3d.segmentation.strokes.files import read_strokes
 from sc3d.segmentation.strokes.backend import StrokesSettings
+from sc3d.segmentation.strokes.files import read_strokes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CLASSES = [{"id": 2, "name": "road", "color": [150, 150, 160]}, {"id": 5, "name": "grass", "color": [170, 220, 110]}]
@@ -333,7 +333,7 @@ def test_run_lays_the_mask_over_the_photo(page, scene):
     page.evaluate("() => { const slider = document.getElementById('opacity'); slider.value = 100; slider.dispatchEvent(new Event('input')); }")
     page.wait_for_timeout(100)
     column, row = np.subtract(on_screen(page, 45, 80), on_screen_corner(page)).astype(int)
-    shown = lambda: np.array(Image.open(io.BytesIO(page.locator("#canvas").screenshot())).convert("RGB"))[row - 5 : row + 6, column - 5 : column + 6].reshape(-1, 3)  # noqa: E731
+    shown = lambda: np.array(Image.open(io.BytesIO(page.locator("#canvas").screenshot())).convert("RGB"))[row - 5 : row + 6, column - 5 : column + 6].reshape(-1, 3)
     assert (shown() == [150, 150, 160]).all()
     page.keyboard.press("m")
     page.wait_for_timeout(100)

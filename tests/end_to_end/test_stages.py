@@ -6,10 +6,10 @@ import numpy as np
 import open3d as o3d
 import pytest
 from PIL import Image
-from tests.builders import ground, truth_mask, views, write_bare_scene
 
 from sc3d.cli import main
 from sc3d.runner import sidecar
+from tests.builders import ground, truth_mask, views, write_bare_scene
 
 
 def run(*arguments) -> None:

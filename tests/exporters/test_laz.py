@@ -7,13 +7,13 @@ import numpy as np
 import open3d as o3d
 import pyproj
 import pytest
-from tests.builders import LABELLED_CLASSES as CLASSES, labelled_cloud, write_scene
 
 from sc3d.errors import InputError
-from sc3d.exporters import clouds
-from sc3d.exporters import laz
+from sc3d.exporters import clouds, laz
 from sc3d.georeferencing.georeference import read_georeference
-from sc3d.settings import Export
+from sc3d.settings.outputs import Export
+from tests.builders import LABELLED_CLASSES as CLASSES
+from tests.builders import labelled_cloud, write_scene
 
 UTM = {"epsg": 32615, "offset": [576000.0, 5188000.0, 200.0]}
 ENU = UTM | {"origin": [46.8427, -91.9944, 198.6]}

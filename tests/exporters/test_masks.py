@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from tests.builders import truth_mask, views, write_bare_scene
 
-from sc3d.segmentation import mask_refinement as refinement
 from sc3d.cli import main
 from sc3d.runner import sidecar
+from sc3d.segmentation import mask_refinement as refinement
+from tests.builders import truth_mask, views, write_bare_scene
 
 
 def run(*arguments) -> None:

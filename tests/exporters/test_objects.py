@@ -6,22 +6,23 @@ import numpy as np
 import pyproj
 import pytest
 import shapely
-from tests.builders import LABELLED_CLASSES as CLASSES, labelled_cloud, write_scene
 from scipy import ndimage
-from tests.exporters.site_truth import compare_buildings, footprint, match_trees, trees
 
 from sc3d.errors import InputError
 from sc3d.exporters import objects
-from sc3d.exporters.trees import climb, split_crowns
 from sc3d.exporters.buildings import join_enclosed, roof_tops, split_buildings
-from sc3d.geometry.raster import Grid
 from sc3d.exporters.polygonize import main_direction, simplified, squared, trace
 from sc3d.exporters.regions import cells_by_number, connected_cells, renumbered
 from sc3d.exporters.terrain import block_medians, ground_height
-from sc3d.settings import Export
+from sc3d.exporters.trees import climb, split_crowns
+from sc3d.geometry.raster import Grid
+from sc3d.settings.outputs import Export
+from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.cloud import truth_cloud
-from sc3d.settings.synthesize import SynthesizeSettings
 from sc3d.synthetic.world import build_world
+from tests.builders import LABELLED_CLASSES as CLASSES
+from tests.builders import labelled_cloud, write_scene
+from tests.exporters.site_truth import compare_buildings, footprint, match_trees, trees
 
 GRID = Grid(0.0, 30.0, 0.25, 120, 160)  # 40 x 30 m
 UTM = {"epsg": 32615, "offset": [576000.0, 5188000.0, 200.0]}
@@ -30,7 +31,7 @@ UTM = {"epsg": 32615, "offset": [576000.0, 5188000.0, 200.0]}
 @pytest.fixture(scope="module")
 def site():
     """A small synthetic site and its true cloud."""
-    world = build_world(SynthesizeSettings(extent=80.0, seed=3))
+    world = build_world(Synthesize(extent=80.0, seed=3))
     return world, truth_cloud(world, 250_000, np.random.default_rng(0))
 
 

@@ -6,15 +6,15 @@ import numpy as np
 import open3d as o3d
 import pytest
 import rasterio
-from tests.builders import LABELLED_CLASSES as CLASSES, labelled_cloud, write_scene
 from scipy import ndimage
 
 from sc3d.errors import InputError, MissingPackageError
+from sc3d.exporters import orthophoto, packages
 from sc3d.geometry import raster as grids
-from sc3d.exporters import orthophoto
-from sc3d.exporters import packages
 from sc3d.geometry.raster import Grid
-from sc3d.settings import Export
+from sc3d.settings.outputs import Export
+from tests.builders import LABELLED_CLASSES as CLASSES
+from tests.builders import labelled_cloud, write_scene
 
 UTM = {"epsg": 32615, "offset": [576000.0, 5188000.0, 200.0]}
 SIZE = (20.0, 12.0)  # of the ground, m; west half road, east half grass

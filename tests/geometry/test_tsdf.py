@@ -11,7 +11,14 @@ import pytest
 
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.geometry.raycast import Surface, first_surface
-from sc3d.geometry.tsdf import DepthFusion, cloud_in_order, drop_small_parts, mesh_in_order, near_mesh, pixel_squares
+from sc3d.geometry.tsdf import (
+    DepthFusion,
+    cloud_in_order,
+    drop_small_parts,
+    mesh_in_order,
+    near_mesh,
+    pixel_squares,
+)
 
 VOXEL = 0.05
 

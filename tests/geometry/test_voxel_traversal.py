@@ -5,16 +5,17 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from sc3d.labelling.fusion import UNSEEN, Cloud, fuse
 from sc3d.geometry.cameras import look_at, pinhole_view, rays
 from sc3d.geometry.neighbors import NeighborIndex
-from sc3d.geometry.voxel_patches import Patches
 from sc3d.geometry.raycast import Surface, first_surface, nearest_points, see_points
-from sc3d.geometry.voxel_traversal import VoxelSurface
 from sc3d.geometry.voxel_lookup import voxel_lookup
+from sc3d.geometry.voxel_patches import Patches
+from sc3d.geometry.voxel_traversal import VoxelSurface
 from sc3d.geometry.voxels import voxel_keys
+from sc3d.labelling.fusion import Cloud, fuse
 from sc3d.scene.labelled_cloud import SURFACE_VOXEL, read_surface, spacing_of
-from sc3d.settings import Label
+from sc3d.scene.labels import UNSEEN
+from sc3d.settings.labels import Label
 
 UP = np.float32([0, 0, 1])
 DIAGONALS = [np.float32([x, y, z]) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z]

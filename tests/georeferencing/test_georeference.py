@@ -10,12 +10,32 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from sc3d.georeferencing.alignment import Similarity, fit_similarity, fit_similarity_robust, flight_shape, roll_upright
-from sc3d.georeferencing.control_points import ControlPoints, align_to_control_points, read_control_points, transform, triangulate
 from sc3d.errors import InputError
-from sc3d.georeferencing.focal import anchor_focal, exif_focal, tells_focal
-from sc3d.georeferencing.georeference import Georeference, enu_to_geodetic, from_origin, geodetic_to_enu, read_georeference, utm_epsg, write_georeference
 from sc3d.geometry.cameras import View, look_at, pinhole_view, project
+from sc3d.georeferencing.alignment import (
+    Similarity,
+    fit_similarity,
+    fit_similarity_robust,
+    flight_shape,
+    roll_upright,
+)
+from sc3d.georeferencing.control_points import (
+    ControlPoints,
+    align_to_control_points,
+    read_control_points,
+    transform,
+    triangulate,
+)
+from sc3d.georeferencing.focal import anchor_focal, exif_focal, tells_focal
+from sc3d.georeferencing.georeference import (
+    Georeference,
+    enu_to_geodetic,
+    from_origin,
+    geodetic_to_enu,
+    read_georeference,
+    utm_epsg,
+    write_georeference,
+)
 from sc3d.georeferencing.geotags import Geotag, read_geotag
 from sc3d.georeferencing.gps import Flight, find_georeference, place, read_flight, residuals
 from sc3d.scene.scene import Scene

@@ -12,19 +12,19 @@ import pycolmap
 import pyproj
 import pytest
 from PIL import Image
-from tests.builders import CLASSES, ORIGIN, ground, truth_mask, write_model
-from tests.builders import views as bare_views
 
 from sc3d.cli import main
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, look_at, project
-from sc3d.georeferencing.georeference import Georeference, from_origin, read_georeference, write_georeference
 from sc3d.geometry.distortion import Lens, to_camera
+from sc3d.georeferencing.georeference import Georeference, from_origin, read_georeference, write_georeference
 from sc3d.importers.model import guess_observations
 from sc3d.importers.opensfm import _lens as opensfm_lens
 from sc3d.importers.project import read_project
 from sc3d.scene.scene import Scene, read_sparse_model
-from sc3d.settings import Import
+from sc3d.settings.reconstruction import Import
+from tests.builders import CLASSES, ORIGIN, ground, truth_mask, write_model
+from tests.builders import views as bare_views
 
 FILES = Path(__file__).parent / "files"
 PLACE = (46.84269, -91.99443, 198.0)

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sc3d.labelling.fusion import LOCKED, SEED, UNLOCKED, UNSEEN, Cloud, edge_distance, fuse, picture_of
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.geometry.raycast import Surface
-from sc3d.settings import Label
+from sc3d.labelling.fusion import Cloud, edge_distance, fuse, picture_of
+from sc3d.scene.labels import LOCKED, SEED, UNLOCKED, UNSEEN
+from sc3d.settings.labels import Label
 
 PLAIN = Label(voxel_size=0.2, edge_width=0, depth_excess=False, incidence=False, range=False, use_confidence=False, verify="no")
 

@@ -3,7 +3,15 @@
 import numpy as np
 
 from sc3d.geometry.voxels import BLOCK, VOXELS, sort_by_voxel
-from sc3d.labelling.verification import MIN_RELIABILITY, PRIOR_SHARE, PRIOR_VIEWS, Places, VoteLog, neighbor_blocks, verify
+from sc3d.labelling.verification import (
+    MIN_RELIABILITY,
+    PRIOR_SHARE,
+    PRIOR_VIEWS,
+    Places,
+    VoteLog,
+    neighbor_blocks,
+    verify,
+)
 
 FULL = 4096
 

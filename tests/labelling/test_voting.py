@@ -8,14 +8,15 @@ import open3d as o3d
 import pycolmap
 import pytest
 
-from sc3d.labelling.density import FULL, GaussianField, gaussian_density, kernel_density, voxel_shares
-from sc3d.labelling.fusion import LOCKED, Cloud, edge_distance, fuse, picture_of
 from sc3d.geometry.cameras import View, look_at, project
 from sc3d.geometry.raycast import Surface, first_surface, see_points
 from sc3d.geometry.voxels import sort_by_voxel, voxel_origin
-from sc3d.settings import Label
+from sc3d.labelling.density import FULL, GaussianField, gaussian_density, kernel_density, voxel_shares
+from sc3d.labelling.fusion import Cloud, edge_distance, fuse, picture_of
 from sc3d.labelling.voting import lens_of, open_ballot
 from sc3d.labelling.voting_kernels import GRAZING, MIN_WEIGHT, SCALE, Rules, to_camera, to_pixel
+from sc3d.scene.labels import LOCKED
+from sc3d.settings.labels import Label
 
 MODELS = {
     "SIMPLE_PINHOLE": [110, 80, 60], "PINHOLE": [110, 112, 80, 60], "SIMPLE_RADIAL": [110, 80, 60, 0.05], "RADIAL": [110, 80, 60, 0.05, -0.02],
@@ -147,7 +148,7 @@ def test_one_or_two_threads_views_and_points_in_any_order_give_the_same_bits():
 def test_every_weight_is_a_switch(switch):
     (cloud, surface), views = world(), views_of("PINHOLE")
     masks = noise_masks(views)
-    read = lambda view: masks[view.name]  # noqa: E731
+    read = lambda view: masks[view.name]
     on, off = (fuse(cloud, views, read, surface, 5, settings) for settings in (SETTINGS, replace(SETTINGS, **switch)))
     assert (on.field.votes[:, 0] == off.field.votes[:, 0]).all()  # the same sightings
     assert on.field.votes[:, 1:].sum() < off.field.votes[:, 1:].sum()  # each factor only takes weight away

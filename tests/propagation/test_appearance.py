@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from sc3d.labelling.fusion import SEED, UNSEEN, Labels
 from sc3d.geometry.graph import build_graph
-from sc3d.propagation import Evidence, propagate
+from sc3d.propagation import propagate
 from sc3d.propagation.appearance import Raters
+from sc3d.propagation.propagate import Evidence
 from sc3d.propagation.terrain import relief_features
-from sc3d.settings import Propagate
+from sc3d.scene.labels import SEED, UNSEEN, Labels
+from sc3d.settings.labels import Propagate
 
 LAWN, ROOF, ROAD = 1, 2, 3
 

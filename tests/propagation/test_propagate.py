@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from sc3d.labelling.fusion import LOCKED, PROPAGATED, SEED, UNSEEN, Labels
-from sc3d.geometry.graph import Graph
+from sc3d.geometry.graph import Graph, build_graph, similarity
 from sc3d.geometry.neighbors import NeighborIndex, curvature
-from sc3d.propagation import Evidence, build_graph, grow, mean_field, potts_energy, propagate, similarity, tie_breakers, vote_nearest
-from sc3d.propagation.potts import free_energy, mean_field_sequential, softmax
-from sc3d.settings import Propagate
+from sc3d.propagation import propagate
+from sc3d.propagation.potts import free_energy, mean_field, mean_field_sequential, potts_energy, softmax
+from sc3d.propagation.propagate import Evidence, tie_breakers
+from sc3d.propagation.region_growing import grow, vote_nearest
+from sc3d.scene.labels import LOCKED, PROPAGATED, SEED, UNSEEN, Labels
+from sc3d.settings.labels import Propagate
 
 
 def plane(height: float = 0.0, count: int = 40, offset: float = 0.0) -> np.ndarray:

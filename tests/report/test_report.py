@@ -17,15 +17,19 @@ import pytest
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, look_at
 from sc3d.geometry.raycast import Surface, first_surface, surface_points
-from sc3d.io import write_geometry, write_image, write_json
+from sc3d.io.clouds import write_geometry
+from sc3d.io.images import write_image
+from sc3d.io.json_files import write_json
 from sc3d.report import write_report
+from sc3d.report.certainty import certainty_section
 from sc3d.report.charts import flight_map, histogram, paired_bars, reliability_curve
-from sc3d.report.images import comparison, ground_picture
 from sc3d.report.data import Material, gather
+from sc3d.report.images import comparison, ground_picture
 from sc3d.report.objects import class_areas, found_section
-from sc3d.report.sections import certainty_section, headline, processing_section, quality_section, summary_line
-from sc3d.scene.scene import Scene
+from sc3d.report.processing import processing_section
+from sc3d.report.sections import headline, quality_section, summary_line
 from sc3d.scene.labelled_cloud import LabelledSurface
+from sc3d.scene.scene import Scene
 
 UTM = np.array([500_000.0, 4_500_000.0, 100.0])
 GRASS, BUILDING = 1, 2

@@ -17,9 +17,9 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
-from tests.builders import views
 
 from sc3d.errors import InputError
+from tests.builders import views
 
 XYZ = ["property float x", "property float y", "property float z"]
 LITTLE = "binary_little_endian"

@@ -8,9 +8,19 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from tests.robustness.hostile_files import LITTLE, Reader, exif, labelled_ply, mesh_ply, picture, splats_ply, tracked_model
 from PIL import Image
+
 from tests.builders import CLASSES
+from tests.robustness.hostile_files import (
+    LITTLE,
+    Reader,
+    exif,
+    labelled_ply,
+    mesh_ply,
+    picture,
+    splats_ply,
+    tracked_model,
+)
 
 HERE = Path(__file__).parent
 TEXT = {".json", ".txt", ".xml", ".csv", ".xyz", ".obj", ".prj", ".asc"}
@@ -47,14 +57,14 @@ def _read_model(folder: Path) -> object:
 
 
 def _read_cloud(folder: Path) -> object:
-    from sc3d.io import read_cloud
+    from sc3d.io.clouds import read_cloud
 
     return [read_cloud(file) for file in sorted(folder.glob("*.*"))]
 
 
 def _read_mesh(folder: Path) -> object:
     from sc3d.geometry.raycast import Surface
-    from sc3d.io import read_mesh
+    from sc3d.io.clouds import read_mesh
 
     for file in sorted(folder.glob("*.ply")):
         mesh = read_mesh(file)
@@ -84,12 +94,11 @@ def _read_splats(folder: Path) -> object:
 
 
 @cache
-def _trainer():  # noqa: ANN202
-    from tests.splatting.test_trainer import SHORT, trace
-
+def _trainer():
     from sc3d.geometry.cameras import look_at, pinhole_view
-    from sc3d.splatting.train import TrainingData
+    from sc3d.splatting.dataset import TrainingData
     from sc3d.splatting.trainer import Trainer
+    from tests.splatting.test_trainer import SHORT, trace
 
     views = [pinhole_view(f"{i}.png", (96, 64), (90, 90, 48, 32), look_at(np.array([4 * np.cos(i), 3 * np.sin(i), 9]), np.zeros(3))) for i in range(3)]
     points = np.random.default_rng(0).uniform(-3, 3, (60, 3)) * [1, 1, 0.1]
@@ -116,7 +125,7 @@ def _build_photos(folder: Path) -> None:
 def _read_photos(folder: Path) -> object:
     from sc3d.georeferencing.focal import exif_focal
     from sc3d.georeferencing.geotags import read_geotag
-    from sc3d.io import find_photos, read_image
+    from sc3d.io.images import find_photos, read_image
     from sc3d.segmentation.mask_formats.import_masks import warn_of_turned
 
     photos = find_photos(folder)
@@ -129,8 +138,8 @@ def _build_masks(folder: Path) -> None:
 
 
 def _read_masks(folder: Path) -> object:
+    from sc3d.io.images import read_index_image
     from sc3d.scene.class_table import parse_classes
-    from sc3d.io import read_index_image
     from sc3d.scene.scene import match_masks
 
     table = parse_classes([{"id": i, "name": str(i), "color": [i, i, i]} for i in range(1, 4)], "test")
@@ -159,8 +168,8 @@ def _build_sidecars(folder: Path) -> None:
 
 def _read_sidecars(folder: Path) -> object:
     from sc3d.report.data import gather
-    from sc3d.scene.scene import Scene
     from sc3d.runner import _finished
+    from sc3d.scene.scene import Scene
 
     record = {"stage": "label", "settings": {"consensus": 0.66}, "inputs": {"cloud.ply": "00"}}
     return _finished(record, [folder / "seeds.ply"]), gather(Scene(folder)).records
@@ -230,14 +239,14 @@ def _read_strokes(folder: Path) -> object:
     return [strokes.paint(20, 15) for strokes in read_strokes(folder, folder / "photos", _many_classes())]
 
 
-def _many_classes():  # noqa: ANN202
+def _many_classes():
     from sc3d.scene.class_table import parse_classes
 
     names = ["building", "house", "wall", "road", "car", "tree", "grass", "water"]
     return parse_classes([{"id": 1 + row, "name": name, "color": [1 + row, 0, 0]} for row, name in enumerate(names)], "test")
 
 
-def _copy_mask_file(name: str):  # noqa: ANN202
+def _copy_mask_file(name: str):
     def build(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(HERE.parent / "segmentation" / "mask_files" / name, folder / Path(name).name)
@@ -251,7 +260,7 @@ def _read_project(folder: Path) -> object:
     from sc3d.importers.model import guess_observations
     from sc3d.importers.photos import locate_photos
     from sc3d.importers.project import project_files, read_project
-    from sc3d.settings import Import
+    from sc3d.settings.reconstruction import Import
 
     path = next((file for file in folder.iterdir() if file.suffix in (".xml",) or file.name.endswith("parameters.txt")), folder)
     project_files(path, Import())
@@ -259,7 +268,7 @@ def _read_project(folder: Path) -> object:
     return guess_observations(project.views[:1], project.points) if project.observations is None else project.observations
 
 
-def _build_project(kind: str):  # noqa: ANN202
+def _build_project(kind: str):
     def build(folder: Path) -> None:
         import test_imports as made
 
@@ -290,7 +299,7 @@ def _read_geometries(folder: Path) -> object:
     return [to_open3d(read_geometry(file)) for file in sorted(folder.iterdir())]
 
 
-def _build_las(suffix: str):  # noqa: ANN202
+def _build_las(suffix: str):
     def build(folder: Path) -> None:
         import test_imports as made
 
@@ -300,7 +309,7 @@ def _build_las(suffix: str):  # noqa: ANN202
     return build
 
 
-def _build_pcd(form: str):  # noqa: ANN202
+def _build_pcd(form: str):
     def build(folder: Path) -> None:
         import open3d as o3d
 
@@ -323,7 +332,7 @@ def _read_control_points(folder: Path) -> object:
     return read_control_points(folder / "gcp_list.txt", ["a.jpg", "b.jpg"])
 
 
-def _one(name: str, content) -> object:  # noqa: ANN001
+def _one(name: str, content) -> object:
     return lambda folder: _write(folder, **{name.replace(".", "__"): content() if callable(content) else content})
 
 

@@ -12,17 +12,17 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
-from tests.robustness.hostile_files import LITTLE, WORDS, damage, damage_json, ply
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from tests.robustness.readers import READERS, TEXT
 
-from sc3d.scene.class_table import ClassTable, parse_classes
 from sc3d.errors import InputError
-from sc3d.io.ply import TYPES, check_ply
 from sc3d.georeferencing.georeference import read_georeference
-from sc3d.io import read_cloud
+from sc3d.io.clouds import read_cloud
+from sc3d.io.ply import TYPES, check_ply
+from sc3d.scene.class_table import ClassTable, parse_classes
 from sc3d.scene.scene import Scene, match_masks
+from tests.robustness.hostile_files import LITTLE, WORDS, damage, damage_json, ply
+from tests.robustness.readers import READERS, TEXT
 
 QUICK = settings(derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck))
 SLOW = {"opensfm-place": 4, "control-points": 6, "splats": 8, "checkpoint": 8, "laz": 15, "photos": 15}  # examples: what takes longer to read
@@ -171,7 +171,7 @@ def test_faces_are_accepted_if_they_have_corners_that_exist(tmp_path_factory, co
 @settings(QUICK, max_examples=40)
 @given(st.integers(1, 40), st.integers(1, 40), st.randoms(use_true_random=False))
 def test_masks_are_read_as_they_were_written(tmp_path_factory, width, height, rng):
-    from sc3d.io import read_index_image, write_image
+    from sc3d.io.images import read_index_image, write_image
 
     folder = tmp_path_factory.mktemp("masks")
     mask = np.frombuffer(rng.randbytes(width * height), np.uint8).reshape(height, width)

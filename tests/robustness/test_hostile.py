@@ -12,17 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.robustness.hostile_files import patch, picture, refused, tracked_model
 from PIL import Image
-from tests.builders import views, write_bare_scene, write_model
 
 import sc3d
-from sc3d.scene.class_table import read_classes
 from sc3d.cli import main
 from sc3d.errors import InputError
-from sc3d.io import find_photos, image_size, read_image, read_index_image, read_json
+from sc3d.io.images import find_photos, image_size, read_image, read_index_image
+from sc3d.io.json_files import read_json
+from sc3d.scene.class_table import read_classes
 from sc3d.scene.scene import match_masks, read_sparse_model
-from sc3d.settings import View
+from sc3d.settings.outputs import View
+from tests.builders import views, write_bare_scene, write_model
+from tests.robustness.hostile_files import patch, picture, refused, tracked_model
 
 
 @pytest.fixture(scope="module", autouse=True)

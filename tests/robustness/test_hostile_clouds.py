@@ -6,14 +6,23 @@ import struct
 
 import numpy as np
 import pytest
-from tests.robustness.hostile_files import LITTLE, XYZ, labelled_ply, mesh_ply, patch, ply, refused, splats_ply
 
 from sc3d.errors import InputError
 from sc3d.io import record_walk as kernels
+from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.las import check_las
-from sc3d.io import read_cloud, read_mesh
 from sc3d.scene.labelled_cloud import read_labelled, read_votes
 from sc3d.splatting.gaussians import Gaussians
+from tests.robustness.hostile_files import (
+    LITTLE,
+    XYZ,
+    labelled_ply,
+    mesh_ply,
+    patch,
+    ply,
+    refused,
+    splats_ply,
+)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -166,9 +175,8 @@ def test_splats_that_cannot_be_rendered(tmp_path, row, column, value):
 
 
 def test_every_prefix_of_a_las_is_refused(tmp_path):
-    from tests.importers.test_importers import surveyed, write_las
-
     from sc3d.importers.clouds import read_geometry
+    from tests.importers.test_importers import surveyed, write_las
 
     for suffix in ("las", "laz"):
         path = write_las(tmp_path / f"a.{suffix}", surveyed(40))

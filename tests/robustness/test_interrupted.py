@@ -13,11 +13,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.builders import write_bare_scene
 
-from sc3d.io import atomic as files
 from sc3d.cli import main
+from sc3d.io import atomic as files
 from sc3d.io.atomic import atomic_path, remove_leftovers, telling_of_full_disk, temporary_name
+from tests.builders import write_bare_scene
 
 OUTPUTS = ("seeds.ply", "votes.npz", "labelled.ply")
 LABELS = (["label"], ["propagate", "--method", "knn"])

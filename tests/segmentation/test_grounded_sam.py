@@ -8,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.pretend_device import PretendDevice
 
-from sc3d.scene.class_table import parse_classes
 from sc3d.errors import InputError
-from sc3d.io import read_index_image, write_image
+from sc3d.io.images import read_index_image, write_image
+from sc3d.scene.class_table import parse_classes
 from sc3d.segmentation.grounded_sam import Detections, GroundedSam
 from sc3d.segmentation.models import IMAGENET, enlarge, outline, to_pixels
-from sc3d.segmentation.text_prompts import Prompt
-from sc3d.segmentation.segment import Folders, segment_photos
 from sc3d.segmentation.rle import fill_runs, find_runs
-from sc3d.settings import Segment
+from sc3d.segmentation.segment import Folders, segment_photos
+from sc3d.segmentation.text_prompts import Prompt
+from sc3d.settings.labels import Segment
+from tests.pretend_device import PretendDevice
 
 pytest_plugins = "tests.segmentation.tiny_sam3"
 
@@ -65,7 +65,12 @@ def test_nothing_found_is_unlabelled(models):
 
 def test_detections_equal_those_of_the_models_own_processor(models):
     """One prompt per class, so that the library's boxes and scores must come out, and its phrases name the class."""
-    from transformers import AutoTokenizer, GroundingDinoForObjectDetection, GroundingDinoImageProcessorPil, GroundingDinoProcessor
+    from transformers import (
+        AutoTokenizer,
+        GroundingDinoForObjectDetection,
+        GroundingDinoImageProcessorPil,
+        GroundingDinoProcessor,
+    )
 
     image = np.random.default_rng(5).integers(0, 256, (96, 128, 3)).astype(np.uint8)
     words = ["building", "parking lot", "trees"]

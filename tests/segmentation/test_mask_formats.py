@@ -15,18 +15,26 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sc3d.scene.class_table import parse_classes
 from sc3d.errors import InputError
-from sc3d.io import read_index_image, write_image
-from sc3d.segmentation.mask_formats.import_masks import MaskFiles, import_masks
+from sc3d.io.images import read_index_image, write_image
+from sc3d.runner import execute
+from sc3d.scene.class_table import parse_classes
+from sc3d.scene.scene import Scene
 from sc3d.segmentation.mask_formats import outlines
 from sc3d.segmentation.mask_formats.coco import decompress
 from sc3d.segmentation.mask_formats.drawing import paint
-from sc3d.segmentation.mask_formats.outlines import OutlineError, draw, ellipse, encode, polygons, rectangle, runs
-from sc3d.segmentation.mask_formats.source import detect
-from sc3d.scene.scene import Scene
-from sc3d.settings import Segment
-from sc3d.runner import execute
+from sc3d.segmentation.mask_formats.import_masks import import_masks
+from sc3d.segmentation.mask_formats.outlines import (
+    OutlineError,
+    draw,
+    ellipse,
+    encode,
+    polygons,
+    rectangle,
+    runs,
+)
+from sc3d.segmentation.mask_formats.source import MaskFiles, detect
+from sc3d.settings.labels import Segment
 
 FILES = Path(__file__).parent / "mask_files"
 SIZE = (96, 72)

@@ -11,7 +11,17 @@ from scipy import ndimage
 from sc3d.scene.class_table import parse_classes
 from sc3d.segmentation.instances import Instance, write_instances
 from sc3d.segmentation.rle import (
-    Window, area, bounds, clip_runs, cut_runs, encode_runs, fill_runs, find_runs, iou, join_runs, move_runs,
+    Window,
+    area,
+    bounds,
+    clip_runs,
+    cut_runs,
+    encode_runs,
+    fill_runs,
+    find_runs,
+    iou,
+    join_runs,
+    move_runs,
 )
 
 

@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sc3d.scene.class_table import parse_classes
 from sc3d.cli import main
-from sc3d.errors import InputError
+from sc3d.scene.class_table import parse_classes
+from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, deal, pick
 from sc3d.segmentation.strokes.features import pixel_features
+from sc3d.segmentation.strokes.files import NOTHING, PhotoStrokes, Shape, parse_shapes, read_strokes
 from sc3d.segmentation.strokes.guided_filter import fit_lines
 from sc3d.segmentation.strokes.novelty import learn_novelty
 from sc3d.segmentation.strokes.pixel_classifier import best_temperature
-from sc3d.segmentation.strokes.files import NOTHING, PhotoStrokes, Shape, parse_shapes, read_strokes
-from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, deal, pick
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CLASSES = [{"id": 1, "name": "road", "color": [150, 150, 160]}, {"id": 2, "name": "tree", "color": [40, 150, 60]}, {"id": 7, "name": "grass", "color": [170, 220, 110]}]

@@ -11,7 +11,14 @@ from scipy import ndimage
 from sc3d.segmentation.instances import Instance, drop_duplicates
 from sc3d.segmentation.merge import Areas
 from sc3d.segmentation.rle import Window, fill_runs, find_runs, iou, join_runs
-from sc3d.segmentation.tiled_inference import Findings, TiledObject, join_looks, join_tiles, list_tiles, segment_tiled
+from sc3d.segmentation.tiled_inference import (
+    Findings,
+    TiledObject,
+    join_looks,
+    join_tiles,
+    list_tiles,
+    segment_tiled,
+)
 
 
 def _unpack(instance: Instance) -> np.ndarray:

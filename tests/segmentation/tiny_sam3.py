@@ -76,7 +76,7 @@ def _save_sam3(folder: Path) -> None:
         tokenizer.save_pretrained(folder / name)
 
 
-def _clip_tokenizer(words: list[str]):  # noqa: ANN202 - a transformers.CLIPTokenizer
+def _clip_tokenizer(words: list[str]):
     """A byte-pair tokenizer that has a token for each word, and letters for all others."""
     from transformers import CLIPTokenizer
 

@@ -14,15 +14,15 @@ import torch
 from sc3d.cli import main
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import rays
-from sc3d.io import read_json
+from sc3d.io.json_files import read_json
+from sc3d.runner import sidecar
 from sc3d.scene.scene import Scene
-from sc3d.settings import Train
+from sc3d.settings.train import Train
 from sc3d.splatting import block_tasks
 from sc3d.splatting.blocks import restrict, share_settings, split_blocks, views_of
 from sc3d.splatting.dataset import scene_data
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.trainer import Trainer
-from sc3d.runner import sidecar
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+
+from sc3d.settings.train import TrainSettings
+from sc3d.splatting import gsplat_backend, trainer
+from sc3d.splatting.train import train
 from tests.pretend_device import PretendDevice
 from tests.splatting.test_analytic import photographed, ring, valley
 from tests.splatting.test_gsplat_backend import functions, reference  # noqa: F401, fixtures
-
-from sc3d.splatting import gsplat_backend, trainer
-from sc3d.settings.train import TrainSettings
-from sc3d.splatting.train import train
 
 
 def test_the_pretended_device_refuses_to_mix():

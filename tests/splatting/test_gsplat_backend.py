@@ -12,18 +12,25 @@ import types
 import numpy as np
 import pytest
 import torch
-from tests.splatting.test_analytic import photographed, ring, valley
-from tests.splatting.test_rendering import BACKGROUND, NAMES, images, make_gaussians, weighted_sum, with_gradients
 
 from sc3d.errors import InputError, MissingPackageError
 from sc3d.geometry.cameras import look_at, pinhole_view
+from sc3d.settings.train import TrainSettings
 from sc3d.splatting import device, gsplat_backend
+from sc3d.splatting.cpu.ssim import image_loss, image_loss_torch, ssim_loss
 from sc3d.splatting.gsplat_backend import Functions, render_gsplat, transmittances
 from sc3d.splatting.optimizer import RowAdam
 from sc3d.splatting.rendering import render
-from sc3d.settings.train import TrainSettings
-from sc3d.splatting.cpu.ssim import image_loss, image_loss_torch, ssim_loss
 from sc3d.splatting.trainer import Trainer
+from tests.splatting.test_analytic import photographed, ring, valley
+from tests.splatting.test_rendering import (
+    BACKGROUND,
+    NAMES,
+    images,
+    make_gaussians,
+    weighted_sum,
+    with_gradients,
+)
 
 TILE = 16
 

@@ -5,13 +5,13 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from tests.splatting.test_rendering import make_gaussians, make_view
 
 from sc3d.geometry.cameras import View, look_at, pinhole_view
 from sc3d.splatting.gaussians import SH_C0, Gaussians
 from sc3d.splatting.lifting import class_images, evidence_by_gradient, lift, painted, winners
-from tests.reference.splatting import render_reference
 from sc3d.splatting.rendering import render
+from tests.reference.splatting import render_reference
+from tests.splatting.test_rendering import make_gaussians, make_view
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

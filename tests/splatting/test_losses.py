@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from sc3d.geometry.cameras import look_at, pinhole_view, pixel_centres, rays
+from sc3d.geometry.view_selection import nearest_views, neighbour_views
 from sc3d.splatting import losses
 from sc3d.splatting.consistency import consistent, pinhole, pixel_rays, reprojection_error
 from sc3d.splatting.cpu.normal_loss import depth_normal_loss
-from sc3d.geometry.view_selection import nearest_views, neighbour_views
 
 SIZE, CALIBRATION = (96, 64), (90.0, 85.0, 50.0, 30.0)
 PLANE = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])

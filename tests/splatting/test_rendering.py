@@ -10,8 +10,8 @@ import torch
 
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.splatting.gaussians import Gaussians
-from tests.reference.splatting import render_reference, rotation_matrices
 from sc3d.splatting.rendering import render, unbiased_depth
+from tests.reference.splatting import render_reference, rotation_matrices
 
 NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 BACKGROUND = torch.tensor([0.2, 0.5, 0.7])

@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
-from tests.splatting.test_gaussians import random_gaussians
 
 from sc3d.splatting import strategy as densify
-from sc3d.splatting.strategy import DensifyLimits, Statistics
 from sc3d.splatting.optimizer import RowAdam
+from sc3d.splatting.strategy import DensifyLimits, Statistics
+from tests.splatting.test_gaussians import random_gaussians
 
 RATES = {"means": 0.01, "log_scales": 0.01, "quats": 0.01, "opacity_logits": 0.01, "sh": 0.01}
 

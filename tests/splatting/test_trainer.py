@@ -8,11 +8,12 @@ import torch
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import look_at, pinhole_view, rays
-from sc3d.splatting.evaluation import depth_map
-from sc3d.splatting.initialization import fill_points
 from sc3d.geometry.view_selection import neighbour_views
 from sc3d.settings.train import TrainSettings
-from sc3d.splatting.train import TrainingData, train, write_log
+from sc3d.splatting.dataset import TrainingData
+from sc3d.splatting.evaluation import depth_map
+from sc3d.splatting.initialization import fill_points
+from sc3d.splatting.train import train, write_log
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

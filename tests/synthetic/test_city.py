@@ -11,21 +11,26 @@ import numpy as np
 import open3d as o3d
 import pytest
 from scipy.spatial import cKDTree
-from tests.test_cli import fails
 
-from sc3d.cli import main
 from sc3d.geometry.cameras import View, in_image, local_origin, pixel_centres, project
 from sc3d.geometry.raycast import Surface, first_surface, surface_points
-from sc3d.io import read_cloud, read_index_image, read_mesh
+from sc3d.io.clouds import read_cloud, read_mesh
+from sc3d.io.images import read_index_image
 from sc3d.scene.scene import Scene
-from sc3d.settings import BenchmarkCity
+from sc3d.settings.synthesize import SynthesizeCity
 from sc3d.synthetic import city
 from sc3d.synthetic.city_files import open_cloud, open_mesh
 from sc3d.synthetic.city_flight import fly_over
 from sc3d.synthetic.mesh import GRASS, ROAD
+from tests.test_cli import fails as command_fails
+from tools.benchmark.__main__ import main
 
 EXTENT, SITES, POINTS = 60.0, (2, 1), 20_000
 OPTIONS = ["--sites", "2", "1", "--points-per-site", str(POINTS), "--views", "4", "--width", "160"]
+
+
+def fails(capsys, *arguments) -> str:
+    return command_fails(capsys, *arguments, command=main)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +49,7 @@ def made(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(city, "EXTENT", EXTENT)
         patch.setattr(city, "build_world", watched)
-        main(["benchmark", "city", str(path), *OPTIONS])
+        main(["city", str(path), *OPTIONS])
     return Scene(path), alive
 
 
@@ -137,7 +142,7 @@ def test_one_site_at_a_time(made):
 def test_sites_are_built_when_asked_for(monkeypatch):
     built = []
     monkeypatch.setattr(city, "build_world", lambda settings, level_edges: built.append(settings.seed))
-    sites = city.make_sites(BenchmarkCity(Path("x"), sites=(3, 2), seed=4))
+    sites = city.make_sites(SynthesizeCity(Path("x"), sites=(3, 2), seed=4))
     first = next(sites)
     assert built == [4000] and np.allclose(first.middle, [-120, -60, 0])
     assert [site.number for site in sites] == [1, 2, 3, 4, 5] and built == [4000 + number for number in range(6)]
@@ -150,7 +155,7 @@ def test_masks_err_and_flight_covers_the_city(made):
     assert 0.6 < json.loads((scene.path / "city.json").read_text())["mask_accuracy"] < 0.9
     assert len(scene.mask_files(scene.masks, scene.class_table())) == len(scene.mask_files(scene.confidence)) == 4
     assert np.abs(local_origin(views)[:2] - city.OFFSET[:2]).max() < 150
-    flown = fly_over((720.0, 600.0), BenchmarkCity(Path("x")))
+    flown = fly_over((720.0, 600.0), SynthesizeCity(Path("x")))
     ground = pixel_centres(72, 60) * 10 - [360, 300]
     seen = sum(in_image(view, project(view, np.c_[ground, np.zeros(len(ground))])[0]).astype(int) for view in flown)
     assert len(flown) == 200 and seen.min() >= 3 and 7 < np.median(seen) < 25
@@ -165,6 +170,6 @@ def test_unfinished_files_get_no_name(tmp_path):
 
 
 def test_bad_input(tmp_path, capsys):
-    assert "choose a new or empty folder" in fails(capsys, "benchmark", "city", tmp_path.parent)
-    assert "at least 1" in fails(capsys, "benchmark", "city", tmp_path / "new", "--sites", "0", "2")
+    assert "choose a new or empty folder" in fails(capsys, "city", tmp_path.parent)
+    assert "at least 1" in fails(capsys, "city", tmp_path / "new", "--sites", "0", "2")
     assert not (tmp_path / "new").exists()

@@ -15,15 +15,21 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import in_image, pixel_centres, project, rays
+from sc3d.geometry.cameras import in_image, project, rays
 from sc3d.scene.scene import read_sparse_model
-from sc3d.synthetic import SynthesizeSettings, build_world, fly, noisy_mask, photograph, synthesize, truth_cloud
+from sc3d.settings.synthesize import Synthesize
+from sc3d.synthetic.cloud import truth_cloud
 from sc3d.synthetic.exif import REFERENCE
+from sc3d.synthetic.flight import fly
+from sc3d.synthetic.generate import synthesize
 from sc3d.synthetic.ground import rect_distance
+from sc3d.synthetic.masks import noisy_mask
 from sc3d.synthetic.mesh import BUILDING, GRASS, OTHER, ROAD, TREE
 from sc3d.synthetic.objects import FLAT
+from sc3d.synthetic.photos import photograph
+from sc3d.synthetic.world import build_world
 
-SETTINGS = SynthesizeSettings(views=10, width=300, extent=80.0, altitude=40.0, num_points=40_000)
+SETTINGS = Synthesize(views=10, width=300, extent=80.0, altitude=40.0, num_points=40_000)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +50,7 @@ def photos(world, views):
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     path = tmp_path_factory.mktemp("scene")
-    settings = SynthesizeSettings(seed=5, views=4, width=120, extent=60.0, altitude=40.0, num_points=3000)
+    settings = Synthesize(seed=5, views=4, width=120, extent=60.0, altitude=40.0, num_points=3000)
     return path, settings, synthesize(path, settings)
 
 
@@ -233,14 +239,14 @@ def test_photos_of_somebody_else_are_not_touched(tmp_path):
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "DJI_0001.JPG").write_bytes(b"photo")
     with pytest.raises(InputError, match="choose an empty folder"):
-        synthesize(tmp_path, SynthesizeSettings(views=1, width=64))
+        synthesize(tmp_path, Synthesize(views=1, width=64))
     assert (tmp_path / "images" / "DJI_0001.JPG").read_bytes() == b"photo"
 
 
 @pytest.mark.parametrize("wrong", [{"views": 0}, {"width": 8}, {"extent": 5.0}, {"mask_noise": -1.0}])
 def test_impossible_settings_are_refused(wrong):
     with pytest.raises(InputError):
-        SynthesizeSettings(**wrong)
+        Synthesize(**wrong)
 
 
 def _digests(path: Path) -> dict[str, str]:

@@ -16,16 +16,17 @@ import open3d as o3d
 import pytest
 
 from sc3d.errors import InputError
-from sc3d.io import read_cloud, write_geometry
+from sc3d.io.chunked_clouds import CloudFile, write_ply
+from sc3d.io.clouds import read_cloud, write_geometry
 from sc3d.scene.scene import Scene
-from sc3d.settings import Evaluate, Label, Propagate
+from sc3d.settings.labels import Evaluate, Label, Propagate
+from sc3d.settings.synthesize import Synthesize
 from sc3d.stages import evaluate, label, propagate
-from sc3d.synthetic import SynthesizeSettings, synthesize
+from sc3d.synthetic.generate import synthesize
 from sc3d.tiling import evaluate as tiled_evaluate
 from sc3d.tiling import label as tiled_label
 from sc3d.tiling import memory as plan
 from sc3d.tiling import propagate as tiled_propagate
-from sc3d.io.chunked_clouds import CloudFile, write_ply
 from sc3d.tiling.memory import Parts, memory_of
 from sc3d.tiling.ranges import MeshParts, RangeMaps, read_triangles, write_ranges
 from sc3d.tiling.store import Survey, TileStore
@@ -38,7 +39,7 @@ NAMES = ("label", "confidence", "state", "num_views")
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "scene"
-    synthesize(folder, SynthesizeSettings(views=8, width=240, num_points=POINTS, seed=3))
+    synthesize(folder, Synthesize(views=8, width=240, num_points=POINTS, seed=3))
     for name, target in (("cloud.ply", "truth.ply"), ("mesh.ply", "truth_mesh.ply")):
         shutil.copy(folder / target, folder / name)
     return folder
@@ -47,7 +48,7 @@ def site(tmp_path_factory) -> Path:
 @pytest.fixture
 def small_tiles(monkeypatch):
     """Room for TILES points only, whatever a point needs."""
-    def room(resources, _):  # noqa: ANN001, ANN202
+    def room(resources, _):
         return TILES if resources.max_memory == "2G" else 10**9
 
     for module in (tiled_label, tiled_propagate, tiled_evaluate):
@@ -240,7 +241,7 @@ def test_a_killed_run_keeps_its_finished_tiles(site, small_tiles, monkeypatch):
     expected = run_label(site, "uninterrupted", max_memory="2G")
     original, done = tiled_label.label_tile, []
 
-    def stops(job, tile):  # noqa: ANN001, ANN202
+    def stops(job, tile):
         if len(done) == 3:
             raise KeyboardInterrupt
         original(job, tile)

@@ -8,24 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.builders import write_bare_scene
-from tests.test_cli import fails
 
-from tools.benchmark import opensplat
-from tools.benchmark import training
+from sc3d.geometry.cameras import look_at, pinhole_view
+from sc3d.io.images import read_image
+from sc3d.scene.scene import read_sparse_model
+from sc3d.splatting.cpu import rasterization as kernels_raster
+from sc3d.splatting.gaussians import Gaussians
+from tests.builders import write_bare_scene
+from tests.reference.splatting import _alphas, rotation_matrices
+from tests.test_cli import fails as command_fails
+from tools.benchmark import opensplat, training
+from tools.benchmark.__main__ import main
 from tools.benchmark.fragments import count_fragments
 from tools.benchmark.machine import Stopwatch, fma_gflops, replaced
 from tools.benchmark.speed_table import markdown, reference_ratio
 from tools.benchmark.workload import FRAGMENTS, VISIBLE_SHARE, build_workload, synthetic_ground
-from sc3d.cli import main
-from sc3d.geometry.cameras import look_at, pinhole_view
-from sc3d.io import read_image
-from sc3d.scene.scene import read_sparse_model
-from sc3d.splatting.cpu import rasterization as kernels_raster
-from sc3d.splatting.gaussians import Gaussians
-from tests.reference.splatting import _alphas, rotation_matrices
 
-TINY = ["benchmark", "speed", "--gaussians", "600", "--sizes", "64"]
+TINY = ["speed", "--gaussians", "600", "--sizes", "64"]
 RIVAL = """#!{python}
 import pathlib, sys, time
 arguments = sys.argv[1:]
@@ -35,6 +34,10 @@ end = time.process_time() + 0.05 + 0.03 * int(arguments[arguments.index("-n") + 
 while time.process_time() < end:
     pass
 """
+
+
+def fails(capsys, *arguments) -> str:
+    return command_fails(capsys, *arguments, command=main)
 
 
 @pytest.fixture(scope="module")
@@ -137,9 +140,9 @@ def test_missing_and_broken_rival(tmp_path, capsys, caplog):
 
 def test_bad_input(tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
-        main(["benchmark"])
+        main([])
     assert stopped.value.code == 2
-    assert "at least 100" in fails(capsys, "benchmark", "speed", "--gaussians", "3")
+    assert "at least 100" in fails(capsys, "speed", "--gaussians", "3")
     assert ".json" in fails(capsys, *TINY, "--output", tmp_path / "speed.txt")
     assert "no cameras" in fails(capsys, *TINY, "--scene", tmp_path)
     assert "sparse points" in fails(capsys, *TINY, "--scene", write_bare_scene(tmp_path / "bare"))
@@ -163,7 +166,7 @@ def test_reference_ratio_needs_a_measured_configuration():
 
 
 def test_help_imports_nothing_heavy():
-    code = ("import sys\nfrom sc3d.cli import main\ntry:\n    main(['benchmark', 'speed', '--help'])\nexcept SystemExit: pass\n"
+    code = ("import sys\nfrom tools.benchmark.__main__ import main\ntry:\n    main(['speed', '--help'])\nexcept SystemExit: pass\n"
             "assert not {'torch', 'numba', 'open3d', 'numpy'} & set(sys.modules)")
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 0 and "--opensplat" in result.stdout, result.stderr

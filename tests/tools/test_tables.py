@@ -8,24 +8,28 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 import torch
-from tests.builders import ground, truth_mask, views, write_bare_scene
-from tests.test_cli import fails
 
-from tools.benchmark import fusion_rivals
-from tools.benchmark import surface
-from tools.benchmark import tables
+from sc3d.errors import InputError
+from sc3d.geometry.cameras import local_origin
+from sc3d.io.clouds import read_cloud
+from sc3d.io.images import read_index_image
+from sc3d.labelling.fusion import Cloud
+from sc3d.scene.scene import Scene
+from sc3d.settings.labels import Label, Propagate
+from sc3d.splatting.gaussians import Gaussians
+from tests.builders import ground, truth_mask, views, write_bare_scene
+from tests.test_cli import fails as command_fails
+from tools.benchmark import fusion_rivals, surface, tables
+from tools.benchmark.__main__ import main
 from tools.benchmark.fusion_page import markdown as fusion_markdown
 from tools.benchmark.surface_page import page, voxel_size_of
-from tools.benchmark.table_page import DEFAULT, DIFFERENCES, OURS, markdown, spread
-from tools.benchmark.table_rows import ablation, helps, turned
-from sc3d.cli import main
-from sc3d.errors import InputError
-from sc3d.labelling.fusion import Cloud
-from sc3d.geometry.cameras import local_origin
-from sc3d.io import read_cloud, read_index_image
-from sc3d.scene.scene import Scene
-from sc3d.settings import Label, Propagate
-from sc3d.splatting.gaussians import Gaussians
+from tools.benchmark.table_page import DIFFERENCES, markdown, spread
+from tools.benchmark.table_rows import DEFAULT, OURS, ablation, turned
+from tools.make_manual import helps
+
+
+def fails(capsys, *arguments) -> str:
+    return command_fails(capsys, *arguments, command=main)
 
 
 def run(*arguments) -> None:
@@ -44,7 +48,7 @@ def command(path: Path) -> list:
     scene = path / "given"
     if not scene.exists():
         write_bare_scene(scene)
-    return ["benchmark", "tables", path, "--scenes", scene, "--seeds", "0", "--noises", "1", "--views", "6", "--width", "160", "--points", "20000", "--every", "1"]
+    return ["tables", path, "--scenes", scene, "--seeds", "0", "--noises", "1", "--views", "6", "--width", "160", "--points", "20000", "--every", "1"]
 
 
 @pytest.fixture(scope="module")
@@ -154,8 +158,8 @@ def test_page_shows_means_spread_and_differences():
 def test_bad_input(folder, tmp_path, capsys):
     with pytest.raises(InputError, match="not \\(6, 160, 999\\)|999"):
         tables.synthetic_scene(folder / "seed0", tables.Synthesize(views=6, width=160, num_points=999))
-    assert "cloud.ply" in fails(capsys, "benchmark", "tables", tmp_path, "--scenes", folder / "rows")
-    assert "at least one scene" in fails(capsys, "benchmark", "tables", tmp_path, "--every", "0")
+    assert "cloud.ply" in fails(capsys, "tables", tmp_path, "--scenes", folder / "rows")
+    assert "at least one scene" in fails(capsys, "tables", tmp_path, "--every", "0")
 
 
 def test_z_buffer_voter_and_scikit_learn_find_the_classes():
@@ -170,7 +174,7 @@ def test_z_buffer_voter_and_scikit_learn_find_the_classes():
 
 def test_fusion_speed(folder, tmp_path):
     output = tmp_path / "speed.json"
-    run("benchmark", "fusion-speed", folder / "seed0_noise1", "--points", "3000", "6000", "--views", "4", "12", "--repeats", "1", "--output", output)
+    run("fusion-speed", folder / "seed0_noise1", "--points", "3000", "6000", "--views", "4", "12", "--repeats", "1", "--output", output)
     record = json.loads(output.read_text())
     assert record["rays"] == 6 * 160 * 107 and [row["views"] for row in record["growth_views"]] == [4, 12]
     assert [row["points"] for row in record["growth_points"]] == [3000, 6000]
@@ -189,10 +193,10 @@ def test_surface_of_the_truth_itself_is_perfect(folder, tmp_path, monkeypatch, c
     points = torch.tensor(read_cloud(truth.path / "truth.ply").point.positions.numpy() - local_origin(truth.model.views)).float()
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(points), 1)
     Gaussians(points, torch.full_like(points, np.log(0.4)), quats, torch.full((len(points),), 4.0), torch.zeros(len(points), 1, 3)).save(scene / "gaussians.ply")
-    assert "--voxel-size" in fails(capsys, "benchmark", "surface", scene, truth.path)
+    assert "--voxel-size" in fails(capsys, "surface", scene, truth.path)
     (scene / "mesh.ply.json").write_text(json.dumps({"summary": {"voxel_size": 0.25}}))
     assert voxel_size_of(Scene(scene)) == 0.25
-    run("benchmark", "surface", scene, truth.path, "--output", tmp_path / "surface.json")
+    run("surface", scene, truth.path, "--output", tmp_path / "surface.json")
     found = json.loads((tmp_path / "surface.json").read_text())["figures"]
     assert found["accuracy"] == 1 and set(found["completeness"].values()) == {1.0} and found["voxel_size"] == 0.25 and found["hit"] > 0.95
     assert (tmp_path / "surface.md").read_text() == page("scene", surface.SurfaceFigures(**found))

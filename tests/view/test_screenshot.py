@@ -12,15 +12,26 @@ import open3d as o3d
 import pycolmap
 import pytest
 
-from sc3d.scene.class_table import parse_classes
 from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View, in_image, look_at, pinhole_view, project, undistorted
+from sc3d.scene.class_table import parse_classes
 from sc3d.scene.labelled_cloud import LabelledSurface
-from sc3d.view import COLOURINGS, STATES, Style, aerial_view, color_points, draw_points, screenshot, show
-from sc3d.view.viewpoints import frusta
-from sc3d.view.colors import CONTESTED, color_scale, disagreement, disagreement_colors, shaded
+from sc3d.view import screenshot
+from sc3d.view.colors import (
+    COLOURINGS,
+    CONTESTED,
+    STATES,
+    color_points,
+    color_scale,
+    disagreement,
+    disagreement_colors,
+    shaded,
+)
 from sc3d.view.picking import Inspector
 from sc3d.view.renderers import vulkan_works
+from sc3d.view.screenshot import Style, draw_points
+from sc3d.view.viewpoints import aerial_view, frusta
+from sc3d.view.window import show
 
 UTM = np.array([500_000.0, 4_500_000.0, 100.0])
 CLASSES = parse_classes([{"id": 1, "name": "grass", "color": [124, 179, 66]}, {"id": 4, "name": "building", "color": [214, 60, 60]}], "test")
@@ -254,9 +265,9 @@ def test_without_display_the_window_names_the_screenshot(monkeypatch, tmp_path):
 
 
 def test_where_nothing_can_render_the_error_names_the_two_packages():
-    script = ("import sys; sys.path.insert(0, {!r}); from tests.view import test_screenshot as test_view; from sc3d.errors import Sc3dError; from sc3d.view import screenshot\n"
+    script = (f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from tests.view import test_screenshot as test_view; from sc3d.errors import Sc3dError; from sc3d.view import screenshot\n"
               "try: screenshot(test_view.full_cloud(), None, (64, 64), class_table=test_view.CLASSES)\n"
-              "except Sc3dError as error: sys.exit(str(error))").format(str(Path(__file__).parents[2]))
+              "except Sc3dError as error: sys.exit(str(error))")
     hidden = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent.json"}
     environment = {name: value for name, value in os.environ.items() if name != "DISPLAY"} | hidden
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=300, check=False)
@@ -267,8 +278,8 @@ def test_where_nothing_can_render_the_error_names_the_two_packages():
 
 def test_without_any_vulkan_driver_the_other_renderer_is_used():
     """The missing driver aborts Open3D, which must not reach this process."""
-    script = ("import sys; sys.path.insert(0, {!r}); from tests.view import test_screenshot as test_view; from sc3d.view.renderers import vulkan_works\n"
-              "assert not vulkan_works(); test_view.check_exactness('auto')").format(str(Path(__file__).parents[2]))
+    script = (f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from tests.view import test_screenshot as test_view; from sc3d.view.renderers import vulkan_works\n"
+              "assert not vulkan_works(); test_view.check_exactness('auto')")
     environment = os.environ | {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=300, check=False)
     if "cannot render pictures here" in done.stderr:

@@ -8,18 +8,27 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tests.builders import ORIGIN, views, write_model
 
 from sc3d.cli import main
-from sc3d.geometry.cameras import look_at, local_origin, pinhole_view, project, undistorted
-from sc3d.io import read_image, write_image
-from sc3d.splatting.gaussians import SH_C0, Gaussians
-from sc3d.view.splat_images import chosen_views, compare, rendered, training_rows
-from sc3d.splatting.rendering import render
+from sc3d.geometry.cameras import local_origin, look_at, pinhole_view, project, undistorted
+from sc3d.io.images import read_image, write_image
 from sc3d.settings.train import TrainSettings
-from sc3d.splatting.train import TrainingData, TrainResult
+from sc3d.splatting.dataset import TrainingData
+from sc3d.splatting.gaussians import SH_C0, Gaussians
+from sc3d.splatting.rendering import render
+from sc3d.splatting.train import TrainResult
+from sc3d.view.contact_sheet import (
+    contact_sheet,
+    depth_colors,
+    depth_range,
+    half_of,
+    normal_colors,
+    side_by_side,
+    write_training_sheet,
+)
 from sc3d.view.flight_video import flight_path
-from sc3d.view.contact_sheet import contact_sheet, depth_colors, depth_range, half_of, normal_colors, side_by_side, write_training_sheet
+from sc3d.view.splat_images import chosen_views, compare, rendered, training_rows
+from tests.builders import ORIGIN, views, write_model
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -41,7 +50,7 @@ def make_gaussians(half: float = 4.0) -> Gaussians:
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(part)) for part in parts))
 
 
-def view_of(centre: tuple[float, float, float], size: tuple[int, int] = (120, 90)):  # noqa: ANN201
+def view_of(centre: tuple[float, float, float], size: tuple[int, int] = (120, 90)):
     """A view whose principal point is not the middle, image top towards the north-east."""
     calibration = (110, 114, size[0] / 2 + 5, size[1] / 2 - 3)
     return pinhole_view("some photo.jpg", size, calibration, look_at(np.array(centre, float), np.array([0.3, 0.2, 0]), (0.4, 1, 0.3)))

@@ -1,21 +1,32 @@
-"""Measurements: `sc3d benchmark speed`, `tables`, `fusion-speed`, `surface` and `city`."""
+"""Measurements: `python -m tools.benchmark {speed,surface,tables,fusion-speed,city} --help`."""
 
 from __future__ import annotations
 
 import importlib
+import sys
 
-from sc3d import settings
+import tyro
 
-RUNS = {
+from sc3d.cli import reporting_errors
+from tools.benchmark import settings
+
+RUNS: dict[type, tuple[str, str]] = {
     settings.BenchmarkSpeed: ("speed", "run_speed"),
     settings.BenchmarkTables: ("tables", "run_tables"),
     settings.BenchmarkFusionSpeed: ("fusion_speed", "run_fusion_speed"),
     settings.BenchmarkSurface: ("surface_page", "run_surface"),
-    settings.BenchmarkCity: ("city", "run_city"),
+    settings.SynthesizeCity: ("city", "run_city"),
 }
 
 
-def main(command: settings.Benchmark) -> None:
-    """Run the benchmark that the record stands for; only its own imports count in its memory."""
+def main(arguments: list[str] | None = None) -> None:
+    """Run the benchmark whose record the arguments make; only its own imports count in its memory."""
+    description = "Measure sc3d on this machine."
+    command = tyro.cli(settings.Benchmark, args=arguments, prog="python -m tools.benchmark", description=description)
     module, function = RUNS[type(command)]
-    getattr(importlib.import_module(f"tools.benchmark.{module}"), function)(command)
+    with reporting_errors():
+        getattr(importlib.import_module(f"tools.benchmark.{module}"), function)(command)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

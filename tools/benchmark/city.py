@@ -6,16 +6,16 @@ import logging
 import time
 
 from sc3d.errors import InputError
-from sc3d.io.atomic import remove_leftovers
-from sc3d.io import write_json
-from sc3d.settings import BenchmarkCity
-from sc3d.runner import peak_memory_mb, require_writable, versions
+from sc3d.io.atomic import remove_leftovers, require_writable
+from sc3d.io.json_files import write_json
+from sc3d.io.provenance import peak_memory_mb, versions
+from sc3d.settings.synthesize import SynthesizeCity
 from sc3d.synthetic.city import synthesize_city
 
 logger = logging.getLogger(__name__)
 
 
-def run_city(command: BenchmarkCity) -> None:
+def run_city(command: SynthesizeCity) -> None:
     """Make the city; its sizes, the time and the memory go to SCENE/city.json."""
     if min(*command.sites, command.points_per_site, command.views) < 1 or command.width < 32:
         raise InputError("sites, points and views must be at least 1, the width at least 32 px")

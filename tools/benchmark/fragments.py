@@ -5,15 +5,37 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from tools.benchmark.machine import replaced
 from sc3d.geometry.cameras import View
 from sc3d.splatting.cpu import rasterization as kernels_raster
-from sc3d.splatting.gaussians import Gaussians
-from sc3d.splatting.cpu.tile_binning import TILE
 from sc3d.splatting.cpu.projection import RECORD
-from sc3d.splatting.cpu.rasterization import CHECK, LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, PLANE, STRIDE, finished, measure_rows, open_tile
-from sc3d.splatting.cpu.simd import LANES, any_at_least, exp2, fma, load, minimum, ramp, splat, store, total, where_at_least
+from sc3d.splatting.cpu.rasterization import (
+    CHECK,
+    LOG2_MIN_ALPHA,
+    MAX_ALPHA,
+    MIN_TRANSMITTANCE,
+    PLANE,
+    STRIDE,
+    finished,
+    measure_rows,
+    open_tile,
+)
+from sc3d.splatting.cpu.simd import (
+    LANES,
+    any_at_least,
+    exp2,
+    fma,
+    load,
+    minimum,
+    ramp,
+    splat,
+    store,
+    total,
+    where_at_least,
+)
+from sc3d.splatting.cpu.tile_binning import TILE
+from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.rendering import render
+from tools.benchmark.machine import replaced
 
 
 def count_fragments(gaussians: Gaussians, view: View) -> tuple[float, float, float]:

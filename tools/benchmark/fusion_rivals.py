@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import open3d as o3d
 
-from sc3d.labelling.fusion import Cloud, Mask
 from sc3d.geometry.cameras import View, in_image, project, rays
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import Surface
+from sc3d.labelling.fusion import Cloud, Mask
 
 NUM_NEIGHBORS = 16
 DEPTH_TOLERANCE = 0.01  # of the depth

@@ -12,21 +12,23 @@ from functools import cached_property
 
 import numpy as np
 
+from sc3d.errors import InputError
+from sc3d.geometry.cameras import View, local_origin
+from sc3d.geometry.raycast import Surface
+from sc3d.io.clouds import read_cloud, read_mesh
+from sc3d.io.provenance import peak_memory_mb, reset_peak_memory, versions
+from sc3d.labelling.fusion import Cloud, Fusion, Mask, fuse
+from sc3d.labelling.inputs import Masks
+from sc3d.propagation import propagate as complete
+from sc3d.propagation.propagate import Evidence
+from sc3d.scene.labelled_cloud import point_arrays, read_surface, spacing_of
+from sc3d.scene.labels import Labels
+from sc3d.scene.scene import Scene
+from sc3d.settings.labels import Label, Propagate
 from tools.benchmark import fusion_rivals as rivals
 from tools.benchmark.fusion_page import markdown
 from tools.benchmark.publish import check_output, publish
-from sc3d.errors import InputError
-from sc3d.labelling.fusion import Cloud, Fusion, Labels, Mask, fuse
-from sc3d.geometry.cameras import View, local_origin
-from sc3d.geometry.raycast import Surface
-from sc3d.io import read_cloud, read_mesh
-from sc3d.scene.labelled_cloud import point_arrays, read_surface, spacing_of
-from sc3d.labelling.inputs import Masks
-from sc3d.propagation import Evidence
-from sc3d.propagation import propagate as complete
-from sc3d.scene.scene import Scene
-from sc3d.settings import BenchmarkFusionSpeed, Label, Propagate
-from sc3d.runner import peak_memory_mb, reset_peak_memory, versions
+from tools.benchmark.settings import BenchmarkFusionSpeed
 
 logger = logging.getLogger(__name__)
 
@@ -136,7 +138,7 @@ def _grown(workload: Workload, num_views: int) -> dict[str, float]:
     """Seconds and peak memory of label and of propagate at one size."""
     workload = _cut(workload, None, num_views)
     rivals.cast_only(workload.surface, rivals.ray_bundles(workload.surface, workload.views[:1]))  # the first cast builds the tree
-    workload.voxel_size  # noqa: B018 - not to be timed either
+    workload.voxel_size
     cpu, wall, peak, fusion = _timed(lambda: _label(workload))
     record = {"points": len(workload.cloud.points), "views": num_views, "voxels": len(np.unique(fusion.cells // 2)),
               "label_cpu_seconds": cpu, "label_wall_seconds": wall, "label_peak_memory_mb": peak}

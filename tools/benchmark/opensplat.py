@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from tools.benchmark.workload import Workload
 from sc3d.errors import InputError, Sc3dError
-from sc3d.io import write_image
+from sc3d.io.images import write_image
 from sc3d.splatting.gaussians import SH_C0
+from tools.benchmark.workload import Workload
 
 REFERENCE_GFLOPS = 40.0  # per core of the machine that the figures below are from
 REFERENCE_CPU_SECONDS = {(50_000, 496): 0.885, (200_000, 496): 1.64, (50_000, 993): 6.43, (200_000, 993): 8.55}

@@ -6,8 +6,8 @@ import logging
 from pathlib import Path
 
 from sc3d.errors import InputError
-from sc3d.io import atomic_path, write_json
-from sc3d.runner import require_writable
+from sc3d.io.atomic import atomic_path, require_writable
+from sc3d.io.json_files import write_json
 
 logger = logging.getLogger(__name__)
 

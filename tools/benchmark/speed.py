@@ -9,15 +9,15 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
+from sc3d.errors import InputError, Sc3dError
+from sc3d.io.provenance import versions
+from sc3d.scene.scene import Scene
 from tools.benchmark.opensplat import cpu_seconds_per_iteration, find_binary, write_project
 from tools.benchmark.publish import check_output, publish
+from tools.benchmark.settings import BenchmarkSpeed
 from tools.benchmark.speed_table import markdown
 from tools.benchmark.training import measure_steps, measure_training
 from tools.benchmark.workload import Ground, build_workload, ground_of, synthetic_ground
-from sc3d.errors import InputError, Sc3dError
-from sc3d.scene.scene import Scene
-from sc3d.settings import BenchmarkSpeed
-from sc3d.runner import versions
 
 logger = logging.getLogger(__name__)
 

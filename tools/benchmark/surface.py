@@ -10,7 +10,8 @@ from tqdm import tqdm
 
 from sc3d.geometry.cameras import View, local_origin, undistorted
 from sc3d.geometry.raycast import Surface, first_surface, see_points
-from sc3d.io import read_cloud, read_index_image, read_mesh
+from sc3d.io.clouds import read_cloud, read_mesh
+from sc3d.io.images import read_index_image
 from sc3d.scene.scene import Scene
 from sc3d.splatting.evaluation import depth_map
 from sc3d.splatting.gaussians import Gaussians
@@ -93,7 +94,7 @@ def _samples(scene: Scene, origin: np.ndarray) -> np.ndarray:
     return np.einsum("nc,ncd->nd", np.stack([1 - s, s * (1 - t), s * t], axis=1), corners[chosen])
 
 
-def _surface(path, origin: np.ndarray) -> Surface:  # noqa: ANN001 - Path
+def _surface(path, origin: np.ndarray) -> Surface:
     mesh = read_mesh(path)
     return Surface.from_mesh(mesh.vertex.positions.numpy() - origin, mesh.triangle.indices.numpy(), np.zeros(3))
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from tools.benchmark.publish import check_output, publish
-from tools.benchmark.surface import MIN_ALPHA, WITHIN, SurfaceFigures, surface_figures
 from sc3d.errors import InputError
-from sc3d.io import read_json
+from sc3d.io.json_files import read_json
+from sc3d.io.provenance import versions
+from sc3d.runner import sidecar
 from sc3d.scene.scene import Scene
-from sc3d.settings import BenchmarkSurface
-from sc3d.runner import sidecar, versions
+from tools.benchmark.publish import check_output, publish
+from tools.benchmark.settings import BenchmarkSurface
+from tools.benchmark.surface import MIN_ALPHA, WITHIN, SurfaceFigures, surface_figures
 
 
 def run_surface(command: BenchmarkSurface) -> None:

@@ -7,8 +7,9 @@ import json
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Literal, get_args, get_origin, get_type_hints
 
+from sc3d.settings.common import Resources
+from sc3d.settings.labels import Label, Propagate
 from tools.make_manual import helps
-from sc3d.settings import Label, Propagate, Resources
 
 OURS, DEFAULT = "conflict-lock + geometry", "sc3d as it is by default"
 NO_FILTER = Label(depth_filter=False)

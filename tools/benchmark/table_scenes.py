@@ -11,16 +11,20 @@ import numpy as np
 from tqdm import tqdm
 
 from sc3d.errors import InputError
-from sc3d.labelling.fusion import Cloud
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import Surface, first_surface, nearest_points
-from sc3d.io import atomic_path, read_cloud, read_index_image, write_image
-from sc3d.scene.labelled_cloud import REACH, point_arrays, read_surface, spacing_of
+from sc3d.io.atomic import atomic_path
+from sc3d.io.clouds import read_cloud
+from sc3d.io.images import read_index_image, write_image
+from sc3d.labelling.fusion import Cloud
 from sc3d.labelling.inputs import Masks, point_density
 from sc3d.metrics import Confusion, JudgedPixels, depth_edge_band
+from sc3d.scene.labelled_cloud import REACH, point_arrays, read_surface, spacing_of
 from sc3d.scene.scene import Scene
-from sc3d.synthetic import SynthesizeSettings, noisy_mask, synthesize
+from sc3d.settings.synthesize import Synthesize
+from sc3d.synthetic.generate import synthesize
+from sc3d.synthetic.masks import noisy_mask
 
 logger = logging.getLogger(__name__)
 
@@ -51,7 +55,7 @@ class Place:
         return self.scene.class_table().num_ids
 
 
-def synthetic_scene(folder: Path, settings: SynthesizeSettings) -> Scene:
+def synthetic_scene(folder: Path, settings: Synthesize) -> Scene:
     """The scene of a seed in `folder`; made if it is not there yet. InputError if another scene is."""
     scene = Scene(folder)
     if not all(path.exists() for path in (scene.classes, folder / "truth.ply", folder / "truth_mesh.ply")):  # classes.json is written last
@@ -65,7 +69,7 @@ def synthetic_scene(folder: Path, settings: SynthesizeSettings) -> Scene:
     return scene
 
 
-def with_masks(scene: Scene, folder: Path, settings: SynthesizeSettings) -> Scene:
+def with_masks(scene: Scene, folder: Path, settings: Synthesize) -> Scene:
     """A scene folder with the same world and photos (links) and masks of strength `settings.mask_noise`, as `synthesize` makes them."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, target in LINKS.items():

@@ -13,23 +13,32 @@ from functools import cache, cached_property
 from itertools import groupby
 from pathlib import Path
 
-import numpy as np
-
 import sc3d
-from tools.benchmark.publish import publish
-from tools.benchmark.table_page import MASKS, markdown
-from tools.benchmark.table_rows import Row, tables
-from tools.benchmark.table_scenes import Place, judge_masks, load_place, synthetic_scene, with_density, with_masks
 from sc3d.errors import InputError
-from sc3d.labelling.fusion import Cloud, Fusion, Labels, fuse
-from sc3d.io import digest, write_json
+from sc3d.io.atomic import require_writable
+from sc3d.io.json_files import write_json
+from sc3d.io.provenance import digest, peak_memory_mb, reset_peak_memory, versions
+from sc3d.labelling.fusion import Cloud, Fusion, fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size
 from sc3d.metrics import Confusion
-from sc3d.propagation import Evidence
 from sc3d.propagation import propagate as complete
+from sc3d.propagation.propagate import Evidence
+from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
-from sc3d.settings import BenchmarkTables, Label, Propagate, Synthesize
-from sc3d.runner import peak_memory_mb, require_writable, reset_peak_memory, versions
+from sc3d.settings.labels import Label, Propagate
+from sc3d.settings.synthesize import Synthesize
+from tools.benchmark.publish import publish
+from tools.benchmark.settings import BenchmarkTables
+from tools.benchmark.table_page import MASKS, markdown
+from tools.benchmark.table_rows import Row, tables
+from tools.benchmark.table_scenes import (
+    Place,
+    judge_masks,
+    load_place,
+    synthetic_scene,
+    with_density,
+    with_masks,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -163,7 +172,7 @@ def judge(place: Place, labels: Labels) -> dict[str, dict]:
     return figures | {"reliability": place.judged.reliability(labels.label, labels.confidence).summary()}
 
 
-def _areas(confusions: tuple[Confusion, Confusion], table) -> dict[str, dict]:  # noqa: ANN001 - ClassTable
+def _areas(confusions: tuple[Confusion, Confusion], table) -> dict[str, dict]:
     near, elsewhere = confusions
     parts = {"all": near + elsewhere, "near_edges": near, "elsewhere": elsewhere}
     return {name: confusion.summary(table) for name, confusion in parts.items()}

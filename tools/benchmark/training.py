@@ -7,21 +7,21 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from sc3d.io.provenance import peak_memory_mb, reset_peak_memory
+from sc3d.settings.train import TrainSettings
+from sc3d.splatting import rendering as render
+from sc3d.splatting.cpu import projection as kernels_project
+from sc3d.splatting.cpu import projection_backward as kernels_backproject
+from sc3d.splatting.cpu import rasterization as kernels_raster
+from sc3d.splatting.cpu import rasterization_backward as kernels_unraster
+from sc3d.splatting.cpu import ssim
+from sc3d.splatting.dataset import TrainingData
+from sc3d.splatting.optimizer import RowAdam
+from sc3d.splatting.strategy import current
+from sc3d.splatting.trainer import Trainer
 from tools.benchmark.fragments import count_fragments
 from tools.benchmark.machine import Stopwatch, fma_gflops, num_threads, use_threads
 from tools.benchmark.workload import Workload
-from sc3d.splatting.cpu import projection_backward as kernels_backproject
-from sc3d.splatting.cpu import projection as kernels_project
-from sc3d.splatting.cpu import rasterization as kernels_raster
-from sc3d.splatting.cpu import rasterization_backward as kernels_unraster
-from sc3d.splatting import rendering as render
-from sc3d.splatting.cpu import ssim
-from sc3d.splatting.strategy import current
-from sc3d.splatting.optimizer import RowAdam
-from sc3d.settings.train import TrainSettings
-from sc3d.splatting.train import TrainingData
-from sc3d.splatting.trainer import Trainer
-from sc3d.runner import peak_memory_mb, reset_peak_memory
 
 # what the renderer calls for each stage; `loss`, `adam` and `total` are timed around the calls
 FUNCTIONS = {

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from tools.benchmark.fragments import count_fragments
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, local_origin, look_at, pinhole_view, project, undistorted
+from sc3d.geometry.view_selection import neighbour_views
 from sc3d.scene.scene import SparseModel
 from sc3d.splatting.gaussians import Gaussians
-from sc3d.geometry.view_selection import neighbour_views
 from sc3d.splatting.rendering import render
+from tools.benchmark.fragments import count_fragments
 
 FRAGMENTS = 23.0  # contributing, per pixel
 VISIBLE_SHARE = 0.2  # of the Gaussians, in one view

@@ -11,7 +11,7 @@ from pathlib import Path, PureWindowsPath
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io import IMAGE_SUFFIXES
+from sc3d.io.images import IMAGE_SUFFIXES
 from sc3d.scene.scene import check_mask_aspect
 from sc3d.segmentation.mask_formats.mapping import Classes
 

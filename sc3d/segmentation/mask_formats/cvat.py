@@ -13,7 +13,15 @@ from xml.parsers import expat
 
 from sc3d.errors import InputError
 from sc3d.segmentation.mask_formats.drawing import Drawing, Shape
-from sc3d.segmentation.mask_formats.outlines import OutlineError, Polygons, Runs, ellipse, polygons, rectangle, runs
+from sc3d.segmentation.mask_formats.outlines import (
+    OutlineError,
+    Polygons,
+    Runs,
+    ellipse,
+    polygons,
+    rectangle,
+    runs,
+)
 
 WITHOUT_AREA = {"points", "polyline", "cuboid", "skeleton", "tag"}
 WITH_AREA = {"polygon", "box", "ellipse", "mask"}

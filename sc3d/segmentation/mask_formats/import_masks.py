@@ -7,11 +7,10 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
-from sc3d.io.atomic import discard
-from sc3d.io.images import open_image
-from sc3d.io import atomic_path, image_size, read_index_image, write_image
+from sc3d.io.atomic import atomic_path, discard
+from sc3d.io.images import image_size, open_image, read_index_image, write_image
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import match_masks
 from sc3d.segmentation.mask_formats.checks import Mask
 from sc3d.segmentation.mask_formats.source import MaskFiles, read_masks

@@ -15,9 +15,19 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io import read_json
+from sc3d.io.json_files import read_json
 from sc3d.segmentation.mask_formats.drawing import Drawing, Shape
-from sc3d.segmentation.mask_formats.outlines import OutlineError, Polygons, Runs, ellipse, encode, numbers, polygons, rectangle, runs
+from sc3d.segmentation.mask_formats.outlines import (
+    OutlineError,
+    Polygons,
+    Runs,
+    ellipse,
+    encode,
+    numbers,
+    polygons,
+    rectangle,
+    runs,
+)
 
 WITHOUT_AREA = {"point", "points", "line", "linestrip"}
 

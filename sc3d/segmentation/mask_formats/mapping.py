@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
-from sc3d.io import read_json
+from sc3d.io.json_files import read_json
+from sc3d.scene.class_table import ClassTable
 
 UNLABELLED = ("ignore", "unlabelled", "unlabeled")
 UNKNOWN = -1

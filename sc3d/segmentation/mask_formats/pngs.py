@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import open_image
-from sc3d.io import image_size, read_index_image
+from sc3d.io.images import image_size, open_image, read_index_image
 from sc3d.segmentation.mask_formats.checks import Checks, Mask
 from sc3d.segmentation.mask_formats.mapping import UNKNOWN, Classes
 

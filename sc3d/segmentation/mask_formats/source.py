@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
+from sc3d.scene.class_table import ClassTable
 from sc3d.segmentation.mask_formats.checks import Checks, Mask
 from sc3d.segmentation.mask_formats.coco import read_coco
 from sc3d.segmentation.mask_formats.cvat import read_cvat

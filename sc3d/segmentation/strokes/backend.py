@@ -9,14 +9,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError, MissingPackageError
-from sc3d.io import read_image
+from sc3d.io.images import read_image
+from sc3d.scene.class_table import ClassTable
+from sc3d.segmentation.segment import Segmentation
 from sc3d.segmentation.strokes.features import pixel_features
+from sc3d.segmentation.strokes.files import BACKGROUND, NOTHING, PhotoStrokes, read_strokes
 from sc3d.segmentation.strokes.guided_filter import fit_lines
 from sc3d.segmentation.strokes.novelty import Novelty, learn_novelty
-from sc3d.segmentation.segment import Segmentation
-from sc3d.segmentation.strokes.files import BACKGROUND, NOTHING, PhotoStrokes, read_strokes
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ class _Learned:
 class Strokes:
     """Segmenter that has learned from strokes."""
 
-    def __init__(self, classifier, novelty: Novelty | None, label_of_code: np.ndarray, settings: StrokesSettings) -> None:  # noqa: ANN001 - PixelClassifier
+    def __init__(self, classifier, novelty: Novelty | None, label_of_code: np.ndarray, settings: StrokesSettings) -> None:
         """classifier: of codes; novelty: of pixels unlike all strokes; label_of_code: (C,) uint8 class id of each code, 0 = background"""
         self._classifier = classifier
         self._novelty = novelty

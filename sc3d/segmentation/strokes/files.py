@@ -15,10 +15,10 @@ from pathlib import Path, PureWindowsPath
 import cv2
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
-from sc3d.io.images import open_image
-from sc3d.io import find_photos, image_size, read_json
+from sc3d.io.images import find_photos, image_size, open_image
+from sc3d.io.json_files import read_json
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import check_mask_aspect
 
 BACKGROUND = "_background_"  # LabelMe's own name for it

@@ -9,10 +9,32 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sc3d.splatting.cpu.tile_binning import TILE
 from sc3d.splatting.cpu.projection import RECORD
-from sc3d.splatting.cpu.rasterization import CHECK, LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, PLANE, STRIDE, finished, measure_rows, open_tile
-from sc3d.splatting.cpu.simd import LANES, any_at_least, exp2, fma, load, minimum, ramp, splat, store, total, where_at_least
+from sc3d.splatting.cpu.rasterization import (
+    CHECK,
+    LOG2_MIN_ALPHA,
+    MAX_ALPHA,
+    MIN_TRANSMITTANCE,
+    PLANE,
+    STRIDE,
+    finished,
+    measure_rows,
+    open_tile,
+)
+from sc3d.splatting.cpu.simd import (
+    LANES,
+    any_at_least,
+    exp2,
+    fma,
+    load,
+    minimum,
+    ramp,
+    splat,
+    store,
+    total,
+    where_at_least,
+)
+from sc3d.splatting.cpu.tile_binning import TILE
 
 NONE = np.uint8(255)  # a pixel without label; so a view may have 255 classes
 _ZERO = np.float32(0.0)

@@ -7,7 +7,17 @@ import math
 import numba
 import numpy as np
 
-from sc3d.splatting.cpu.projection import CHUNK, _axes_cam, _basis, _basis_slopes, _colour, _covariance, _jacobian, _mean_cam, _smallest
+from sc3d.splatting.cpu.projection import (
+    CHUNK,
+    _axes_cam,
+    _basis,
+    _basis_slopes,
+    _colour,
+    _covariance,
+    _jacobian,
+    _mean_cam,
+    _smallest,
+)
 
 # sums over pixels in one raster gradient record; s = d loss / d ln(alpha), w = weight, g = d loss / d output channel
 SUMS = 16  # s, s u, s u^2, s dy, s u dy, s dy^2, |ds/dx|, |ds/dy|, w g (colour 3, normal 3, plane distance), spare

@@ -13,11 +13,25 @@ import math
 import numba
 import numpy as np
 
-from sc3d.splatting.cpu.tile_binning import ROOM, TILE, first_pixel, last_pixel
 from sc3d.splatting.cpu.projection import MIN_ALPHA, RECORD
 from sc3d.splatting.cpu.simd import (
-    LANES, any_at_least, exp2, fma, largest, load, maximum, minimum, ramp, root, splat, store, store_whole, total, where_at_least,
+    LANES,
+    any_at_least,
+    exp2,
+    fma,
+    largest,
+    load,
+    maximum,
+    minimum,
+    ramp,
+    root,
+    splat,
+    store,
+    store_whole,
+    total,
+    where_at_least,
 )
+from sc3d.splatting.cpu.tile_binning import ROOM, TILE, first_pixel, last_pixel
 
 MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4

@@ -11,14 +11,34 @@ import math
 import numba
 import numpy as np
 
-from sc3d.splatting.cpu.tile_binning import TILE
 from sc3d.splatting.cpu.projection import LOG2E_HALF, RECORD
 from sc3d.splatting.cpu.rasterization import (
-    CHANNELS, CHECK, LOG2_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, PLANE, STRIDE, finished, measure_rows, open_tile,
+    CHANNELS,
+    CHECK,
+    LOG2_MIN_ALPHA,
+    MAX_ALPHA,
+    MIN_TRANSMITTANCE,
+    PLANE,
+    STRIDE,
+    finished,
+    measure_rows,
+    open_tile,
 )
 from sc3d.splatting.cpu.simd import (
-    LANES, absolute, any_at_least, exp2, fma, load, minimum, ramp, splat, store, sums, where_at_least,
+    LANES,
+    absolute,
+    any_at_least,
+    exp2,
+    fma,
+    load,
+    minimum,
+    ramp,
+    splat,
+    store,
+    sums,
+    where_at_least,
 )
+from sc3d.splatting.cpu.tile_binning import TILE
 
 _LOG2_MAX_ALPHA = np.float32(math.log2(MAX_ALPHA))
 _SCALE = np.float32(LOG2E_HALF)  # a and h of a record are in these units

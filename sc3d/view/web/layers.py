@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.geometry.cameras import View, undistorted
+from sc3d.scene.class_table import ClassTable
 from sc3d.view.colors import Colouring
-from sc3d.view.screenshot import LINE_COLOR
-from sc3d.view.web.orbit_camera import field_of_view, orientation
 from sc3d.view.display_cloud import ShownCloud
 from sc3d.view.display_splats import SPLAT_COLOURINGS, ShownSplats
+from sc3d.view.screenshot import LINE_COLOR
+from sc3d.view.web.orbit_camera import field_of_view, orientation
 
 if TYPE_CHECKING:
     import viser

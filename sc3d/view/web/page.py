@@ -19,13 +19,13 @@ from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
 from sc3d.scene.scene import Scene
-from sc3d.view.viewpoints import aerial_view, frustum_depth, without_outliers
 from sc3d.view.colors import Colouring
-from sc3d.view.picking import Inspector
-from sc3d.view.web.orbit_camera import OrbitPose
 from sc3d.view.display_cloud import ShownCloud
 from sc3d.view.display_splats import ShownSplats
+from sc3d.view.picking import Inspector
+from sc3d.view.viewpoints import aerial_view, frustum_depth, without_outliers
 from sc3d.view.web.layers import CameraLayer, CloudLayer, SplatLayer
+from sc3d.view.web.orbit_camera import OrbitPose
 from sc3d.view.web.panel import Page, PhotoPanel, PointPanel, ShowPanel, legend_html
 
 if TYPE_CHECKING:

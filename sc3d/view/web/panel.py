@@ -14,11 +14,11 @@ from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import Colouring, color_scale, legend_entries
-from sc3d.view.web.photos import PhotoPictures, jpeg_uri, photo_pictures, thumbnail
-from sc3d.view.picking import Inspector, PickedPoint, point_on_ray
-from sc3d.view.web.orbit_camera import OrbitPose
 from sc3d.view.display_cloud import ShownCloud
+from sc3d.view.picking import Inspector, PickedPoint, point_on_ray
 from sc3d.view.web.layers import CameraLayer, CloudLayer, SplatLayer
+from sc3d.view.web.orbit_camera import OrbitPose
+from sc3d.view.web.photos import PhotoPictures, jpeg_uri, photo_pictures, thumbnail
 
 if TYPE_CHECKING:
     import viser

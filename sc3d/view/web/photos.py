@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sc3d.scene.class_table import ClassTable
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, resample
-from sc3d.io import read_image, read_index_image
+from sc3d.io.images import read_image, read_index_image
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.view.viewpoints import fitted
 

@@ -16,19 +16,18 @@ import numpy as np
 import pytest
 import torch
 
-from tests.builders import CLASSES, ORIGIN, ground, views
-from tests.builders import inspector_of, labelled_scene
 from sc3d.cli import main
 from sc3d.geometry.cameras import View, look_at, pinhole_view, project, rays, undistorted
 from sc3d.scene.scene import Scene
 from sc3d.splatting.gaussians import Gaussians
-from sc3d.view.viewpoints import aerial_view, frustum_depth, without_outliers
 from sc3d.view.colors import STATES
-from sc3d.view.web.photos import photo_pictures
-from sc3d.view.picking import Inspector
-from sc3d.view.web.orbit_camera import OrbitPose, field_of_view
 from sc3d.view.display_cloud import ShownCloud
 from sc3d.view.display_splats import ShownSplats
+from sc3d.view.picking import Inspector
+from sc3d.view.viewpoints import aerial_view, frustum_depth, without_outliers
+from sc3d.view.web.orbit_camera import OrbitPose, field_of_view
+from sc3d.view.web.photos import photo_pictures
+from tests.builders import CLASSES, ORIGIN, ground, inspector_of, labelled_scene, views
 
 ROAD, GRASS = CLASSES[0]["color"], CLASSES[1]["color"]
 SIZE = (900, 600)  # px of the browser's window

@@ -20,19 +20,18 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from tests.builders import CLASSES, ORIGIN, truth_mask, views
-from tests.builders import inspector_of, labelled_scene
-from sc3d.scene.class_table import parse_classes
 from sc3d.cli import main
 from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import look_at, pinhole_view
+from sc3d.scene.class_table import parse_classes
 from sc3d.scene.scene import Scene
-from sc3d.view.web.photos import overlay, photo_pictures, thumbnail
-from sc3d.view.picking import PickedPoint
-from sc3d.view.web.orbit_camera import OrbitPose, orientation
 from sc3d.view.display_cloud import ShownCloud
+from sc3d.view.picking import PickedPoint
 from sc3d.view.web.layers import CameraLayer, CloudLayer, half_precision, node_name
+from sc3d.view.web.orbit_camera import OrbitPose, orientation
 from sc3d.view.web.panel import legend_html, point_html
+from sc3d.view.web.photos import overlay, photo_pictures, thumbnail
+from tests.builders import CLASSES, ORIGIN, inspector_of, labelled_scene, truth_mask, views
 
 ROAD = CLASSES[0]["color"]
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc/net/tcp")
@@ -46,7 +45,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 @contextmanager
 def layer_server() -> Iterator[object]:
     pytest.importorskip("viser", reason="the viewer in the browser needs viser: pip install 'sc3d[web]'")
-    from sc3d.view.web.page import page as web
+    from sc3d.view.web import page as web
 
     with web._server("127.0.0.1", 0) as server:
         yield server
@@ -185,7 +184,7 @@ def test_command_serves_this_machine_until_it_is_ended(scene, number):
 
 def test_a_page_for_everybody_comes_with_a_warning(scene, caplog, monkeypatch):
     pytest.importorskip("viser", reason="the viewer in the browser needs viser: pip install 'sc3d[web]'")
-    from sc3d.view.web.page import page as web
+    from sc3d.view.web import page as web
 
     ended = threading.Event()
     ended.set()

@@ -1,0 +1,20 @@
+"""What is known of each point: its class, how sure that is, and where it comes from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+UNSEEN, SEED, LOCKED, PROPAGATED, UNLOCKED = range(5)  # `state` of a point
+STATE_NAMES = ("unseen", "seed", "locked", "propagated", "unlocked")
+
+
+@dataclass(frozen=True)
+class Labels:
+    """One entry per point: label uint8 (0 = none), confidence float32 in [0, 1], state uint8, num_views int32."""
+
+    label: np.ndarray
+    confidence: np.ndarray
+    state: np.ndarray
+    num_views: np.ndarray

@@ -1,0 +1,24 @@
+"""Where a stage may work and what it may use."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where a stage may work; results do not depend on it."""
+
+    workers: int = 0
+    """Dask workers to start on this machine; without them all work is done in this process."""
+    cluster: str = ""
+    """Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers see the same files."""
+
+
+@dataclass(frozen=True)
+class Resources(Workers):
+    """What a stage may use; results do not depend on it."""
+
+    max_memory: str = ""
+    """Memory to stay below, such as 6G; what does not fit is worked on tile by tile, from disk. Half of this machine's memory otherwise. Each worker of
+    a --cluster may use as much."""

@@ -1,0 +1,146 @@
+"""Options of what makes and judges labels: annotate, segment, label, propagate, evaluate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from sc3d.settings.common import Resources
+
+
+@dataclass(frozen=True)
+class Segment:
+    """2D masks for all photos."""
+
+    backend: Literal["files", "strokes", "grounded-sam", "sam3"] = "files"
+    """Where masks come from: files (--masks), a few strokes that you drew (--strokes, no model), or text prompts with Grounding DINO and SAM 2 or with SAM 3."""
+    masks: Path | None = None
+    """Masks made elsewhere: a folder of PNGs <photo stem>.png, a folder of LabelMe JSONs, a COCO JSON, or a CVAT XML (files)."""
+    format: Literal["auto", "index", "color", "labelme", "coco", "cvat"] = "auto"
+    """Format of --masks (files): index = PNG with one id per pixel, color = PNG in the colours of the class table; auto looks at the files."""
+    mapping: Path | None = None
+    """JSON object of the ids, names or colours in --masks and the classes that they stand for, such as {"wall": "building", "7": "road"} (files)."""
+    confidence: Path | None = None
+    """Folder of confidence maps <photo stem>.png (files); optional."""
+    strokes: Path | None = None
+    """Folder of strokes and polygons per class, LabelMe JSON or PNG in the colours of the class table; SCENE/strokes otherwise (strokes)."""
+    prompts: tuple[str, ...] = ()
+    """Texts per class, each as NAME=text,text (grounded-sam, sam3); they replace those of classes.json."""
+    model_dir: Path | None = None
+    """Folder with downloaded model weights; the hub's cache otherwise."""
+    download: bool = False
+    """Download weights that are not on this machine."""
+    detector: str = "IDEA-Research/grounding-dino-tiny"
+    """Grounding DINO model that finds boxes (grounded-sam)."""
+    segmenter: str = "facebook/sam2.1-hiera-small"
+    """SAM 2 or SAM 1 model that outlines them (grounded-sam)."""
+    concept_model: str = "facebook/sam3"
+    """SAM 3 model (sam3)."""
+    box_threshold: float = 0.3
+    """Smallest score of a detected box or concept."""
+    text_threshold: float = 0.25
+    """Smallest score of a phrase (grounded-sam)."""
+    tile: int = 1600
+    """Photos larger than this are also looked at in overlapping tiles of this size, px, so that small things are found; 0 = never (grounded-sam, sam3)."""
+    overlap: float = 0.2
+    """Share of a tile that it has in common with the next."""
+    refine: bool = False
+    """One more round on the masks that are in the scene (needs its cloud): what contradicts the fused labels loses confidence, if that brings the
+    labels nearer to the masks of photos that were left out. Writes SCENE/confidence_refined, which label then takes instead of SCENE/confidence."""
+    half: bool = False
+    """Compute in half precision (bfloat16; float16 on older GPUs); needs CUDA (grounded-sam, sam3)."""
+    device: str = "auto"
+    """torch device: auto, cpu, cuda."""
+
+
+@dataclass(frozen=True)
+class Label(Resources):
+    """Fuse masks into the voxel label field and the cloud."""
+
+    method: Literal["direct", "majority", "conflict-lock", "paper"] = "conflict-lock"
+    """direct: last photo wins; majority: most votes win; conflict-lock: disagreeing voxels are reset and locked; paper: the same with any
+    disagreement and the paper's weights, whatever the other options say."""
+    depth_filter: bool = True
+    """Only the first surface along each ray is labelled; --no-depth-filter lets labels penetrate."""
+    surface: Literal["auto", "surfels", "voxels"] = "auto"
+    """What hides the points behind it. auto: mesh.ply if there is one, else as voxels; voxels: the grid of the cloud's own points, traversed coarse to fine;
+    surfels: a square around every point (more memory), which clouds in tiles have instead of voxels."""
+    consensus: float = 0.66
+    """Share of the votes that the winning class needs, else the voxel is locked (conflict-lock)."""
+    voxel_size: float = 0.0
+    """Label voxel, world units; 0 = 2 times the median point spacing, at least 1.5 times the median mask pixel on the ground."""
+    use_confidence: bool = True
+    """Weigh mask pixels by the confidence maps, where there are any."""
+    edge_width: float = 3.0
+    """Mask pixels closer than this to a label boundary count less, px; 0 = off."""
+    depth_excess: bool = True
+    """Weigh votes less, the farther a point lies behind the first surface (within the tolerance)."""
+    incidence: bool = False
+    """Weigh votes by the cosine of the incidence angle."""
+    range: bool = True
+    """Weigh votes by the inverse distance, so that near photos count more."""
+    verify: Literal["no", "lock", "weigh"] = "weigh"
+    """Hold the fused labels against each view's masks, place by place. lock: labels that rest on views which contradict them nearby are locked;
+    weigh: such views count less as well."""
+    density: bool = False
+    """Inside a voxel, weigh points by the density of the Gaussians around them (gaussians.ply), or by their distance to the points' mean without it."""
+    reproject: bool = False
+    """Vote once more on locked voxels with half the depth tolerance and without mask edges and grazing views."""
+    cloud: Path | None = None
+    """Cloud to label; SCENE/cloud.ply otherwise."""
+    output: Path | None = None
+    """Labelled cloud to write; SCENE/seeds.ply otherwise."""
+
+
+@dataclass(frozen=True)
+class Propagate(Resources):
+    """Complete the labels along the geometry."""
+
+    method: Literal["knn", "geometry", "map"] = "map"
+    """knn: nearest labelled points vote; geometry: front along similar normals and curvature (the paper's); map: Potts energy over all points."""
+    num_neighbors: int = 16
+    """Neighbours per point in the graph."""
+    fill: bool = False
+    """Label also the points that no edge connects to a seed, from the nearest labelled point."""
+    smoothness: float = 3.0
+    """Weight of the pairwise term (map)."""
+    color: bool = True
+    """Edges between unlike colours weigh less (geometry, map); not in the paper."""
+    appearance: bool = True
+    """Learn colour and relief of the classes from agreed points, and let them vote too: the only cure for errors that all views share (map)."""
+    rounds: int = 2
+    """Times that is learned: first from agreed points, then from the result (map)."""
+    verify_seeds: bool = True
+    """Drop seeds that look like another class before the labels spread (knn, geometry); not in the paper."""
+    seeds: Path | None = None
+    """Cloud written by label; SCENE/seeds.ply otherwise."""
+    output: Path | None = None
+    """Labelled cloud to write; SCENE/labelled.ply otherwise."""
+
+
+@dataclass(frozen=True)
+class Evaluate(Resources):
+    """OA, mIoU and IoU per class against truth masks, through the first surface."""
+
+    truth: Path | None = None
+    """Folder of truth masks; SCENE/truth otherwise."""
+    labelled: Path | None = None
+    """Labelled cloud; SCENE/labelled.ply otherwise."""
+    band: float = 10.0
+    """Half width of the band around depth edges that is also reported apart, px."""
+    output: Path | None = None
+    """Metrics file; SCENE/metrics.json otherwise."""
+
+
+@dataclass(frozen=True)
+class Annotate:
+    """Draw strokes and polygons per class on photos, on a page in the browser that only this machine can open, and try them out."""
+
+    scene: Annotated[Positional[Path], arg(help="Scene folder with images/ and classes.json.")]
+    port: int = 8000
+    """Port to serve on; the next free one if it is taken."""
+    photo: str | None = None
+    """Name of the photo to show first."""

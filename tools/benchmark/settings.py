@@ -1,0 +1,88 @@
+"""Options of the benchmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg, subcommand
+
+from sc3d.settings.synthesize import SynthesizeCity as SynthesizeCity
+
+
+@dataclass(frozen=True)
+class BenchmarkSpeed:
+    """Time training stage by stage: CPU and wall time, fragments per pixel, fraction of the arithmetic limit, memory; OpenSplat beside it."""
+
+    scene: Path | None = None
+    """COLMAP scene folder whose sparse points say where the ground is; a synthetic ground otherwise."""
+    gaussians: tuple[int, ...] = (50_000, 200_000)
+    """Numbers of Gaussians; each is combined with each size."""
+    sizes: tuple[int, ...] = (496, 993)
+    """Longest sides of the view, px."""
+    repeats: int = 7
+    """Times every measurement is repeated; medians are reported."""
+    surface: bool = True
+    """Also time whole training steps with and without the surface terms."""
+    opensplat: Path | None = None
+    """OpenSplat's program, to run on the same Gaussians and photos in turn with sc3d."""
+    output: Path | None = None
+    """JSON file for the figures; a Markdown table is written beside it."""
+
+
+@dataclass(frozen=True)
+class BenchmarkTables:
+    """The paper's tables and an ablation: every method and switch on synthetic scenes and on scenes with truth, judged on the same pixels."""
+
+    workdir: Annotated[Positional[Path], arg(help="Folder for the synthetic scenes and finished rows; the same command goes on where it stopped.")]
+    scenes: tuple[Path, ...] = ()
+    """Scene folders to add; each needs cloud.ply, masks/ and truth/."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Synthetic scenes, in WORKDIR/seed<n>."""
+    noises: tuple[float, ...] = (0.5, 1.0, 1.5)
+    """Strengths of the mask errors, for every seed."""
+    views: int = 40
+    """Photos of a synthetic scene."""
+    points: int = 1_000_000
+    """Points of a synthetic scene."""
+    width: int = 800
+    """Width of the synthetic photos, px."""
+    every: int = 4
+    """Judge every nth photo with truth, but not fewer than 8."""
+    output: Path | None = None
+    """Folder for tables.md and tables.json; WORKDIR otherwise."""
+
+
+@dataclass(frozen=True)
+class BenchmarkFusionSpeed:
+    """Time label and propagate against bare ray casting, a numpy z-buffer voter, one nearest-neighbour pass and scikit-learn; growth and memory."""
+
+    scene: Annotated[Positional[Path], arg(help="Scene folder with cloud.ply, mesh.ply and masks/, such as one that `benchmark tables` made.")]
+    points: tuple[int, ...] = (1_000_000, 3_000_000, 10_000_000)
+    """Numbers of points, drawn from cloud.ply, beyond its size copied along the surface; the rivals run at the first."""
+    views: tuple[int, ...] = (20, 40, 80)
+    """Numbers of views, at the first number of points; a scene with fewer repeats its views."""
+    repeats: int = 3
+    """Times the comparison with the rivals is repeated, in turn; medians are reported."""
+    output: Path | None = None
+    """JSON file for the figures; a Markdown table is written beside it."""
+
+
+@dataclass(frozen=True)
+class BenchmarkSurface:
+    """Compare gaussians.ply and mesh.ply of a scene with the exact depth and surface of the synthetic scene that its photos come from."""
+
+    scene: Annotated[Positional[Path], arg(help="Reconstructed scene folder, with the true cameras.")]
+    truth: Annotated[Positional[Path], arg(help="Synthetic scene folder: depth/, truth/, truth.ply, truth_mesh.ply.")]
+    voxel_size: float = 0.0
+    """Voxel of the mesh, world units; 0 = as in mesh.ply.json."""
+    output: Path | None = None
+    """JSON file for the figures; a Markdown table is written beside it."""
+
+
+Benchmark = (
+    Annotated[BenchmarkSpeed, subcommand("speed")] | Annotated[BenchmarkTables, subcommand("tables")]
+    | Annotated[BenchmarkFusionSpeed, subcommand("fusion-speed")] | Annotated[BenchmarkSurface, subcommand("surface")]
+    | Annotated[SynthesizeCity, subcommand("city")]
+)
