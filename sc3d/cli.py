@@ -50,7 +50,12 @@ def reporting_errors() -> Iterator[None]:
     except (Sc3dError, OSError, MemoryError) as error:
         sys.exit(_fail(f"{error or type(error).__name__}", status=1))
     except KeyboardInterrupt:
-        sys.exit(_fail("interrupted; finished work is kept, run the same command again to go on", status=128 + signal.SIGINT))
+        sys.exit(
+            _fail(
+                "interrupted; finished work is kept, run the same command again to go on",
+                status=128 + signal.SIGINT,
+            )
+        )
 
 
 def usage() -> str:
@@ -74,7 +79,11 @@ def scene_command(record: type) -> type:
         [
             ("scene", Annotated[Positional[Path], tyro.conf.arg(help="Scene folder.")]),
             ("settings", OmitArgPrefixes[record], dataclasses.field(default_factory=record)),
-            ("overwrite", Annotated[bool, tyro.conf.arg(help="Run again even if the outputs are up to date.")], False),
+            (
+                "overwrite",
+                Annotated[bool, tyro.conf.arg(help="Run again even if the outputs are up to date.")],
+                False,
+            ),
         ],
         frozen=True,
     )

@@ -1,4 +1,6 @@
-"""Gaussians to a surface: depth of every view, checked against its neighbours, fused into a TSDF (METHOD section 1, Surface)."""
+"""Gaussians to a surface: depth of every view, checked against its neighbours, fused into a TSDF (METHOD
+section 1, Surface).
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,8 @@ LOOSE = 4.0  # px; how far two views may disagree where nothing better is known
 class Surfaces:
     """mesh, cloud: in the views' local world; voxel_size: world units.
 
-    confirmed: share of all pixels whose depth was confirmed by neighbour views; coverage: share whose ray hits the mesh
+    confirmed: share of all pixels whose depth was confirmed by neighbour views; coverage: share whose ray
+        hits the mesh
     """
 
     mesh: o3d.t.geometry.TriangleMesh
@@ -54,7 +57,8 @@ class DepthViews:
     """The views whose depth is fused.
 
     views: pinhole; image: index to (H, W, 3) uint8 RGB of the view's size
-    neighbours: per view, rows of views that see the same surface; depth_range: nearest and farthest depth, world units
+    neighbours: per view, rows of views that see the same surface; depth_range: nearest and farthest depth,
+        world units
     """
 
     views: list[View]
@@ -69,7 +73,11 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
         maps = _DepthMaps(Path(folder), data)
         footprint = maps.render(gaussians)
         voxel_size = settings.voxel_size or _default_voxel_size(gaussians, footprint)
-        fusion, confirmed, pixels = DepthFusion(voxel_size), 0, sum(view.width * view.height for view in data.views)
+        fusion, confirmed, pixels = (
+            DepthFusion(voxel_size),
+            0,
+            sum(view.width * view.height for view in data.views),
+        )
         for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
             depth = maps.confirmed(row, settings.min_views)
             fusion.integrate(view, depth, data.image(row), data.depth_range[1])
@@ -83,7 +91,11 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
             if _coverage(_joined(parts)[0], data.views) >= wanted:
                 break
             for turn in range(ROUNDS):
-                parts.append(_complete(maps, _joined(parts)[0], voxel_size, range(turn, len(data.views), ROUNDS), accept))
+                parts.append(
+                    _complete(
+                        maps, _joined(parts)[0], voxel_size, range(turn, len(data.views), ROUNDS), accept
+                    )
+                )
     mesh, cloud = _joined(parts)
     return Surfaces(mesh, cloud, voxel_size, confirmed / pixels, _coverage(mesh, data.views))
 
@@ -93,14 +105,20 @@ def _part(fusion: DepthFusion) -> Part:
     mesh, cloud = drop_small_parts(fusion.mesh(), MIN_PART), fusion.cloud()
     if not len(mesh.triangle.indices):
         return mesh, cloud.select_by_index(o3d.core.Tensor(np.empty(0, np.int64)))
-    return mesh, cloud.select_by_mask(o3d.core.Tensor(near_mesh(cloud.point.positions.numpy(), mesh, 0.5 * fusion.voxel_size)))
+    return mesh, cloud.select_by_mask(
+        o3d.core.Tensor(near_mesh(cloud.point.positions.numpy(), mesh, 0.5 * fusion.voxel_size))
+    )
 
 
 def wanted_coverage(views: list[View]) -> float:
-    """1 where all views look the same way: a wrong depth then moves a point along everybody's line of sight. Else OBLIQUE_COVERAGE."""
+    """1 where all views look the same way: a wrong depth then moves a point along everybody's line of sight.
+    Else OBLIQUE_COVERAGE.
+    """
     forward = np.stack([view.cam_from_world[2, :3] for view in views])
     middle = forward.mean(axis=0)
-    same = (forward @ (middle / np.maximum(np.linalg.norm(middle), 1e-12)) > np.cos(np.deg2rad(NADIR_SPREAD))).all()
+    same = (
+        forward @ (middle / np.maximum(np.linalg.norm(middle), 1e-12)) > np.cos(np.deg2rad(NADIR_SPREAD))
+    ).all()
     return 1.0 if same else OBLIQUE_COVERAGE
 
 
@@ -110,7 +128,13 @@ def _coverage(mesh: o3d.t.geometry.TriangleMesh, views: list[View]) -> float:
     return float(np.mean([np.isfinite(first_surface(surface, view).range).mean() for view in views]))
 
 
-def _complete(maps: _DepthMaps, mesh: o3d.t.geometry.TriangleMesh, voxel_size: float, rows: range, accept: Callable[..., np.ndarray]) -> Part:
+def _complete(
+    maps: _DepthMaps,
+    mesh: o3d.t.geometry.TriangleMesh,
+    voxel_size: float,
+    rows: range,
+    accept: Callable[..., np.ndarray],
+) -> Part:
     """Surface from the accepted depth of pixels that look through the holes of `mesh`, of some views.
 
     Each view's own: where views disagree, as in tree crowns, their average would be no surface at all.
@@ -119,9 +143,17 @@ def _complete(maps: _DepthMaps, mesh: o3d.t.geometry.TriangleMesh, voxel_size: f
     for row in tqdm(rows, desc="completing", unit="view", disable=None):
         view = data.views[row]
         first, depth = first_surface(surface, view), maps.read(row).numpy()
-        before = depth < (1 - MARGIN) * first.range * first.ray_z  # where nothing is hit, or only something far behind
+        # where nothing is hit, or only something far behind
+        before = depth < (1 - MARGIN) * first.range * first.ray_z
         squares, centres = pixel_squares(view, depth, data.image(row), before & accept(maps, row, first))
-        parts.append((squares, cloud_in_order(centres.voxel_down_sample(voxel_size)) if len(centres.point.positions) else centres))
+        parts.append(
+            (
+                squares,
+                cloud_in_order(centres.voxel_down_sample(voxel_size))
+                if len(centres.point.positions)
+                else centres,
+            )
+        )
     return _joined(parts)
 
 
@@ -131,12 +163,16 @@ def _agreed(maps: _DepthMaps, row: int, first: FirstSurface) -> np.ndarray:
 
 
 def _unopposed(maps: _DepthMaps, row: int, first: FirstSurface) -> np.ndarray:
-    """(H, W) bool: as high as the surroundings, nothing known behind it, and no neighbour looks through it: what only one view sees."""
+    """(H, W) bool: as high as the surroundings, nothing known behind it, and no neighbour looks through it:
+    what only one view sees.
+    """
     return maps.usual(row) & (maps.blocks(row) == 0) & ~np.isfinite(first.range)
 
 
 def _plausible(maps: _DepthMaps, row: int, first: FirstSurface) -> np.ndarray:
-    """(H, W) bool: some neighbour agrees, or at most one looks through it; crowns in the wind, but also floaters."""
+    """(H, W) bool: some neighbour agrees, or at most one looks through it; crowns in the wind, but also
+    floaters.
+    """
     return (maps.counts(row, LOOSE) >= 1) | (maps.blocks(row) <= 1)
 
 
@@ -146,7 +182,11 @@ def _joined(parts: list[Part]) -> Part:
     starts = np.cumsum([0, *(len(each.vertex.positions) for each in meshes[:-1])])
     for name in ("positions", "normals", "colors"):
         mesh.vertex[name] = o3d.core.Tensor(np.concatenate([each.vertex[name].numpy() for each in meshes]))
-    mesh.triangle.indices = o3d.core.Tensor(np.concatenate([each.triangle.indices.numpy() + start for each, start in zip(meshes, starts, strict=True)]))
+    mesh.triangle.indices = o3d.core.Tensor(
+        np.concatenate(
+            [each.triangle.indices.numpy() + start for each, start in zip(meshes, starts, strict=True)]
+        )
+    )
     cloud = o3d.t.geometry.PointCloud()
     for name in ("positions", "normals", "colors"):
         cloud.point[name] = o3d.core.Tensor(np.concatenate([each.point[name].numpy() for each in clouds]))
@@ -157,7 +197,8 @@ def _joined(parts: list[Part]) -> Part:
 class _Relief:
     """Lowest and highest height of a surface around each cell of a coarse map.
 
-    axes: (3, 3) rows: two horizontal axes and up, which is against the mean viewing direction; start: (2,) corner; size: cell, world units
+    axes: (3, 3) rows: two horizontal axes and up, which is against the mean viewing direction; start: (2,)
+        corner; size: cell, world units
     low, high: (CELLS, CELLS) float32
     """
 
@@ -174,15 +215,24 @@ class _Relief:
         axes[2] *= np.sign(axes[2] @ up)
         placed = vertices @ axes.T
         start = placed[:, :2].min(axis=0)
-        relief = cls(axes, start, float(np.ptp(placed[:, :2], axis=0).max()) / CELLS * 1.001, np.empty(0), np.empty(0))
+        relief = cls(
+            axes, start, float(np.ptp(placed[:, :2], axis=0).max()) / CELLS * 1.001, np.empty(0), np.empty(0)
+        )
         cells, height = relief.place(vertices)
         low, high = np.full(CELLS**2, np.inf, np.float32), np.full(CELLS**2, -np.inf, np.float32)
         np.minimum.at(low, cells, height)
         np.maximum.at(high, cells, height)
         window = np.ones((2 * AROUND + 1,) * 2, np.uint8)
-        low, high = cv2.erode(low.reshape(CELLS, CELLS), window), cv2.dilate(high.reshape(CELLS, CELLS), window)
+        low, high = (
+            cv2.erode(low.reshape(CELLS, CELLS), window),
+            cv2.dilate(high.reshape(CELLS, CELLS), window),
+        )
         overall = np.quantile(height, [0.01, 0.99])  # where nothing sure is around
-        return replace(relief, low=np.where(np.isfinite(low), low, overall[0]), high=np.where(np.isfinite(high), high, overall[1]))
+        return replace(
+            relief,
+            low=np.where(np.isfinite(low), low, overall[0]),
+            high=np.where(np.isfinite(high), high, overall[1]),
+        )
 
     def place(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(N,) cell of each (N, 3) point (the nearest one for points off the map) and (N,) height."""
@@ -213,8 +263,12 @@ class _DepthMaps:
         return torch.from_numpy(np.load(self.folder / f"{row}{kind}.npy"))
 
     def counts(self, row: int, tolerance: float) -> np.ndarray:
-        """(H, W) number of neighbours that see a pixel's surface within `tolerance` px of where this view has it."""
-        others = [(self.read(other), self.data.views[other]) for other in self.data.neighbours[row][:NUM_NEIGHBOURS]]
+        """(H, W) number of neighbours that see a pixel's surface within `tolerance` px of where this view has
+        it.
+        """
+        others = [
+            (self.read(other), self.data.views[other]) for other in self.data.neighbours[row][:NUM_NEIGHBOURS]
+        ]
         return consistent(self.read(row), self.data.views[row], others, tolerance).numpy()
 
     def confirmed(self, row: int, min_views: int) -> np.ndarray:
@@ -228,25 +282,40 @@ class _DepthMaps:
         self.relief = _Relief.of(mesh.vertex.positions.numpy(), self.data.views)
         for row, view in enumerate(self.data.views):
             first = first_surface(surface, view)
-            np.save(self.folder / f"{row}-sure.npy", np.where(np.isfinite(first.range), first.range * first.ray_z, 0).astype(np.float32))
+            np.save(
+                self.folder / f"{row}-sure.npy",
+                np.where(np.isfinite(first.range), first.range * first.ray_z, 0).astype(np.float32),
+            )
 
     def usual(self, row: int) -> np.ndarray:
-        """(H, W) whether a pixel's point is as high as something sure around it on the map; a floater is higher. After `trust`."""
+        """(H, W) whether a pixel's point is as high as something sure around it on the map; a floater is
+        higher. After `trust`.
+        """
         view, depth = self.data.views[row], self.read(row).numpy()
         points_cam = pixel_rays(view).numpy() * depth[..., None]
         points = (points_cam - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
         cells, height = self.relief.place(points.reshape(-1, 3))
         margin = MARGIN * depth.ravel()
-        return ((height > self.relief.low.ravel()[cells] - margin) & (height < self.relief.high.ravel()[cells] + margin)).reshape(depth.shape)
+        return (
+            (height > self.relief.low.ravel()[cells] - margin)
+            & (height < self.relief.high.ravel()[cells] + margin)
+        ).reshape(depth.shape)
 
     def blocks(self, row: int) -> np.ndarray:
-        """(H, W) number of neighbours that are sure of a surface behind a pixel's point, so that it would be in their way; after `trust`."""
-        sure = [(self.read(other, "-sure"), self.data.views[other]) for other in self.data.neighbours[row][:NUM_NEIGHBOURS]]
+        """(H, W) number of neighbours that are sure of a surface behind a pixel's point, so that it would be
+        in their way; after `trust`.
+        """
+        sure = [
+            (self.read(other, "-sure"), self.data.views[other])
+            for other in self.data.neighbours[row][:NUM_NEIGHBOURS]
+        ]
         return blocking(self.read(row), self.data.views[row], sure, MARGIN).numpy()
 
 
 def centre_cloud(gaussians: Gaussians, centres: np.ndarray, min_opacity: float) -> o3d.t.geometry.PointCloud:
-    """The Gaussians' centres as a cloud: positions, colours, normals (smallest axis, towards the nearest of the (M, 3) camera centres)."""
+    """The Gaussians' centres as a cloud: positions, colours, normals (smallest axis, towards the nearest of
+    the (M, 3) camera centres).
+    """
     chosen = gaussians[gaussians.opacities >= min_opacity].detached()
     if not len(chosen):
         raise Sc3dError(f"no Gaussian has an opacity of {min_opacity} or more: lower --min-opacity")
@@ -254,7 +323,9 @@ def centre_cloud(gaussians: Gaussians, centres: np.ndarray, min_opacity: float) 
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
     colors = np.clip(0.5 + 0.28209479177387814 * chosen.sh[:, 0].numpy(), 0, 1)
     cloud.point.colors = o3d.core.Tensor(np.round(colors * 255).astype(np.uint8))
-    cloud.point.normals = o3d.core.Tensor(orient_normals(points, chosen.normals.numpy(), centres).astype(np.float32))
+    cloud.point.normals = o3d.core.Tensor(
+        orient_normals(points, chosen.normals.numpy(), centres).astype(np.float32)
+    )
     return cloud
 
 

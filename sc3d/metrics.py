@@ -1,4 +1,6 @@
-"""Overall accuracy, IoU per class and mIoU against truth masks, through the first surface (paper section 4.2)."""
+"""Overall accuracy, IoU per class and mIoU against truth masks, through the first surface (paper section
+4.2).
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from sc3d.scene.class_table import ClassTable
 
 @dataclass(frozen=True)
 class Confusion:
-    """counts: (C, C) int64 pixels, row = truth, column = prediction, indexed by class id; row 0 stays empty, column 0 = no prediction."""
+    """counts: (C, C) int64 pixels, row = truth, column = prediction, indexed by class id; row 0 stays empty,
+    column 0 = no prediction.
+    """
 
     counts: np.ndarray
 
@@ -76,9 +80,11 @@ def total(parts: Iterable[Confusion], num_ids: int) -> Confusion:
 
 @dataclass(frozen=True)
 class JudgedPixels:
-    """The P pixels that have truth, and the cloud point that each of them shows: found once, then every labelling of the cloud is judged by a look-up.
+    """The P pixels that have truth, and the cloud point that each of them shows: found once, then every
+    labelling of the cloud is judged by a look-up.
 
-    truth: (P,) uint8 ids, never 0; rows: (P,) int32 row of the cloud, -1 = no point there; band: (P,) bool near a depth edge
+    truth: (P,) uint8 ids, never 0; rows: (P,) int32 row of the cloud, -1 = no point there; band: (P,) bool
+        near a depth edge
     """
 
     truth: np.ndarray
@@ -87,17 +93,23 @@ class JudgedPixels:
 
     @classmethod
     def of(cls, truth: np.ndarray, rows: np.ndarray, band: np.ndarray) -> JudgedPixels:
-        """One photo. truth: (H, W) uint8, 0 = not judged; rows: (H, W) int32 as `nearest_points` returns them; band: (H, W) bool."""
+        """One photo. truth: (H, W) uint8, 0 = not judged; rows: (H, W) int32 as `nearest_points` returns
+        them; band: (H, W) bool.
+        """
         judged = truth > 0
         return cls(truth[judged], rows[judged].astype(np.int32), band[judged])
 
     @classmethod
     def joined(cls, parts: list[JudgedPixels]) -> JudgedPixels:
         """All pixels of several photos, in order."""
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("truth", "rows", "band")))
+        return cls(
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in ("truth", "rows", "band"))
+        )
 
     def look_up(self, values: np.ndarray) -> np.ndarray:
-        """(P,) value of the point that each pixel shows, 0 where there is none. values: (N,) per point of the cloud."""
+        """(P,) value of the point that each pixel shows, 0 where there is none. values: (N,) per point of the
+        cloud.
+        """
         return np.where(self.rows >= 0, values[self.rows], values.dtype.type(0))
 
     def confusions(self, predicted: np.ndarray, num_ids: int) -> tuple[Confusion, Confusion]:
@@ -107,14 +119,17 @@ class JudgedPixels:
         return Confusion(inside), Confusion(outside)
 
     def reliability(self, label: np.ndarray, confidence: np.ndarray) -> Reliability:
-        """Confidence of the label at each pixel that has one, against being right. label: (N,) uint8, confidence: (N,) float32 per point of the cloud."""
+        """Confidence of the label at each pixel that has one, against being right. label: (N,) uint8,
+        confidence: (N,) float32 per point of the cloud.
+        """
         predicted = self.look_up(label)
         labelled = predicted > 0
         return reliability(self.look_up(confidence)[labelled], (predicted == self.truth)[labelled])
 
 
 def depth_edge_band(depth: np.ndarray, width: float) -> np.ndarray:
-    """(H, W) bool: pixels within `width` px of a depth discontinuity (a step of more than 2 % of the depth, or the end of the surface).
+    """(H, W) bool: pixels within `width` px of a depth discontinuity (a step of more than 2 % of the depth,
+    or the end of the surface).
 
     depth: (H, W) range or z, inf = nothing
     """
@@ -129,7 +144,8 @@ def depth_edge_band(depth: np.ndarray, width: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Reliability:
-    """One entry per bin: confidence and accuracy (B,) float64, means over the bin, NaN where empty; count (B,) int64; ece: expected calibration error.
+    """One entry per bin: confidence and accuracy (B,) float64, means over the bin, NaN where empty; count
+    (B,) int64; ece: expected calibration error.
 
     ece = sum over bins of count / total x |confidence - accuracy|; NaN without any sample
     """
@@ -151,20 +167,34 @@ class Reliability:
     def total(cls, parts: list[Reliability]) -> Reliability:
         """Of all samples of several parts, one at least."""
         count = sum(part.count for part in parts)
-        sums = (sum(np.nan_to_num(mean) * part.count for part, mean in ((part, getattr(part, name)) for part in parts)) for name in ("confidence", "accuracy"))
+        sums = (
+            sum(
+                np.nan_to_num(mean) * part.count
+                for part, mean in ((part, getattr(part, name)) for part in parts)
+            )
+            for name in ("confidence", "accuracy")
+        )
         return cls.of_sums(*sums, count)
 
     def summary(self) -> dict[str, object]:
         """JSON-ready figures; None for an empty bin."""
-        rows = [None if not count else [float(mean), float(share), int(count)]
-                for mean, share, count in zip(self.confidence, self.accuracy, self.count, strict=True)]
+        rows = [
+            None if not count else [float(mean), float(share), int(count)]
+            for mean, share, count in zip(self.confidence, self.accuracy, self.count, strict=True)
+        ]
         return {"ece": self.ece, "bins": rows}
 
 
 def reliability(confidence: np.ndarray, right: np.ndarray, bins: int = 10) -> Reliability:
-    """confidence: (N,) in [0, 1]; right: (N,) bool, was the label right; bins of equal width, 1.0 in the last."""
+    """confidence: (N,) in [0, 1]; right: (N,) bool, was the label right; bins of equal width, 1.0 in the
+    last.
+    """
     if len(confidence) and (np.min(confidence) < 0 or np.max(confidence) > 1):
         raise ValueError("confidences must lie in [0, 1]")
     row = np.minimum((np.asarray(confidence, np.float64) * bins).astype(np.int64), bins - 1)
     count = np.bincount(row, minlength=bins)
-    return Reliability.of_sums(np.bincount(row, confidence, minlength=bins), np.bincount(row, np.asarray(right, np.float64), minlength=bins), count)
+    return Reliability.of_sums(
+        np.bincount(row, confidence, minlength=bins),
+        np.bincount(row, np.asarray(right, np.float64), minlength=bins),
+        count,
+    )

@@ -4,7 +4,8 @@ A stage module `sc3d/stages/<name>.py` offers three functions of (scene, setting
     inputs   -> paths whose content decides whether the stage must run again
     outputs  -> paths that it writes
     run      -> does the work; returns the figures for the summary and the sidecar
-Stages never import one another; `execute` below is what they share: skip finished work, time it, write the sidecars.
+Stages never import one another; `execute` below is what they share: skip finished work, time it, write the
+sidecars.
 """
 
 from __future__ import annotations
@@ -37,7 +38,11 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
     Up to date: every output and its sidecar exist, made by the same settings from inputs of the same content.
     """
     stage = importlib.import_module(f"sc3d.stages.{name}")
-    record = {"stage": name, "settings": _decisive(settings), "inputs": {str(path): digest(path) for path in stage.inputs(scene, settings)}}
+    record = {
+        "stage": name,
+        "settings": _decisive(settings),
+        "inputs": {str(path): digest(path) for path in stage.inputs(scene, settings)},
+    }
     outputs = stage.outputs(scene, settings)
     previous = _finished(record, outputs)
     if previous is not None and not overwrite:
@@ -48,7 +53,12 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
     reset_peak_memory()
     with _replacing(outputs), _room(scene):
         summary = _plain(stage.run(scene, settings))
-    record |= {"versions": versions(), "seconds": round(time.perf_counter() - started, 2), "peak_memory_mb": peak_memory_mb(), "summary": summary}
+    record |= {
+        "versions": versions(),
+        "seconds": round(time.perf_counter() - started, 2),
+        "peak_memory_mb": peak_memory_mb(),
+        "summary": summary,
+    }
     with _room(scene):
         for output in outputs:
             write_json(sidecar(output), record)
@@ -66,9 +76,15 @@ def _prepare(scene: Scene, outputs: list[Path]) -> None:
 
 @contextmanager
 def _replacing(outputs: list[Path]) -> Iterator[None]:
-    """Hide the sidecars: an output that is being replaced must not pass for finished. They come back if the block fails and no output has changed."""
+    """Hide the sidecars: an output that is being replaced must not pass for finished. They come back if the
+    block fails and no output has changed.
+    """
     before = [_identity(output) for output in outputs]
-    hidden = {path: path.with_name(f"{temporary_name(path.name)}.before") for path in map(sidecar, outputs) if path.is_file()}
+    hidden = {
+        path: path.with_name(f"{temporary_name(path.name)}.before")
+        for path in map(sidecar, outputs)
+        if path.is_file()
+    }
     for path, aside in hidden.items():
         path.rename(aside)
     try:
@@ -97,10 +113,14 @@ def _room(scene: Scene) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError) as error:
-        if getattr(error, "errno", None) not in (errno.ENOSPC, errno.EDQUOT) and "disk is full" not in str(error):
+        if getattr(error, "errno", None) not in (errno.ENOSPC, errno.EDQUOT) and "disk is full" not in str(
+            error
+        ):
             raise
         name = getattr(error, "filename", None)
-        raise Sc3dError(f"no space left in {Path(name).parent if name else scene.path}: make room and run the same command again; finished work is kept") from error
+        raise Sc3dError(
+            f"no space left in {Path(name).parent if name else scene.path}: make room and run the same command again; finished work is kept"
+        ) from error
 
 
 def _decisive(settings: object) -> dict[str, object]:

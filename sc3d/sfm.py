@@ -26,27 +26,40 @@ from sc3d.settings.reconstruction import Reconstruct
 
 logger = logging.getLogger(__name__)
 
-FEATURE_BYTES, PAIR_BYTES = 160, 20_000  # in the database: of a keypoint with its descriptor, of the matches of two photos
-LOOSE = 1.1  # a model is moved onto its GPS if that makes the root mean square distance smaller by this factor
+# in the database: of a keypoint with its descriptor, of the matches of two photos
+FEATURE_BYTES, PAIR_BYTES = 160, 20_000
+# a model is moved onto its GPS if that makes the root mean square distance smaller by this factor
+LOOSE = 1.1
 
 
 @dataclass(frozen=True)
 class Reconstructed:
-    """What `reconstruct` found besides the model: figures for the summary, and where the model lies on Earth, if that is known."""
+    """What `reconstruct` found besides the model: figures for the summary, and where the model lies on Earth,
+    if that is known.
+    """
 
     summary: dict[str, object]
     georeference: Georeference | None
 
 
-def reconstruct(images: Path, names: list[str], sparse: Path, settings: Reconstruct, control_points: ControlPoints | None = None) -> Reconstructed:
-    """Photos to a COLMAP model in `sparse`: in local ENU, metric and upright, where GPS or control points allow it.
+def reconstruct(
+    images: Path,
+    names: list[str],
+    sparse: Path,
+    settings: Reconstruct,
+    control_points: ControlPoints | None = None,
+) -> Reconstructed:
+    """Photos to a COLMAP model in `sparse`: in local ENU, metric and upright, where GPS or control points
+    allow it.
 
     images: folder; names: photos relative to it; sparse: folder to write the binary model to
     """
     pycolmap.set_random_seed(settings.seed)
     pycolmap.logging.minloglevel = 2
     if settings.camera_model not in pycolmap.CameraModelId.__members__ or settings.camera_model == "INVALID":
-        raise InputError(f"unknown camera model {settings.camera_model!r}: one of {', '.join(list(pycolmap.CameraModelId.__members__)[1:])}")
+        raise InputError(
+            f"unknown camera model {settings.camera_model!r}: one of {', '.join(list(pycolmap.CameraModelId.__members__)[1:])}"
+        )
     flight = read_flight(images, names) if settings.gps else None
     if settings.matching == "spatial" and flight is None:
         raise InputError("--matching spatial needs GPS in the photos' EXIF: use exhaustive or sequential")
@@ -66,7 +79,9 @@ def reconstruct(images: Path, names: list[str], sparse: Path, settings: Reconstr
         with atomic_path(sparse) as output:
             output.mkdir()
             model.write_binary(str(output))
-    return Reconstructed(_summary(model, names, georeference) | focal | _heights(model, flight, georeference), georeference)
+    return Reconstructed(
+        _summary(model, names, georeference) | focal | _heights(model, flight, georeference), georeference
+    )
 
 
 def _extract(database: Path, images: Path, names: list[str], settings: Reconstruct) -> None:
@@ -76,19 +91,28 @@ def _extract(database: Path, images: Path, names: list[str], settings: Reconstru
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = settings.camera_model
     pycolmap.Database.open(database).close()
-    pycolmap.import_images(database, images, pycolmap.CameraMode.AUTO, names, reader)  # else ids follow the threads that are done first
+    # else ids follow the threads that are done first
+    pycolmap.import_images(database, images, pycolmap.CameraMode.AUTO, names, reader)
     with _progress(database, "keypoints", len(names), "features", "photo"):
-        pycolmap.extract_features(database, images, names, pycolmap.CameraMode.AUTO, reader, options, pycolmap.Device.cpu)
+        pycolmap.extract_features(
+            database, images, names, pycolmap.CameraMode.AUTO, reader, options, pycolmap.Device.cpu
+        )
 
 
 def _database_size(num_photos: int, settings: Reconstruct) -> int:
-    """Bytes that the database may take: keypoints with descriptors, matches, and the journal of what is being written."""
+    """Bytes that the database may take: keypoints with descriptors, matches, and the journal of what is being
+    written.
+    """
     partners = {"exhaustive": num_photos / 2, "sequential": 10, "spatial": 50}[settings.matching]
-    return int(num_photos * (2 * FEATURE_BYTES * settings.max_features + PAIR_BYTES * min(partners, num_photos)))
+    return int(
+        num_photos * (2 * FEATURE_BYTES * settings.max_features + PAIR_BYTES * min(partners, num_photos))
+    )
 
 
 def _write_priors(database: Path, flight: Flight | None) -> None:
-    """Replace the positions that pycolmap read from EXIF by ENU positions with their covariance; photos without get none."""
+    """Replace the positions that pycolmap read from EXIF by ENU positions with their covariance; photos
+    without get none.
+    """
     none = np.full(3, np.nan)
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image for image in opened.read_all_images()}
@@ -109,7 +133,11 @@ def _write_priors(database: Path, flight: Flight | None) -> None:
 
 
 def _match(database: Path, num_photos: int, settings: Reconstruct) -> None:
-    match = {"exhaustive": pycolmap.match_exhaustive, "sequential": pycolmap.match_sequential, "spatial": pycolmap.match_spatial}
+    match = {
+        "exhaustive": pycolmap.match_exhaustive,
+        "sequential": pycolmap.match_sequential,
+        "spatial": pycolmap.match_spatial,
+    }
     num_pairs = num_photos * (num_photos - 1) // 2 if settings.matching == "exhaustive" else None
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = settings.seed  # for each pair, whichever thread it falls to
@@ -117,7 +145,9 @@ def _match(database: Path, num_photos: int, settings: Reconstruct) -> None:
         match[settings.matching](database, verification_options=verification, device=pycolmap.Device.cpu)
 
 
-def _map(database: Path, images: Path, work: Path, settings: Reconstruct, num_photos: int, has_gps: bool) -> pycolmap.Reconstruction:
+def _map(
+    database: Path, images: Path, work: Path, settings: Reconstruct, num_photos: int, has_gps: bool
+) -> pycolmap.Reconstruction:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = settings.seed
     options.num_threads = 1  # with more, sums of larger scenes are rounded otherwise in each run
@@ -125,9 +155,13 @@ def _map(database: Path, images: Path, work: Path, settings: Reconstruct, num_ph
     options.use_robust_loss_on_prior_position = has_gps
     options.min_model_size = min(10, num_photos)
     with tqdm(total=num_photos, desc="cameras", unit="photo", disable=None) as bar:
-        models = pycolmap.incremental_mapping(database, images, work, options, next_image_callback=lambda: bar.update(1))
+        models = pycolmap.incremental_mapping(
+            database, images, work, options, next_image_callback=lambda: bar.update(1)
+        )
     if not models:
-        raise Sc3dError("no two photos could be matched: they need at least 60 % overlap and texture; try a larger --max-size")
+        raise Sc3dError(
+            "no two photos could be matched: they need at least 60 % overlap and texture; try a larger --max-size"
+        )
     return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
 
 
@@ -139,7 +173,10 @@ def _progress(database: Path, table: str, total: int | None, description: str, u
     def poll() -> None:
         with tqdm(total=total, desc=description, unit=unit, disable=None) as bar:
             while not bar.disable and not done.wait(0.5):
-                with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=0.1)) as connection:
+                with (
+                    suppress(sqlite3.Error),
+                    closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=0.1)) as connection,
+                ):
                     bar.update(connection.execute(f"select count(*) from {table}").fetchone()[0] - bar.n)
             if total is not None:
                 bar.update(total - bar.n)
@@ -154,27 +191,46 @@ def _progress(database: Path, table: str, total: int | None, description: str, u
 
 
 def _georeference(
-    model: pycolmap.Reconstruction, flight: Flight | None, control_points: ControlPoints | None, settings: Reconstruct
+    model: pycolmap.Reconstruction,
+    flight: Flight | None,
+    control_points: ControlPoints | None,
+    settings: Reconstruct,
 ) -> Georeference | None:
-    """Bring a model into local ENU, from control points or else from GPS, or make it level at least; returns what is then known of its place."""
+    """Bring a model into local ENU, from control points or else from GPS, or make it level at least; returns
+    what is then known of its place.
+    """
     if control_points is not None:
         figures = align_to_control_points(model, control_points, refine_focal=tells_focal(model))
-        return from_origin(control_points.origin, settings.epsg or control_points.epsg, settings.altitude_offset, {"control_points": figures})
+        return from_origin(
+            control_points.origin,
+            settings.epsg or control_points.epsg,
+            settings.altitude_offset,
+            {"control_points": figures},
+        )
     fit = place(flight, _centres(model), _points(model)) if flight else None
     if fit is None:
         if flight:
-            logger.warning("the registered photos do not fit their GPS: the model has no scale, no north and no position")
+            logger.warning(
+                "the registered photos do not fit their GPS: the model has no scale, no north and no position"
+            )
         _level(model)
         return None
     moved = dict(zip(_centres(model), fit.apply(np.array(list(_centres(model).values())))))
-    if flight.shape == "line" or residuals(flight, _centres(model))["rms"] > LOOSE * residuals(flight, moved)["rms"]:
+    if (
+        flight.shape == "line"
+        or residuals(flight, _centres(model))["rms"] > LOOSE * residuals(flight, moved)["rms"]
+    ):
         transform(model, fit)
-    return from_origin(flight.origin, settings.epsg, settings.altitude_offset, {"gps": residuals(flight, _centres(model))})
+    return from_origin(
+        flight.origin, settings.epsg, settings.altitude_offset, {"gps": residuals(flight, _centres(model))}
+    )
 
 
 def _centres(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
     """Camera centre (3,) by photo name."""
-    images = sorted((model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name)
+    images = sorted(
+        (model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name
+    )
     return {image.name: image.projection_center() for image in images}
 
 
@@ -190,11 +246,15 @@ def _level(model: pycolmap.Reconstruction) -> None:
     transform(model, Similarity(1.0, axes, -axes @ middle))
 
 
-def _summary(model: pycolmap.Reconstruction, names: list[str], georeference: Georeference | None) -> dict[str, object]:
+def _summary(
+    model: pycolmap.Reconstruction, names: list[str], georeference: Georeference | None
+) -> dict[str, object]:
     registered = {model.image(image_id).name for image_id in model.reg_image_ids()}
     left_out = [name for name in names if name not in registered]
     if left_out:
-        logger.warning("%d of %d photos could not be registered: %s", len(left_out), len(names), ", ".join(left_out))
+        logger.warning(
+            "%d of %d photos could not be registered: %s", len(left_out), len(names), ", ".join(left_out)
+        )
     return {
         "photos": len(names),
         "registered": len(registered),
@@ -207,17 +267,34 @@ def _summary(model: pycolmap.Reconstruction, names: list[str], georeference: Geo
     } | _errors(georeference)
 
 
-def _heights(model: pycolmap.Reconstruction, flight: Flight | None, georeference: Georeference | None) -> dict[str, float]:
-    """Flight height above the middle of the points, and above take-off where DJI's XMP states it, m; a warning where they are far apart."""
+def _heights(
+    model: pycolmap.Reconstruction, flight: Flight | None, georeference: Georeference | None
+) -> dict[str, float]:
+    """Flight height above the middle of the points, and above take-off where DJI's XMP states it, m; a
+    warning where they are far apart.
+    """
     if georeference is None:
         return {}
-    heights = {"height_above_points_m": round(float(np.mean([centre[2] for centre in _centres(model).values()]) - np.median(_points(model)[:, 2])), 1)}
-    stated = [tag.above_takeoff for tag in flight.tags.values() if tag.above_takeoff is not None] if flight else []
+    heights = {
+        "height_above_points_m": round(
+            float(
+                np.mean([centre[2] for centre in _centres(model).values()]) - np.median(_points(model)[:, 2])
+            ),
+            1,
+        )
+    }
+    stated = (
+        [tag.above_takeoff for tag in flight.tags.values() if tag.above_takeoff is not None] if flight else []
+    )
     if stated:
         heights["height_above_takeoff_m"] = round(float(np.median(stated)), 1)
         if not 0.7 < heights["height_above_points_m"] / max(np.median(stated), 0.1) < 1.4:
-            logger.warning("the cameras lie %.0f m above the points, XMP says %.0f m above take-off: unless the ground is that uneven, the focal length is wrong "
-                           "(see --focal)", heights["height_above_points_m"], heights["height_above_takeoff_m"])
+            logger.warning(
+                "the cameras lie %.0f m above the points, XMP says %.0f m above take-off: unless the ground is that uneven, the focal length is wrong "
+                "(see --focal)",
+                heights["height_above_points_m"],
+                heights["height_above_takeoff_m"],
+            )
     return heights
 
 

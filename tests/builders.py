@@ -1,4 +1,6 @@
-"""Scenes for the tests, made from scratch: a square of ground in UTM coordinates, half road and half grass, photographed from above; clouds with labels."""
+"""Scenes for the tests, made from scratch: a square of ground in UTM coordinates, half road and half grass,
+photographed from above; clouds with labels.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,10 @@ from sc3d.view.picking import Inspector
 ROOT = Path(__file__).parents[1]  # of the checkout
 ORIGIN = np.array([512345.0, 5187654.0, 210.0])
 SIZE = (160, 120)
-CLASSES = [{"id": 1, "name": "road", "color": [150, 150, 160]}, {"id": 3, "name": "grass", "color": [170, 220, 110]}]
+CLASSES = [
+    {"id": 1, "name": "road", "color": [150, 150, 160]},
+    {"id": 3, "name": "grass", "color": [170, 220, 110]},
+]
 
 
 def ground(step: float = 0.1, half: float = 4.0) -> np.ndarray:
@@ -28,9 +33,14 @@ def ground(step: float = 0.1, half: float = 4.0) -> np.ndarray:
 
 
 def views() -> list[View]:
-    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=SIZE[0], height=SIZE[1], params=[150.0, 80.0, 60.0, -0.05], camera_id=1)
+    camera = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=SIZE[0], height=SIZE[1], params=[150.0, 80.0, 60.0, -0.05], camera_id=1
+    )
     centres = [[-1, -1, 9], [1, -1, 9], [1, 1, 9], [-1, 1, 9], [0, 0, 10]]
-    return [View(f"photo_{row}.jpg", camera, look_at(ORIGIN + centre, ORIGIN)) for row, centre in enumerate(centres)]
+    return [
+        View(f"photo_{row}.jpg", camera, look_at(ORIGIN + centre, ORIGIN))
+        for row, centre in enumerate(centres)
+    ]
 
 
 def truth_mask(view: View) -> np.ndarray:
@@ -80,8 +90,10 @@ def labelled_cloud(points: np.ndarray, label: np.ndarray, colors: bool = True) -
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.ascontiguousarray(points, np.float64)))
     normals = rng.normal(size=(count, 3))
     attributes = {
-        "normals": (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32), "label": label.astype(np.uint8)[:, None],
-        "confidence": rng.random((count, 1), np.float32), "state": rng.integers(0, 5, (count, 1), np.uint8),
+        "normals": (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
+        "label": label.astype(np.uint8)[:, None],
+        "confidence": rng.random((count, 1), np.float32),
+        "state": rng.integers(0, 5, (count, 1), np.uint8),
         "num_views": rng.integers(0, 90, (count, 1)).astype(np.int32),
     }
     if colors:
@@ -91,7 +103,12 @@ def labelled_cloud(points: np.ndarray, label: np.ndarray, colors: bool = True) -
     return cloud
 
 
-def write_scene(path: Path, cloud: o3d.t.geometry.PointCloud, georeference: dict | None = None, classes: list[dict] = LABELLED_CLASSES) -> Scene:
+def write_scene(
+    path: Path,
+    cloud: o3d.t.geometry.PointCloud,
+    georeference: dict | None = None,
+    classes: list[dict] = LABELLED_CLASSES,
+) -> Scene:
     """labelled.ply, classes.json and, if given, georeference.json."""
     path.mkdir(parents=True, exist_ok=True)
     assert o3d.t.io.write_point_cloud(str(path / "labelled.ply"), cloud)
@@ -102,23 +119,40 @@ def write_scene(path: Path, cloud: o3d.t.geometry.PointCloud, georeference: dict
 
 
 def labelled_scene(path: Path) -> Scene:
-    """Road and grass in UTM coordinates with labels, confidences, states and votes, masks, and photos of different greys, the first 128."""
+    """Road and grass in UTM coordinates with labels, confidences, states and votes, masks, and photos of
+    different greys, the first 128.
+    """
     write_bare_scene(path)
     points = ground()
     road = points[:, 0] < ORIGIN[0]
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
-    votes = {"votes_0": np.ones(len(points)), "votes_1": np.where(road, 3.0, 0.5), "votes_2": np.zeros(len(points)), "votes_3": np.where(road, 1.0, 4.5)}
-    attributes = {"label": np.where(road, 1, 3).astype(np.uint8), "confidence": np.linspace(0, 1, len(points), dtype=np.float32)}
+    votes = {
+        "votes_0": np.ones(len(points)),
+        "votes_1": np.where(road, 3.0, 0.5),
+        "votes_2": np.zeros(len(points)),
+        "votes_3": np.where(road, 1.0, 4.5),
+    }
+    attributes = {
+        "label": np.where(road, 1, 3).astype(np.uint8),
+        "confidence": np.linspace(0, 1, len(points), dtype=np.float32),
+    }
     attributes["state"] = np.resize(np.uint8([1, 2, 3]), len(points))
-    for name, values in {**attributes, **{name: column.astype(np.float32) for name, column in votes.items()}}.items():
+    for name, values in {
+        **attributes,
+        **{name: column.astype(np.float32) for name, column in votes.items()},
+    }.items():
         cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(values[:, None]))
     o3d.t.io.write_point_cloud(str(path / "labelled.ply"), cloud)
     (path / "images").mkdir()
     for row, view in enumerate(views()):
-        Image.fromarray(np.full((view.height, view.width, 3), 128 + 20 * row, np.uint8)).save(path / "images" / view.name)
+        Image.fromarray(np.full((view.height, view.width, 3), 128 + 20 * row, np.uint8)).save(
+            path / "images" / view.name
+        )
     return Scene(path)
 
 
 def inspector_of(scene: Scene) -> Inspector:
     """What the viewer looks points up in."""
-    return Inspector(o3d.t.io.read_point_cloud(str(scene.labelled)), scene.model.views, scene.class_table(), scene.mesh)
+    return Inspector(
+        o3d.t.io.read_point_cloud(str(scene.labelled)), scene.model.views, scene.class_table(), scene.mesh
+    )

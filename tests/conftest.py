@@ -23,7 +23,9 @@ def one_thread():
 
 @pytest.fixture(scope="session")
 def tiny_models(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of tiny random-weight models, saved like those of the hub: `dino`, `sam`, `sam2` and `sam2_video` (about 3 MB)."""
+    """Folder of tiny random-weight models, saved like those of the hub: `dino`, `sam`, `sam2` and
+    `sam2_video` (about 3 MB).
+    """
     pytest.importorskip("transformers")
     import torch
 
@@ -48,14 +50,39 @@ def _save_grounding_dino(path: Path) -> None:
     words = ["building", "house", "roof", "road", "parking", "lot", "tree", "grass", "solar", "panel", "##s"]
     vocabulary = [f"[unused{index}]" for index in range(1100)]
     vocabulary[0], vocabulary[100:104] = "[PAD]", ["[UNK]", "[CLS]", "[SEP]", "[MASK]"]
-    vocabulary[1012], vocabulary[1029] = ".", "?"  # the ids of bert-base-uncased: Grounding DINO has them built in as separators
+    # the ids of bert-base-uncased: Grounding DINO has them built in as separators
+    vocabulary[1012], vocabulary[1029] = ".", "?"
     vocabulary[1040 : 1040 + len(words)] = words
-    tokenizer = BertTokenizer(vocab={word: index for index, word in enumerate(vocabulary)}, do_lower_case=True)
-    swin = SwinConfig(image_size=64, embed_dim=8, depths=[1, 1, 1, 1], num_heads=[1, 1, 1, 1], window_size=4, out_indices=[2, 3, 4])
-    bert = BertConfig(vocab_size=len(vocabulary), hidden_size=32, num_hidden_layers=1, num_attention_heads=2, intermediate_size=32)
+    tokenizer = BertTokenizer(
+        vocab={word: index for index, word in enumerate(vocabulary)}, do_lower_case=True
+    )
+    swin = SwinConfig(
+        image_size=64,
+        embed_dim=8,
+        depths=[1, 1, 1, 1],
+        num_heads=[1, 1, 1, 1],
+        window_size=4,
+        out_indices=[2, 3, 4],
+    )
+    bert = BertConfig(
+        vocab_size=len(vocabulary),
+        hidden_size=32,
+        num_hidden_layers=1,
+        num_attention_heads=2,
+        intermediate_size=32,
+    )
     config = GroundingDinoConfig(
-        backbone_config=swin, text_config=bert, d_model=32, num_queries=12, encoder_layers=1, decoder_layers=2, encoder_ffn_dim=32,
-        decoder_ffn_dim=32, encoder_attention_heads=2, decoder_attention_heads=2, max_text_len=32,
+        backbone_config=swin,
+        text_config=bert,
+        d_model=32,
+        num_queries=12,
+        encoder_layers=1,
+        decoder_layers=2,
+        encoder_ffn_dim=32,
+        decoder_ffn_dim=32,
+        encoder_attention_heads=2,
+        decoder_attention_heads=2,
+        max_text_len=32,
     )
     model = GroundingDinoForObjectDetection(config)
     with torch.no_grad():
@@ -69,8 +96,16 @@ def _save_sam(path: Path) -> None:
 
     config = SamConfig(
         vision_config=dict(
-            hidden_size=32, output_channels=32, num_hidden_layers=2, num_attention_heads=2, image_size=128, window_size=4, global_attn_indexes=[1],
-            num_pos_feats=16, mlp_dim=32, initializer_range=0.02,
+            hidden_size=32,
+            output_channels=32,
+            num_hidden_layers=2,
+            num_attention_heads=2,
+            image_size=128,
+            window_size=4,
+            global_attn_indexes=[1],
+            num_pos_feats=16,
+            mlp_dim=32,
+            initializer_range=0.02,
         ),
         prompt_encoder_config=dict(hidden_size=32, image_size=128, mask_input_channels=4),
         mask_decoder_config=dict(hidden_size=32, mlp_dim=32, num_attention_heads=2, iou_head_hidden_dim=32),
@@ -84,20 +119,34 @@ def _save_sam2(folder: Path) -> None:
     parts = dict(
         vision_config=dict(
             backbone_config=dict(
-                model_type="sam2_hiera_det_model", hidden_size=8, image_size=[128, 128], blocks_per_stage=[1, 1, 2, 1],
-                embed_dim_per_stage=[8, 16, 32, 64], num_attention_heads_per_stage=[1, 1, 2, 2], window_size_per_stage=[4, 4, 4, 4],
+                model_type="sam2_hiera_det_model",
+                hidden_size=8,
+                image_size=[128, 128],
+                blocks_per_stage=[1, 1, 2, 1],
+                embed_dim_per_stage=[8, 16, 32, 64],
+                num_attention_heads_per_stage=[1, 1, 2, 2],
+                window_size_per_stage=[4, 4, 4, 4],
                 global_attention_blocks=[3],
             ),
-            backbone_channel_list=[64, 32, 16, 8], backbone_feature_sizes=[[32, 32], [16, 16], [8, 8]], fpn_hidden_size=32,
+            backbone_channel_list=[64, 32, 16, 8],
+            backbone_feature_sizes=[[32, 32], [16, 16], [8, 8]],
+            fpn_hidden_size=32,
         ),
         prompt_encoder_config=dict(hidden_size=32, image_size=128, mask_input_channels=4),
         mask_decoder_config=dict(hidden_size=32, mlp_dim=32, num_attention_heads=2, iou_head_hidden_dim=32),
     )
     _save_sure(Sam2Model(Sam2Config(**parts)), folder / "sam2")
-    # The hub's SAM 2 weights are video models ("model_type": "sam2_video") of which photos need the image part only
+    # The hub's SAM 2 weights are video models ("model_type": "sam2_video") of which photos need the image
+    # part only
     memory = dict(
-        memory_attention_hidden_size=32, memory_attention_num_layers=1, memory_attention_feed_forward_hidden_size=32, memory_encoder_hidden_size=32,
-        memory_encoder_output_channels=8, mask_downsampler_embed_dim=32, memory_fuser_embed_dim=32, memory_fuser_intermediate_dim=32,
+        memory_attention_hidden_size=32,
+        memory_attention_num_layers=1,
+        memory_attention_feed_forward_hidden_size=32,
+        memory_encoder_hidden_size=32,
+        memory_encoder_output_channels=8,
+        mask_downsampler_embed_dim=32,
+        memory_fuser_embed_dim=32,
+        memory_fuser_intermediate_dim=32,
         memory_attention_rope_feat_sizes=[8, 8],
     )
     _save_sure(Sam2VideoModel(Sam2VideoConfig(**parts, **memory)), folder / "sam2_video")

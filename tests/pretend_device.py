@@ -1,8 +1,10 @@
-"""A GPU for machines without one: tensors that say they are not on the CPU, compute there all the same, and refuse to mix with CPU tensors.
+"""A GPU for machines without one: tensors that say they are not on the CPU, compute there all the same, and
+refuse to mix with CPU tensors.
 
     with PretendDevice():
         tensor.to("meta") ...
-The device is called `meta`, which torch knows without drivers; real meta tensors (without values) do not exist inside the block.
+The device is called `meta`, which torch knows without drivers; real meta tensors (without values) do not
+exist inside the block.
 """
 
 import torch
@@ -10,7 +12,8 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-COPIES = ("aten.copy_", "aten._to_copy", "aten.index_put", "aten._index_put", "aten.index.")  # take tensors from two devices, as on a GPU
+# take tensors from two devices, as on a GPU
+COPIES = ("aten.copy_", "aten._to_copy", "aten.index_put", "aten._index_put", "aten.index.")
 
 
 class _Tensor(torch.Tensor):
@@ -19,7 +22,13 @@ class _Tensor(torch.Tensor):
     @staticmethod
     def __new__(cls, inner):
         tensor = torch.Tensor._make_wrapper_subclass(
-            cls, inner.shape, strides=inner.stride(), storage_offset=inner.storage_offset(), dtype=inner.dtype, device="meta")
+            cls,
+            inner.shape,
+            strides=inner.stride(),
+            storage_offset=inner.storage_offset(),
+            dtype=inner.dtype,
+            device="meta",
+        )
         tensor.inner = inner
         return tensor
 
@@ -31,7 +40,10 @@ class _Tensor(torch.Tensor):
 
 
 def _run(function, args, kwargs):
-    name, tensors = str(function), [value for value in tree_flatten((args, kwargs))[0] if isinstance(value, torch.Tensor)]
+    name, tensors = (
+        str(function),
+        [value for value in tree_flatten((args, kwargs))[0] if isinstance(value, torch.Tensor)],
+    )
     there = [tensor for tensor in tensors if isinstance(tensor, _Tensor)]
     here = [tensor for tensor in tensors if not isinstance(tensor, _Tensor) and tensor.dim() > 0]
     if there and here and not name.startswith(COPIES):
@@ -48,7 +60,11 @@ def _run(function, args, kwargs):
     first = function._schema.arguments[0].alias_info if function._schema.arguments else None
     if first is not None and first.is_write:
         return args[0]
-    return tree_map(lambda value: _Tensor(value) if isinstance(value, torch.Tensor) else value, result) if stays else result
+    return (
+        tree_map(lambda value: _Tensor(value) if isinstance(value, torch.Tensor) else value, result)
+        if stays
+        else result
+    )
 
 
 def _inside(value):
@@ -61,7 +77,9 @@ class _Dispatch(TorchDispatchMode):
 
 
 class PretendDevice(TorchFunctionMode):
-    """Context in which `meta` is a device with values. `new_tensor` needs help: torch makes empty tensors of it there."""
+    """Context in which `meta` is a device with values. `new_tensor` needs help: torch makes empty tensors of
+    it there.
+    """
 
     def __enter__(self):
         self._dispatch = _Dispatch()

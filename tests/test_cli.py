@@ -37,7 +37,9 @@ def fails(capsys, *arguments, status: int = 2, command=main) -> str:
 
 
 def files(folder: Path) -> set:
-    return {(str(file.relative_to(folder)), file.stat().st_size) for file in folder.rglob("*") if file.is_file()}
+    return {
+        (str(file.relative_to(folder)), file.stat().st_size) for file in folder.rglob("*") if file.is_file()
+    }
 
 
 @pytest.mark.parametrize("name", [*STAGES, *COMMANDS])
@@ -46,7 +48,9 @@ def test_help_answers_in_under_a_second(name):
     spent = []
     for _ in range(3):  # the machine may be busy: the best of three
         started = time.perf_counter()
-        result = subprocess.run([sys.executable, "-c", code, name, "--help"], capture_output=True, text=True, env=os.environ)
+        result = subprocess.run(
+            [sys.executable, "-c", code, name, "--help"], capture_output=True, text=True, env=os.environ
+        )
         spent.append(time.perf_counter() - started)
         assert result.returncode == 0 and "usage: sc3d " + name in result.stdout
         if spent[-1] < 1:
@@ -64,8 +68,13 @@ def test_usage_and_unknown_command(capsys):
 
 def test_scripts_in_tools_are_the_commands():
     tools = Path(__file__).parent.parent / "tools"
-    assert {file.stem for file in tools.glob("*.py")} - {"fuzz_readers", "make_manual", "__init__"} == {*STAGES, *COMMANDS}
-    result = subprocess.run([sys.executable, str(tools / "label.py"), "--help"], capture_output=True, text=True, env=os.environ)
+    assert {file.stem for file in tools.glob("*.py")} - {"fuzz_readers", "make_manual", "__init__"} == {
+        *STAGES,
+        *COMMANDS,
+    }
+    result = subprocess.run(
+        [sys.executable, str(tools / "label.py"), "--help"], capture_output=True, text=True, env=os.environ
+    )
     assert "usage: sc3d label" in result.stdout
 
 
@@ -115,13 +124,17 @@ class TestBadInput:
         self.check(capsys, scene, ["COLMAP model"], "label", scene)
 
     def test_empty_cloud(self, capsys, scene):
-        (scene / "cloud.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n")
+        (scene / "cloud.ply").write_text(
+            "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+        )
         self.check(capsys, scene, ["no points"], "label", scene)
 
     def test_points_that_are_not_numbers(self, capsys, scene):
         points = np.zeros((10, 3))
         points[3, 1] = np.nan
-        o3d.t.io.write_point_cloud(str(scene / "cloud.ply"), o3d.t.geometry.PointCloud(o3d.core.Tensor(points)))
+        o3d.t.io.write_point_cloud(
+            str(scene / "cloud.ply"), o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
+        )
         self.check(capsys, scene, ["not finite"], "label", scene)
 
     @pytest.mark.parametrize("share", [0.5, 0.999])
@@ -135,8 +148,12 @@ class TestBadInput:
         self.check(capsys, scene, ["not a PLY"], "label", scene)
 
     def test_class_table(self, capsys, scene):
-        for broken, word in (([], "non-empty"), ([{"id": 0, "name": "a", "color": [0, 0, 0]}], "0 means unlabelled"),
-                             ([{"id": 1, "name": "a", "color": [0, 0, 999]}], "color"), ([{"id": 1, "name": "a", "color": [0, 0, 0]}] * 2, "twice")):
+        for broken, word in (
+            ([], "non-empty"),
+            ([{"id": 0, "name": "a", "color": [0, 0, 0]}], "0 means unlabelled"),
+            ([{"id": 1, "name": "a", "color": [0, 0, 999]}], "color"),
+            ([{"id": 1, "name": "a", "color": [0, 0, 0]}] * 2, "twice"),
+        ):
             (scene / "classes.json").write_text(json.dumps(broken))
             self.check(capsys, scene, [word], "label", scene)
         (scene / "classes.json").write_text("{")

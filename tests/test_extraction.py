@@ -19,7 +19,9 @@ def flat_square(half: float, height: float) -> Gaussians:
     """Opaque discs with normals along z."""
     x, y = np.meshgrid(np.arange(-half, half, STEP), np.arange(-half, half, STEP))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
-    gaussians = Gaussians.from_points(points, np.tile(np.uint8([200, 120, 40]), (len(points), 1)), 0, opacity=0.95)
+    gaussians = Gaussians.from_points(
+        points, np.tile(np.uint8([200, 120, 40]), (len(points), 1)), 0, opacity=0.95
+    )
     scales = torch.full_like(gaussians.log_scales, float(np.log(STEP)))
     scales[:, 2] = -8
     quats = torch.zeros_like(gaussians.quats)
@@ -29,7 +31,12 @@ def flat_square(half: float, height: float) -> Gaussians:
 
 def views() -> list:
     centres = [[-2, -2, 12], [2, -2, 12], [2, 2, 12], [-2, 2, 12], [0, 0, 13]]
-    return [pinhole_view(f"{row}.jpg", (160, 120), (150, 150, 78, 62), look_at(np.array(centre, float), np.zeros(3))) for row, centre in enumerate(centres)]
+    return [
+        pinhole_view(
+            f"{row}.jpg", (160, 120), (150, 150, 78, 62), look_at(np.array(centre, float), np.zeros(3))
+        )
+        for row, centre in enumerate(centres)
+    ]
 
 
 def data() -> DepthViews:
@@ -50,7 +57,9 @@ def test_plane_comes_out_flat_closed_and_upwards():
 
 
 def test_completion_covers_what_only_one_view_sees():
-    lonely = replace(data(), neighbours=[np.array([4]), np.array([4]), np.array([4]), np.array([4]), np.array([0])])
+    lonely = replace(
+        data(), neighbours=[np.array([4]), np.array([4]), np.array([4]), np.array([4]), np.array([0])]
+    )
     without = extract_surface(flat_square(8.0, 0.0), lonely, Extract(voxel_size=0.15, coverage=0.0))
     completed = extract_surface(flat_square(8.0, 0.0), lonely, Extract(voxel_size=0.15, coverage=1.0))
     assert completed.coverage > without.coverage + 0.02
@@ -76,9 +85,27 @@ def test_a_point_before_a_surface_that_others_see_is_blocked():
     from sc3d.splatting.consistency import blocking
 
     view, *others = views()[:3]
-    flat = [torch.from_numpy((other.centre[2] / -(np.linalg.inv(other.matrix) @ np.concatenate(
-        [np.stack(np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5), -1), np.ones((120, 160, 1))], -1)[..., None])[..., 0].dot(
-        other.cam_from_world[:3, 2])).astype(np.float32)) for other in (view, *others)]  # depth of the plane z = 0
+    flat = [
+        torch.from_numpy(
+            (
+                other.centre[2]
+                / -(
+                    np.linalg.inv(other.matrix)
+                    @ np.concatenate(
+                        [
+                            np.stack(np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5), -1),
+                            np.ones((120, 160, 1)),
+                        ],
+                        -1,
+                    )[..., None]
+                )[..., 0].dot(
+                    # depth of the plane z = 0
+                    other.cam_from_world[:3, 2]
+                )
+            ).astype(np.float32)
+        )
+        for other in (view, *others)
+    ]
     sure = list(zip(flat[1:], others, strict=True))
     on_plane = blocking(flat[0], view, sure, 0.03).numpy()
     floating = blocking(0.8 * flat[0], view, sure, 0.03).numpy()
@@ -89,6 +116,9 @@ def test_a_point_before_a_surface_that_others_see_is_blocked():
 
 def test_only_flights_that_look_one_way_are_filled_without_limit():
     ahead, aside = np.array([0.0, 0.0, 12.0]), np.array([9.0, 0.0, 12.0])
-    down = [pinhole_view(f"{row}.jpg", (160, 120), (150, 150, 80, 60), look_at(centre, centre * [1, 1, 0])) for row, centre in enumerate((ahead, aside))]
+    down = [
+        pinhole_view(f"{row}.jpg", (160, 120), (150, 150, 80, 60), look_at(centre, centre * [1, 1, 0]))
+        for row, centre in enumerate((ahead, aside))
+    ]
     oblique = pinhole_view("o.jpg", (160, 120), (150, 150, 80, 60), look_at(aside, np.zeros(3)))
     assert wanted_coverage(down) == 1 and wanted_coverage([*down, oblique]) < 1

@@ -11,10 +11,21 @@ def test_hand_made_matrix():
     predicted = np.uint8([1, 1, 2, 0, 2, 1, 3, 3, 1, 0])  # the last two pixels are not judged
     confusion = Confusion.of(truth, predicted, 5)
     expected = np.zeros((5, 5), int)
-    expected[1, 1], expected[1, 2], expected[1, 0], expected[2, 2], expected[2, 1], expected[3, 3] = 2, 1, 1, 1, 1, 2
+    expected[1, 1], expected[1, 2], expected[1, 0], expected[2, 2], expected[2, 1], expected[3, 3] = (
+        2,
+        1,
+        1,
+        1,
+        1,
+        2,
+    )
     np.testing.assert_array_equal(confusion.counts, expected)
     assert confusion.accuracy == pytest.approx(5 / 8)
-    assert confusion.iou[1] == pytest.approx(2 / 5) and confusion.iou[2] == pytest.approx(1 / 3) and confusion.iou[3] == 1
+    assert (
+        confusion.iou[1] == pytest.approx(2 / 5)
+        and confusion.iou[2] == pytest.approx(1 / 3)
+        and confusion.iou[3] == 1
+    )
     assert np.isnan(confusion.iou[4])
     assert confusion.mean_iou == pytest.approx((2 / 5 + 1 / 3 + 1) / 3)
     assert confusion.coverage == pytest.approx(7 / 8)
@@ -24,7 +35,9 @@ def test_against_scikit_learn():
     metrics = pytest.importorskip("sklearn.metrics")
     rng = np.random.default_rng(0)
     truth = rng.integers(1, 5, (50, 60)).astype(np.uint8)
-    predicted = np.where(rng.uniform(size=truth.shape) < 0.7, truth, rng.integers(1, 5, truth.shape)).astype(np.uint8)
+    predicted = np.where(rng.uniform(size=truth.shape) < 0.7, truth, rng.integers(1, 5, truth.shape)).astype(
+        np.uint8
+    )
     parts = [Confusion.of(truth[rows], predicted[rows], 5) for rows in (slice(0, 20), slice(20, 50))]
     confusion = total(parts, 5)
     flat = truth.ravel(), predicted.ravel()
@@ -55,15 +68,33 @@ def test_judged_pixels_equal_the_confusion_of_images():
     label = rng.integers(0, 4, 50).astype(np.uint8)
     photos = []
     for shape in ((12, 9), (7, 11)):
-        photos.append((rng.integers(0, 4, shape).astype(np.uint8), rng.integers(-1, 50, shape).astype(np.int32), rng.uniform(size=shape) < 0.3))
+        photos.append(
+            (
+                rng.integers(0, 4, shape).astype(np.uint8),
+                rng.integers(-1, 50, shape).astype(np.int32),
+                rng.uniform(size=shape) < 0.3,
+            )
+        )
     pixels = JudgedPixels.joined([JudgedPixels.of(*photo) for photo in photos])
     near, elsewhere = pixels.confusions(pixels.look_up(label), 4)
-    images = [(truth, np.where(rows >= 0, label[rows], 0).astype(np.uint8), band) for truth, rows, band in photos]
+    images = [
+        (truth, np.where(rows >= 0, label[rows], 0).astype(np.uint8), band) for truth, rows, band in photos
+    ]
     for confusion, inside in ((near, True), (elsewhere, False)):
-        expected = total((Confusion.of(np.where(band == inside, truth, 0), predicted, 4) for truth, predicted, band in images), 4)
+        expected = total(
+            (
+                Confusion.of(np.where(band == inside, truth, 0), predicted, 4)
+                for truth, predicted, band in images
+            ),
+            4,
+        )
         np.testing.assert_array_equal(confusion.counts, expected.counts)
     values = pixels.look_up(np.linspace(0.5, 1, 50, dtype=np.float32))
-    assert (values[pixels.rows < 0] == 0).all() and (values[pixels.rows >= 0] >= 0.5).all() and values.dtype == np.float32
+    assert (
+        (values[pixels.rows < 0] == 0).all()
+        and (values[pixels.rows >= 0] >= 0.5).all()
+        and values.dtype == np.float32
+    )
     believed = pixels.reliability(label, np.full(50, 0.75, np.float32))
     right, labelled = int(np.trace((near + elsewhere).counts)), int((near + elsewhere).counts[:, 1:].sum())
     assert believed.count[7] == labelled and believed.accuracy[7] == pytest.approx(right / labelled)

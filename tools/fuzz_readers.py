@@ -1,10 +1,15 @@
-"""By hand: `python tools/fuzz_readers.py FOLDER --cases 3000 [--readers ply-mesh laz]` damages valid files at random and reads them.
+"""By hand: `python tools/fuzz_readers.py FOLDER --cases 3000 [--readers ply-mesh laz]` damages valid files at
+random and reads them.
 
-Allowed is a result or an InputError. Anything else is a finding: another exception, more than 2 s of processor time, more than 1 GiB above what the process
-takes without a file, the end of the process. A case is made from the name of its reader and its number alone, so that `--only ply-mesh:1234` repeats it.
-One line of JSON per finding and per finished part goes to FOLDER/findings.jsonl and FOLDER/parts.jsonl; parts that are there are not repeated.
+Allowed is a result or an InputError. Anything else is a finding: another exception, more than 2 s of
+processor time, more than 1 GiB above what the process
+takes without a file, the end of the process. A case is made from the name of its reader and its number alone,
+so that `--only ply-mesh:1234` repeats it.
+One line of JSON per finding and per finished part goes to FOLDER/findings.jsonl and FOLDER/parts.jsonl; parts
+that are there are not repeated.
 
-`--atheris READER` lets atheris (libFuzzer) choose the damage by the branches of sc3d's own code that it reaches; pip install atheris.
+`--atheris READER` lets atheris (libFuzzer) choose the damage by the branches of sc3d's own code that it
+reaches; pip install atheris.
 """
 
 from __future__ import annotations
@@ -52,7 +57,11 @@ def main() -> None:
         name, number = arguments.only.rsplit(":", 1)
         return print(one_case(Fixture(name), int(number)))
     started, parts = time.time(), arguments.folder / "parts.jsonl"
-    done = {(row["reader"], row["first"]) for row in map(json.loads, parts.read_text().splitlines())} if parts.exists() else set()
+    done = (
+        {(row["reader"], row["first"]) for row in map(json.loads, parts.read_text().splitlines())}
+        if parts.exists()
+        else set()
+    )
     for first in range(0, arguments.cases, PART):
         for name in arguments.readers or READERS:
             if (name, first) not in done and time.time() - started < 60 * arguments.minutes:
@@ -130,16 +139,22 @@ class Fixture:
         from tests.robustness.readers import TEXT
 
         rng = random.Random(f"{self.name}:{number}")
-        chosen = rng.sample(self.reader.targets, 2 if len(self.reader.targets) > 1 and rng.random() < 0.1 else 1)
+        chosen = rng.sample(
+            self.reader.targets, 2 if len(self.reader.targets) > 1 and rng.random() < 0.1 else 1
+        )
         damaged = {}
         for target in chosen:
             content, is_json = self.contents[target], target.endswith(".json")
-            damaged[target] = damage_json(content, rng) if is_json and rng.random() < 0.7 else damage(content, rng, Path(target).suffix in TEXT or b"ascii" in content[:20])
+            damaged[target] = (
+                damage_json(content, rng)
+                if is_json and rng.random() < 0.7
+                else damage(content, rng, Path(target).suffix in TEXT or b"ascii" in content[:20])
+            )
         return damaged
 
 
 def one_case(fixture: Fixture, number: int) -> tuple[str, str]:
-    """"read", "refused" or "foreign", and what was said."""
+    """ "read", "refused" or "foreign", and what was said."""
     return read_damaged(fixture, fixture.case(number))
 
 
@@ -157,7 +172,9 @@ def read_damaged(fixture: Fixture, damaged: dict[str, bytes]) -> tuple[str, str]
         return ("refused", text) if 0 < len(text) < 5000 else ("foreign", f"message of {len(text)} letters")
     except BaseException as error:  # panics of lazrs are no Exception
         where = traceback.extract_tb(error.__traceback__)[-3:]
-        return "foreign", f"{type(error).__name__}: {str(error)[:200]} | " + " < ".join(f"{Path(frame.filename).name}:{frame.lineno}" for frame in reversed(where))
+        return "foreign", f"{type(error).__name__}: {str(error)[:200]} | " + " < ".join(
+            f"{Path(frame.filename).name}:{frame.lineno}" for frame in reversed(where)
+        )
     finally:
         for target in damaged:
             (fixture.folder / target).write_bytes(fixture.contents[target])
@@ -169,11 +186,18 @@ def report(folder: Path, row: dict) -> None:
 
 
 def guided(name: str, rest: list[str]) -> None:
-    """libFuzzer chooses a target by the first byte and the content by the rest; its arguments, such as -runs=10000, are passed on."""
+    """libFuzzer chooses a target by the first byte and the content by the rest; its arguments, such as
+    -runs=10000, are passed on.
+    """
     import atheris
 
-    compiled = [".".join(file.relative_to(ROOT).with_suffix("").parts) for file in (ROOT / "sc3d").rglob("*.py") if re.search("@numba|@intrinsic", file.read_text())]
-    with atheris.instrument_imports(include=["sc3d"], exclude=compiled):  # numba cannot compile what atheris has changed
+    compiled = [
+        ".".join(file.relative_to(ROOT).with_suffix("").parts)
+        for file in (ROOT / "sc3d").rglob("*.py")
+        if re.search("@numba|@intrinsic", file.read_text())
+    ]
+    # numba cannot compile what atheris has changed
+    with atheris.instrument_imports(include=["sc3d"], exclude=compiled):
         fixture = Fixture(name)
         fixture.reader.read(fixture.folder)  # loads the code under test
     corpus = fixture.folder.parent / "corpus"
@@ -189,7 +213,19 @@ def guided(name: str, rest: list[str]) -> None:
         if result == "foreign":
             raise RuntimeError(told)
 
-    atheris.Setup([sys.argv[0], "-rss_limit_mb=3000", "-timeout=20", "-max_len=20000", "-len_control=0", "-reduce_inputs=0", *rest, str(corpus)], once)
+    atheris.Setup(
+        [
+            sys.argv[0],
+            "-rss_limit_mb=3000",
+            "-timeout=20",
+            "-max_len=20000",
+            "-len_control=0",
+            "-reduce_inputs=0",
+            *rest,
+            str(corpus),
+        ],
+        once,
+    )
     atheris.Fuzz()
 
 

@@ -1,4 +1,6 @@
-"""Writes the manual's pages of commands, from the same records as `--help`: `python tools/make_manual.py [FOLDER]`."""
+"""Writes the manual's pages of commands, from the same records as `--help`: `python tools/make_manual.py
+[FOLDER]`.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ NOTE = "<!-- Written by `python tools/make_manual.py`; edit sc3d/settings instea
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a command. flag: as typed; values: what it takes; default: as text, "" = required; help: one paragraph."""
+    """One option of a command. flag: as typed; values: what it takes; default: as text, "" = required; help:
+    one paragraph.
+    """
 
     flag: str
     values: str
@@ -36,7 +40,8 @@ class Option:
 class Command:
     """A command of the manual.
 
-    about: one sentence; records: settings by subcommand, {"": record} if it has none; scene: it takes a scene folder and --overwrite beside its record
+    about: one sentence; records: settings by subcommand, {"": record} if it has none; scene: it takes a scene
+        folder and --overwrite beside its record
     """
 
     about: str
@@ -50,13 +55,20 @@ def helps(record: type) -> dict[str, str]:
     found = {}
     for part in (kind for kind in reversed(record.__mro__) if is_dataclass(kind)):
         body = ast.parse(textwrap.dedent(inspect.getsource(part))).body[0].body
-        found |= {before.target.id: after.value.value for before, after in zip(body, body[1:], strict=False)
-                  if isinstance(before, ast.AnnAssign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)}
+        found |= {
+            before.target.id: after.value.value
+            for before, after in zip(body, body[1:], strict=False)
+            if isinstance(before, ast.AnnAssign)
+            and isinstance(after, ast.Expr)
+            and isinstance(after.value, ast.Constant)
+        }
     return found
 
 
 def options(record: type) -> list[Option]:
-    """The options of a record, in order; records inside it belong to other commands, to which one line points."""
+    """The options of a record, in order; records inside it belong to other commands, to which one line
+    points.
+    """
     found = []
     for field in fields(record):
         kind = get_type_hints(record, include_extras=True)[field.name]
@@ -64,15 +76,30 @@ def options(record: type) -> list[Option]:
         bare = get_args(kind)[0] if notes else kind
         if "Suppress" in repr(notes):
             continue
-        name = next((note.name for note in notes if getattr(note, "name", None) is not None), field.name).replace("_", "-")
+        name = next(
+            (note.name for note in notes if getattr(note, "name", None) is not None), field.name
+        ).replace("_", "-")
         if is_dataclass(bare):
-            found += [Option(f"--{name}.OPTION", "", "", f"The options of `sc3d {name}`.")] if name else options(bare)
+            found += (
+                [Option(f"--{name}.OPTION", "", "", f"The options of `sc3d {name}`.")]
+                if name
+                else options(bare)
+            )
             continue
-        about = next((note.help for note in notes if getattr(note, "help", None)), None) or helps(record).get(field.name, "")
+        about = next((note.help for note in notes if getattr(note, "help", None)), None) or helps(record).get(
+            field.name, ""
+        )
         positional = "Positional" in repr(kind)
         default = None if field.default is MISSING else field.default
         flag = name.upper() if positional else f"--{name}, --no-{name}" if bare is bool else f"--{name}"
-        found.append(Option(flag, "" if bare is bool else _values(bare), "" if positional else _shown(default), " ".join(about.split())))
+        found.append(
+            Option(
+                flag,
+                "" if bare is bool else _values(bare),
+                "" if positional else _shown(default),
+                " ".join(about.split()),
+            )
+        )
     return found
 
 
@@ -80,8 +107,16 @@ def page(name: str, command: Command) -> str:
     """Markdown page of a command."""
     parts = [NOTE, f"# sc3d {name}", command.about]
     for subcommand, record in command.records.items():
-        usage = " ".join(["sc3d", name, *([subcommand] if subcommand else []), *(["SCENE"] if command.scene else []),
-                          *(option.flag for option in options(record) if not option.flag.startswith("-")), "[options]"])
+        usage = " ".join(
+            [
+                "sc3d",
+                name,
+                *([subcommand] if subcommand else []),
+                *(["SCENE"] if command.scene else []),
+                *(option.flag for option in options(record) if not option.flag.startswith("-")),
+                "[options]",
+            ]
+        )
         heading = [f"## {subcommand}", " ".join((record.__doc__ or "").split())] if subcommand else []
         parts += [*heading, f"```\n{usage}\n```", _table(options(record), command.scene)]
     return "\n\n".join(parts) + "\n"
@@ -94,14 +129,20 @@ def write_pages(folder: Path, commands: dict[str, Command]) -> list[Path]:
         written.append(folder / f"{name}.md")
         write_text(written[-1], page(name, command))
     lines = [f"| [{name}]({name}.md) | {command.about} |" for name, command in commands.items()]
-    write_text(folder / "README.md", "\n".join([NOTE, "", "# Commands", "", "| command | |", "|---|---|", *lines]) + "\n")
+    write_text(
+        folder / "README.md",
+        "\n".join([NOTE, "", "# Commands", "", "| command | |", "|---|---|", *lines]) + "\n",
+    )
     return [*written, folder / "README.md"]
 
 
 def _table(found: list[Option], scene: bool) -> str:
     rows = [(option.flag, option.values, option.default, option.help) for option in found]
     rows += [("--overwrite", "", "False", "Run again even if the outputs are up to date.")] if scene else []
-    cells = ["| " + " | ".join(_escaped(cell) for cell in (f"`{flag}`", values, default, about)) + " |" for flag, values, default, about in rows]
+    cells = [
+        "| " + " | ".join(_escaped(cell) for cell in (f"`{flag}`", values, default, about)) + " |"
+        for flag, values, default, about in rows
+    ]
     return "\n".join(["| option | values | default | |", "|---|---|---|---|", *cells])
 
 
@@ -118,8 +159,14 @@ def _values(kind: Any) -> str:
     if origin in (Union, UnionType):
         return _values(next(argument for argument in arguments if argument is not NoneType))
     if origin is tuple:
-        return f"{_values(arguments[0])} ..." if arguments[-1] is Ellipsis else " ".join(_values(argument) for argument in arguments)
-    return {int: "whole number", float: "number", str: "text", Path: "path"}.get(kind, getattr(kind, "__name__", str(kind)))
+        return (
+            f"{_values(arguments[0])} ..."
+            if arguments[-1] is Ellipsis
+            else " ".join(_values(argument) for argument in arguments)
+        )
+    return {int: "whole number", float: "number", str: "text", Path: "path"}.get(
+        kind, getattr(kind, "__name__", str(kind))
+    )
 
 
 def _shown(value: object) -> str:
@@ -133,7 +180,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "data" / "manual" / "commands")
     folder = parser.parse_args(arguments).folder
-    commands = {name: _command(record, name in STAGES) for name, record in sorted((STAGES | COMMANDS).items())}
+    commands = {
+        name: _command(record, name in STAGES) for name, record in sorted((STAGES | COMMANDS).items())
+    }
     written = write_pages(folder, commands)
     sys.stdout.write(f"wrote {len(written)} pages to {folder}\n")
 

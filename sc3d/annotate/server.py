@@ -1,7 +1,9 @@
 """HTTP for the annotation page, on the loopback address only.
 
-What keeps others out: the Host header must name this server (a foreign name that resolves to 127.0.0.1 does not), requests that a browser
-marks as coming from another site are refused, and whatever writes or computes must come from the page's own origin and carry the token that
+What keeps others out: the Host header must name this server (a foreign name that resolves to 127.0.0.1 does
+not), requests that a browser
+marks as coming from another site are refused, and whatever writes or computes must come from the page's own
+origin and carry the token that
 only this page was given. Photos are found by their names in a list, never by a path.
 """
 
@@ -27,11 +29,16 @@ logger = logging.getLogger(__name__)
 ADDRESS = "127.0.0.1"
 LARGEST_BODY = 8 << 20  # bytes
 PORTS_TRIED = 20
-STATIC = {"/": ("page.html", "text/html"), "/page.js": ("page.js", "text/javascript"), "/canvas.js": ("canvas.js", "text/javascript"),
-          "/drawing.js": ("drawing.js", "text/javascript"), "/style.css": ("style.css", "text/css")}
+STATIC = {
+    "/": ("page.html", "text/html"),
+    "/page.js": ("page.js", "text/javascript"),
+    "/canvas.js": ("canvas.js", "text/javascript"),
+    "/drawing.js": ("drawing.js", "text/javascript"),
+    "/style.css": ("style.css", "text/css"),
+}
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; "
-                               "form-action 'none'; frame-ancestors 'none'",
+    "form-action 'none'; frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
     "X-Content-Type-Options": "nosniff",
@@ -72,7 +79,9 @@ class AnnotationServer(ThreadingHTTPServer):
             except (OSError, OverflowError):
                 continue
         else:
-            raise InputError(f"no free port from {port} to {port + PORTS_TRIED - 1}: choose another with --port")
+            raise InputError(
+                f"no free port from {port} to {port + PORTS_TRIED - 1}: choose another with --port"
+            )
         self.hosts = {f"{name}:{self.server_port}" for name in (ADDRESS, "localhost")}
 
     @property
@@ -115,7 +124,10 @@ class Handler(BaseHTTPRequestHandler):
             found, status = _to_json({"error": str(error)}), HTTPStatus.UNPROCESSABLE_ENTITY
         except Exception:  # the page must hear of it; the traceback goes to the log
             logger.exception("%s %s failed", self.command, self.path)
-            found, status = _to_json({"error": "something went wrong: see the terminal"}), HTTPStatus.INTERNAL_SERVER_ERROR
+            found, status = (
+                _to_json({"error": "something went wrong: see the terminal"}),
+                HTTPStatus.INTERNAL_SERVER_ERROR,
+            )
         self._send(status, found)
 
     def _get(self, path: str) -> Answer:
@@ -125,7 +137,11 @@ class Handler(BaseHTTPRequestHandler):
         if path == "/scene":
             return _to_json(session.describe())
         kind, stem = self._split(path, ("photo", "strokes"))
-        return Answer(session.photo(stem), "image/jpeg") if kind == "photo" else _to_json({"shapes": session.read(stem)})
+        return (
+            Answer(session.photo(stem), "image/jpeg")
+            if kind == "photo"
+            else _to_json({"shapes": session.read(stem)})
+        )
 
     def _post(self, path: str) -> Answer:
         self._check_token()
@@ -155,7 +171,9 @@ class Handler(BaseHTTPRequestHandler):
         if not (length.isascii() and length.isdigit()):
             raise Refusal(HTTPStatus.LENGTH_REQUIRED, "the length of the request is missing")
         if int(length) > LARGEST_BODY:
-            raise Refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {LARGEST_BODY >> 20} MB of strokes")
+            raise Refusal(
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {LARGEST_BODY >> 20} MB of strokes"
+            )
         try:
             return json.loads(self.rfile.read(int(length)))
         except (ValueError, RecursionError):
@@ -174,7 +192,9 @@ class Handler(BaseHTTPRequestHandler):
 
     def _send(self, status: HTTPStatus, answer: Answer) -> None:
         self.send_response(status)
-        for name, value in ({"Content-Type": answer.kind, "Content-Length": str(len(answer.body))} | HEADERS).items():
+        for name, value in (
+            {"Content-Type": answer.kind, "Content-Length": str(len(answer.body))} | HEADERS
+        ).items():
             self.send_header(name, value)
         if status != HTTPStatus.OK:
             self.send_header("Connection", "close")  # a refused body is still in the pipe

@@ -1,4 +1,6 @@
-"""What the annotation page can do to a scene: show photos, read and write strokes, and try them out on a photo. Knows nothing of HTTP."""
+"""What the annotation page can do to a scene: show photos, read and write strokes, and try them out on a
+photo. Knows nothing of HTTP.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ class Session:
         """Look at everything first, so that errors come before the page.
 
         start: name or stem of the photo to show first
-        Raises InputError if the scene lacks photos, classes or that photo, or holds strokes that cannot be read.
+        Raises InputError if the scene lacks photos, classes or that photo, or holds strokes that cannot be
+        read.
         """
         scene.require(scene.classes, scene.images, hint="the page needs classes.json and images/")
         self._scene = scene
@@ -44,7 +47,9 @@ class Session:
         self.sizes = {stem: image_size(photo) for stem, photo in self.photos.items()}
         self._start = next(iter(self.photos)) if start is None else Path(start).stem
         if self._start not in self.photos:
-            raise InputError(f"no photo {start!r} in {scene.images}: one of {', '.join(list(self.photos)[:5])} ...")
+            raise InputError(
+                f"no photo {start!r} in {scene.images}: one of {', '.join(list(self.photos)[:5])} ..."
+            )
         self._trying, self._writing = threading.Lock(), threading.Lock()
         self._learned: tuple[str, Strokes] | None = None
         self._jpeg = lru_cache(maxsize=4)(self._encode)
@@ -58,11 +63,26 @@ class Session:
         photos = []
         for stem, photo in self.photos.items():
             width, height = self.sizes[stem]
-            photos.append({"stem": stem, "name": photo.name, "width": width, "height": height, "strokes": len(self.read(stem))})
-        return {"scene": self._scene.path.resolve().name, "start": self._start, "classes": classes, "photos": photos}
+            photos.append(
+                {
+                    "stem": stem,
+                    "name": photo.name,
+                    "width": width,
+                    "height": height,
+                    "strokes": len(self.read(stem)),
+                }
+            )
+        return {
+            "scene": self._scene.path.resolve().name,
+            "start": self._start,
+            "classes": classes,
+            "photos": photos,
+        }
 
     def file(self, stem: str) -> Path:
-        """Where the strokes of a photo are kept; KeyError for an unknown photo, so that no name leads out of the folder."""
+        """Where the strokes of a photo are kept; KeyError for an unknown photo, so that no name leads out of
+        the folder.
+        """
         return self._scene.strokes / f"{self.photos[stem].stem}.json"
 
     def read(self, stem: str) -> list[dict[str, object]]:
@@ -71,13 +91,24 @@ class Session:
         return self._plain(read_json(file), file, stem) if file.exists() else []
 
     def save(self, stem: str, content: object) -> int:
-        """Check a drawing like the backend does and write it; a file without shapes is removed. Returns the number of shapes.
+        """Check a drawing like the backend does and write it; a file without shapes is removed. Returns the
+        number of shapes.
 
         content: LabelMe, decoded; fields that strokes do not need are dropped
         """
-        shapes = [shape | {"group_id": None, "description": "", "flags": {}} for shape in self._plain(content, "the drawing", stem)]
+        shapes = [
+            shape | {"group_id": None, "description": "", "flags": {}}
+            for shape in self._plain(content, "the drawing", stem)
+        ]
         width, height = self.sizes[stem]
-        head = {"version": "5.5.0", "flags": {}, "imagePath": self.photos[stem].name, "imageData": None, "imageHeight": height, "imageWidth": width}
+        head = {
+            "version": "5.5.0",
+            "flags": {},
+            "imagePath": self.photos[stem].name,
+            "imageData": None,
+            "imageHeight": height,
+            "imageWidth": width,
+        }
         with self._writing:  # two windows may save at once
             if shapes:
                 write_json(self.file(stem), head | {"shapes": shapes})
@@ -89,17 +120,23 @@ class Session:
         """The shapes of a LabelMe file, checked, in px of the photo."""
         names = {entry.id: entry.name for entry in self.class_table} | {0: BACKGROUND}
         shapes = parse_shapes(content, origin, self.sizes[stem], self.class_table)
-        return [{"label": names[shape.label], "shape_type": shape.kind, "points": shape.points.tolist()} | ({"width": shape.width} if shape.width else {})
-                for shape in shapes]
+        return [
+            {"label": names[shape.label], "shape_type": shape.kind, "points": shape.points.tolist()}
+            | ({"width": shape.width} if shape.width else {})
+            for shape in shapes
+        ]
 
     def photo(self, stem: str) -> bytes:
-        """The photo as JPEG, as it is stored: LabelMe and browsers would turn it by its EXIF orientation, the cameras do not."""
+        """The photo as JPEG, as it is stored: LabelMe and browsers would turn it by its EXIF orientation, the
+        cameras do not.
+        """
         return self._jpeg(stem)
 
     def try_out(self, stem: str) -> bytes:
         """Learn from all strokes of the scene, if they have changed, and segment a photo.
 
-        returns: RGBA PNG in the colours of the classes, transparent where there is no label; no larger than needed
+        returns: RGBA PNG in the colours of the classes, transparent where there is no label; no larger than
+            needed
         Raises BusyError while another request does the same.
         """
         photo = self.photos[stem]
@@ -108,11 +145,18 @@ class Session:
         try:
             state = digest(self._scene.strokes)
             if self._learned is None or self._learned[0] != state:
-                self._learned = state, Strokes.learn(self._scene.strokes, self._scene.images, self.class_table, self._settings)
+                self._learned = (
+                    state,
+                    Strokes.learn(self._scene.strokes, self._scene.images, self.class_table, self._settings),
+                )
             labels = self._learned[1].segment(reduced(read_image(photo), TRIED)).labels
         finally:
             self._trying.release()
-        return _png(np.dstack([self.class_table.palette[labels][..., ::-1], np.where(labels > 0, 255, 0).astype(np.uint8)]))
+        return _png(
+            np.dstack(
+                [self.class_table.palette[labels][..., ::-1], np.where(labels > 0, 255, 0).astype(np.uint8)]
+            )
+        )
 
     def _encode(self, stem: str) -> bytes:
         shown = np.ascontiguousarray(reduced(read_image(self.photos[stem]), SHOWN)[..., ::-1])

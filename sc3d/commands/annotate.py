@@ -19,8 +19,12 @@ def main(command: Annotate) -> None:
     scene.require(hint="")
     require_writable(scene.path)
     with AnnotationServer(Session(scene, command.photo), command.port) as server:
-        logger.info("open %s in a browser on this machine; Ctrl + C ends it\nstrokes go to %s; `sc3d segment %s --backend strokes` makes the masks",
-                    server.url, scene.strokes, scene.path)
+        logger.info(
+            "open %s in a browser on this machine; Ctrl + C ends it\nstrokes go to %s; `sc3d segment %s --backend strokes` makes the masks",
+            server.url,
+            scene.strokes,
+            scene.path,
+        )
         try:
             server.serve_forever()
         except KeyboardInterrupt:

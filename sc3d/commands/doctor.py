@@ -25,14 +25,23 @@ PROBES = {  # each in a process of its own: a missing library may abort it
     "vulkan pictures": "import open3d as o; o.visualization.rendering.OffscreenRenderer(8, 8); print('work')",
     "OpenGL pictures": "import open3d as o; v = o.visualization.Visualizer(); print('work' if v.create_window(visible=False) else 'do not work')",
 }
-APT = {"GL": "libgl1", "EGL": "libegl1", "usb-1.0": "libusb-1.0-0", "vulkan": "libvulkan1 mesa-vulkan-drivers"}
+APT = {
+    "GL": "libgl1",
+    "EGL": "libegl1",
+    "usb-1.0": "libusb-1.0-0",
+    "vulkan": "libvulkan1 mesa-vulkan-drivers",
+}
 
 
 def main(command: Doctor) -> None:
     for name, version in versions().items():
         logger.info("%-22s %s", name, version)
     missing = [package for library, package in APT.items() if ctypes.util.find_library(library) is None]
-    logger.info("%-22s %s", "system libraries", "complete" if not missing else f"sudo apt-get install --no-install-recommends {' '.join(missing)}")
+    logger.info(
+        "%-22s %s",
+        "system libraries",
+        "complete" if not missing else f"sudo apt-get install --no-install-recommends {' '.join(missing)}",
+    )
     for name, code in PROBES.items():
         logger.info("%-22s %s", name, _probe(code))
     logger.info("%-22s %s", "processor cores", os.cpu_count())
@@ -47,7 +56,9 @@ def _probe(code: str) -> str:
         return "no answer within 120 s"
     if result.returncode == 0 and result.stdout.strip():
         return result.stdout.strip().splitlines()[-1]
-    lines = (result.stderr.strip() or result.stdout.strip() or f"ended with status {result.returncode}").splitlines()
+    lines = (
+        result.stderr.strip() or result.stdout.strip() or f"ended with status {result.returncode}"
+    ).splitlines()
     return f"does not work: {lines[-1][:150]}"
 
 

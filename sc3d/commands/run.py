@@ -22,15 +22,24 @@ logger = logging.getLogger(__name__)
 def main(command: Run) -> None:
     started = time.perf_counter()
     scene = Scene(command.scene)
-    segment = replace(command.segment, masks=command.masks or command.segment.masks, confidence=command.confidence or command.segment.confidence)
+    segment = replace(
+        command.segment,
+        masks=command.masks or command.segment.masks,
+        confidence=command.confidence or command.segment.confidence,
+    )
     check(command, segment)
     prepare(command.photos, scene)
     if command.classes is not None:
         with atomic_path(scene.classes) as temporary:
             shutil.copyfile(command.classes, temporary)
     stages = [
-        ("reconstruct", command.reconstruct), ("train", command.train), ("extract", command.extract), ("segment", replace(segment, refine=False)),
-        *([("segment", Segment(refine=True))] if segment.refine else []), ("label", command.label), ("propagate", command.propagate),
+        ("reconstruct", command.reconstruct),
+        ("train", command.train),
+        ("extract", command.extract),
+        ("segment", replace(segment, refine=False)),
+        *([("segment", Segment(refine=True))] if segment.refine else []),
+        ("label", command.label),
+        ("propagate", command.propagate),
     ]
     if command.truth is not None:
         stages.append(("evaluate", Evaluate(truth=command.truth)))
@@ -44,7 +53,9 @@ def check(command: Run, segment: Segment) -> None:
     sizes = photo_sizes(command.photos)
     classes = command.classes or Scene(command.scene).classes
     if not classes.exists():
-        raise InputError(f"{classes} is missing: pass --classes FILE (data/classes.json of the sc3d repository is one to start from)")
+        raise InputError(
+            f"{classes} is missing: pass --classes FILE (data/classes.json of the sc3d repository is one to start from)"
+        )
     class_table = read_classes(classes)
     if segment.backend == "files":
         from sc3d.segmentation.mask_formats.import_masks import check_masks
@@ -52,8 +63,12 @@ def check(command: Run, segment: Segment) -> None:
 
         masks = segment.masks or Scene(command.scene).masks
         if not masks.exists():
-            raise InputError("--masks PATH is needed (or --segment.backend strokes or grounded-sam, which make masks)")
-        source = MaskFiles(masks, segment.format, segment.mapping) if segment.masks else MaskFiles(masks, "index")
+            raise InputError(
+                "--masks PATH is needed (or --segment.backend strokes or grounded-sam, which make masks)"
+            )
+        source = (
+            MaskFiles(masks, segment.format, segment.mapping) if segment.masks else MaskFiles(masks, "index")
+        )
         check_masks(source, sizes, class_table, segment.confidence)
     if command.truth is not None:
         match_masks(command.truth, sizes, class_table)

@@ -38,7 +38,9 @@ def main(command: View) -> None:
     if command.photo is not None:
         photo = next((view for view in views if view.name == command.photo), None)
         if photo is None:
-            raise InputError(f"no photo {command.photo!r} in {scene.sparse}: one of {', '.join(view.name for view in views[:5])} ...")
+            raise InputError(
+                f"no photo {command.photo!r} in {scene.sparse}: one of {', '.join(view.name for view in views[:5])} ..."
+            )
     if command.flight is not None:
         _write_flight(command, scene)
     if command.web or command.html is not None:
@@ -56,10 +58,16 @@ def main(command: View) -> None:
 def _check(command: View) -> None:
     """Raise InputError for options that do not fit together, before any work."""
     page = command.web or command.html is not None
-    if page and (command.screenshot is not None or command.flight is not None or (command.web and command.html is not None)):
+    if page and (
+        command.screenshot is not None
+        or command.flight is not None
+        or (command.web and command.html is not None)
+    ):
         raise InputError("choose one of --web, --html FILE and --screenshot FILE or --flight FILE")
     if command.splats and not page and command.screenshot is None and command.flight is None:
-        raise InputError("the window shows no splats: add --web for the browser, --screenshot FILE for a picture, or --flight FILE for a video")
+        raise InputError(
+            "the window shows no splats: add --web for the browser, --screenshot FILE for a picture, or --flight FILE for a video"
+        )
     if command.splats and command.file is not None:
         raise InputError("--splats shows the Gaussians of the scene: leave out --file")
     if command.splats and command.by in ("state", "disagreement"):
@@ -83,7 +91,11 @@ def _picture_of_cloud(command: View, scene: Scene, views: list[Camera], photo: C
 
     cloud, table = _read_cloud(command, scene, votes=command.by == "disagreement"), _class_table(scene)
     cloud = only_classes(cloud, class_ids(table, command.classes))
-    style = Style(by=command.by, from_above=command.from_above, cameras=views if command.cameras and photo is None else ())
+    style = Style(
+        by=command.by,
+        from_above=command.from_above,
+        cameras=views if command.cameras and photo is None else (),
+    )
     return screenshot(cloud, photo, command.size, style, table)
 
 
@@ -95,7 +107,12 @@ def _open_window(command: View, scene: Scene, views: list[Camera]) -> None:
     from sc3d.view.window import show
 
     inspector = _inspector(scene, _read_cloud(command, scene, votes=True), views)
-    show(inspector, views if command.cameras else [], command.by, class_ids(inspector.class_table, command.classes))
+    show(
+        inspector,
+        views if command.cameras else [],
+        command.by,
+        class_ids(inspector.class_table, command.classes),
+    )
 
 
 def _show_page(command: View, scene: Scene, views: list[Camera]) -> None:
@@ -108,16 +125,28 @@ def _show_page(command: View, scene: Scene, views: list[Camera]) -> None:
     has_cloud = command.file is not None or _file_of(scene) is not None
     splats_first = command.splats or not has_cloud
     splats = _splats_of_scene(scene) if splats_first else None
-    inspector = _inspector(scene, _read_cloud(command, scene, votes=True) if has_cloud else splats.centres(), views)
+    inspector = _inspector(
+        scene, _read_cloud(command, scene, votes=True) if has_cloud else splats.centres(), views
+    )
     by = command.by
     if splats_first and not can_color(inspector.cloud, by):
         by = "photo"
         logger.info("there are no labels yet, the colours are those of the photos")
     color_points(inspector.cloud, by, inspector.class_table)
-    load_splats = None if splats is None and not scene.gaussians.exists() else lambda: splats or _splats_of_scene(scene)
+    load_splats = (
+        None if splats is None and not scene.gaussians.exists() else lambda: splats or _splats_of_scene(scene)
+    )
     view = WebView(
-        scene, inspector, load_splats, splats_first, by, class_ids(inspector.class_table, command.classes), command.cameras, command.photo,
-        command.from_above, command.points,
+        scene,
+        inspector,
+        load_splats,
+        splats_first,
+        by,
+        class_ids(inspector.class_table, command.classes),
+        command.cameras,
+        command.photo,
+        command.from_above,
+        command.points,
     )
     if command.html is None:
         serve(view, command.host, command.port)
@@ -174,7 +203,9 @@ def _splats_of_scene(scene: Scene) -> ShownSplats:
 
 
 def _splats(command: View, scene: Scene) -> ShownSplats:
-    """The splats for a picture or video: gaussians.ply as trained or, for `--splats --by label` and `--by confidence`, the labelled ones."""
+    """The splats for a picture or video: gaussians.ply as trained or, for `--splats --by label` and `--by
+    confidence`, the labelled ones.
+    """
     from sc3d.view.display_cloud import class_ids
     from sc3d.view.display_splats import labelled_splats, trained_splats
 
@@ -184,12 +215,17 @@ def _splats(command: View, scene: Scene) -> ShownSplats:
         table = scene.class_table()
         return labelled_splats(scene, table).only(class_ids(table, command.classes))
     if command.splats and command.by == "label":
-        logger.info("the splats have no labels yet and are shown as trained: `sc3d export %s --format splats` labels them", scene.path)
+        logger.info(
+            "the splats have no labels yet and are shown as trained: `sc3d export %s --format splats` labels them",
+            scene.path,
+        )
     return trained_splats(scene)
 
 
 def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: the splats from the air, or beside a photo; in class colours or by confidence where they have labels."""
+    """(H, W, 3) uint8 RGB: the splats from the air, or beside a photo; in class colours or by confidence
+    where they have labels.
+    """
     from sc3d.geometry.cameras import resample
     from sc3d.view.captions import add_legend
     from sc3d.view.contact_sheet import half_of, side_by_side
@@ -203,13 +239,17 @@ def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.
     if photo is None:
         seen = gaussians.means[gaussians.opacities > 0.5].numpy()
         points = seen if len(seen) else gaussians.means.numpy()
-        image = rendered(gaussians, aerial_view(without_outliers(points), command.size, command.from_above), WHITE)
+        image = rendered(
+            gaussians, aerial_view(without_outliers(points), command.size, command.from_above), WHITE
+        )
         return image if table is None else add_legend(image, command.by, table, present)
     source = photo.shifted(splats.origin)
     view = fitted(source, half_of(command.size))
     pixels = resample(read_image(scene.photo(photo.name)), source, view)
     if table is not None:
-        image = side_by_side((pixels, rendered(gaussians, view, WHITE)), (photo.name, f"splats by {command.by}"))
+        image = side_by_side(
+            (pixels, rendered(gaussians, view, WHITE)), (photo.name, f"splats by {command.by}")
+        )
         return add_legend(image, command.by, table, present)
     found = compare(gaussians, view, pixels)
     return side_by_side((found.photo, found.rendered), (photo.name, f"splats, PSNR {found.psnr:.2f} dB"))
@@ -222,8 +262,14 @@ def _write_flight(command: View, scene: Scene) -> None:
     from sc3d.view.splat_images import rendered
 
     splats = _splats(command, scene)
-    gaussians = splats.painted(command.by, scene.class_table()) if command.splats and splats.label is not None else splats.gaussians
+    gaussians = (
+        splats.painted(command.by, scene.class_table())
+        if command.splats and splats.label is not None
+        else splats.gaussians
+    )
     path = flight_path([view.shifted(splats.origin) for view in scene.model.views], command.size)
-    frames = (rendered(gaussians, view, WHITE) for view in tqdm(path, desc="flight", unit="frame", disable=None))
+    frames = (
+        rendered(gaussians, view, WHITE) for view in tqdm(path, desc="flight", unit="frame", disable=None)
+    )
     write_video(command.flight, frames, (path[0].width, path[0].height))
     logger.info("wrote %s", command.flight)

@@ -1,1 +1,3 @@
-"""The labelled scene for other programs: one module per format, each with `outputs(scene, settings)` and `write(scene, settings) -> figures`."""
+"""The labelled scene for other programs: one module per format, each with `outputs(scene, settings)` and
+`write(scene, settings) -> figures`.
+"""

@@ -13,15 +13,20 @@ from sc3d.geometry.raster import Grid, highest_points
 CLOSING, OPENING = 0.6, 0.5  # gaps and strips narrower than about twice this vanish, m
 SMOOTHING = 0.4  # standard deviation of the Gaussian that evens the border out, m
 HOLE = 6.0  # courtyards smaller than this are gaps, m2
-ROOF_SHARE = 0.3  # of the points above the ground in a cell: fewer are a few wrong labels in a crown, not a roof under one
+# of the points above the ground in a cell: fewer are a few wrong labels in a crown, not a roof under one
+ROOF_SHARE = 0.3
 STEP = 2.0  # roofs that differ by more along all their border are two buildings, m
-ENCLOSED = 0.5  # a part with this share of its border on one other building (a tower, a lift house) belongs to it
-EDGE, PART = 0.35, 0.1  # chimneys and machines end at steps of EDGE m; what is left of a roof has parts of at least this share of it
+# a part with this share of its border on one other building (a tower, a lift house) belongs to it
+ENCLOSED = 0.5
+# chimneys and machines end at steps of EDGE m; what is left of a roof has parts of at least this share of it
+EDGE, PART = 0.35, 0.1
 MAX_SLOPE = 1.5  # steeper is an edge, not a roof, in wide cells
 TOP = 0.98  # quantile of the roof that is its height: the ridge without single high points
 
 
-def roof_heights(points: np.ndarray, is_building: np.ndarray, above_ground: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def roof_heights(
+    points: np.ndarray, is_building: np.ndarray, above_ground: np.ndarray, grid: Grid
+) -> tuple[np.ndarray, np.ndarray]:
     """Cells that a roof covers, also under overhanging crowns, and its height there.
 
     points: (N, 3) m; is_building, above_ground: (N,) bool
@@ -30,7 +35,9 @@ def roof_heights(points: np.ndarray, is_building: np.ndarray, above_ground: np.n
     roof = is_building & above_ground
     size = grid.height * grid.width
     cells = grid.flat_cells(points[above_ground])
-    share = np.bincount(cells, is_building[above_ground], size) / np.maximum(np.bincount(cells, minlength=size), 1)
+    share = np.bincount(cells, is_building[above_ground], size) / np.maximum(
+        np.bincount(cells, minlength=size), 1
+    )
     rows = highest_points(grid, points, roof)
     known = (rows >= 0) & (share.reshape(grid.shape) >= ROOF_SHARE)
     if not known.any():
@@ -42,22 +49,27 @@ def roof_heights(points: np.ndarray, is_building: np.ndarray, above_ground: np.n
 
 
 def close_roofs(covered: np.ndarray, pixel: float) -> np.ndarray:
-    """Narrow gaps and small holes filled, strips and specks removed, the border moved to where half of the cells around are covered."""
+    """Narrow gaps and small holes filled, strips and specks removed, the border moved to where half of the
+    cells around are covered.
+    """
     closing, opening = disk(CLOSING / pixel), disk(OPENING / pixel)
     margin = 2 * len(closing)
     covered = np.pad(covered, margin)
     closed = ndimage.binary_closing(covered, closing)
     holes, _ = ndimage.label(~closed)
     closed |= (np.bincount(holes.ravel())[holes] * pixel**2 < HOLE) & (holes > 0)
-    inner = ndimage.binary_erosion(closed, closing)  # closing also fills the dents of a noisy border, which would move it outwards
+    # closing also fills the dents of a noisy border, which would move it outwards
+    inner = ndimage.binary_erosion(closed, closing)
     smooth = ndimage.gaussian_filter((covered | inner).astype(np.float64), SMOOTHING / pixel) > 0.5
     return ndimage.binary_opening(smooth, opening)[margin:-margin, margin:-margin]
 
 
 def split_buildings(covered: np.ndarray, heights: np.ndarray, grid: Grid, min_area: float) -> np.ndarray:
-    """(H, W) int32 number of the building in each cell from 1, 0 = none: connected cells without a step between them.
+    """(H, W) int32 number of the building in each cell from 1, 0 = none: connected cells without a step
+    between them.
 
-    covered: (H, W) bool; heights: (H, W) m; min_area: smaller pieces go to the neighbour that they touch, or vanish, m2
+    covered: (H, W) bool; heights: (H, W) m; min_area: smaller pieces go to the neighbour that they touch, or
+        vanish, m2
     """
     blocks, _ = ndimage.label(covered)
     parts = connected_cells(covered.astype(np.int32), heights, STEP)
@@ -70,7 +82,9 @@ def split_buildings(covered: np.ndarray, heights: np.ndarray, grid: Grid, min_ar
 
 
 def join_enclosed(parts: np.ndarray) -> np.ndarray:
-    """Parts with most of their border on one other part become part of it, the smallest first. parts: (H, W) int from 0 = none."""
+    """Parts with most of their border on one other part become part of it, the smallest first. parts: (H, W)
+    int from 0 = none.
+    """
     pairs = np.concatenate([np.stack([parts[a].ravel(), parts[b].ravel()], axis=1) for a, b in neighbors()])
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     found, counts = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0, return_counts=True)
@@ -80,7 +94,11 @@ def join_enclosed(parts: np.ndarray) -> np.ndarray:
     sizes, target = np.bincount(parts.ravel()), np.arange(parts.max() + 1)
     for part in sorted(set(borders) - {0}, key=lambda part: (sizes[part], part)):
         around = borders[part]
-        other, shared = max(((other, count) for other, count in around.items() if other), key=lambda item: item[1], default=(0, 0))
+        other, shared = max(
+            ((other, count) for other, count in around.items() if other),
+            key=lambda item: item[1],
+            default=(0, 0),
+        )
         if other and shared >= ENCLOSED * around.total():
             target[target == part] = other
             del borders[part]
@@ -92,14 +110,20 @@ def join_enclosed(parts: np.ndarray) -> np.ndarray:
 
 
 def roof_tops(buildings: np.ndarray, heights: np.ndarray, pixel: float) -> np.ndarray:
-    """(B,) float64 z of the ridge or parapet of each building, m: the top of its roof without chimneys and machines.
+    """(B,) float64 z of the ridge or parapet of each building, m: the top of its roof without chimneys and
+    machines.
 
     buildings: (H, W) int32 numbers from 1; heights: (H, W) z, m; pixel: side of the cells, m
     """
     parts = connected_cells(buildings, heights, max(EDGE, MAX_SLOPE * pixel))
     large = np.bincount(parts.ravel())[parts] >= PART * np.bincount(buildings.ravel())[buildings]
     large |= ~_any_in(buildings, large)
-    return np.array([np.quantile(heights.ravel()[cells], TOP) for cells in cells_by_number(np.where(large, buildings, 0), int(buildings.max()))])
+    return np.array(
+        [
+            np.quantile(heights.ravel()[cells], TOP)
+            for cells in cells_by_number(np.where(large, buildings, 0), int(buildings.max()))
+        ]
+    )
 
 
 def _any_in(parts: np.ndarray, chosen: np.ndarray) -> np.ndarray:

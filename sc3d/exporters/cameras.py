@@ -27,21 +27,39 @@ def colmap_text_folder(scene: Scene) -> Path:
 
 
 def write_transforms(scene: Scene) -> dict[str, object]:
-    """`export/transforms/transforms.json` and `sparse_pc.ply`, in the scene's own frame; the photos stay where they are and are named relative to it."""
+    """`export/transforms/transforms.json` and `sparse_pc.ply`, in the scene's own frame; the photos stay
+    where they are and are named relative to it.
+    """
     views, folder = scene.model.views, transforms_folder(scene)
     lenses = [camera_parameters(view.camera, view.name) for view in views]
     if len({lens["camera_model"] for lens in lenses}) > 1:
-        raise InputError("transforms.json cannot hold perspective and fisheye photos together: export a COLMAP model instead")
+        raise InputError(
+            "transforms.json cannot hold perspective and fisheye photos together: export a COLMAP model instead"
+        )
     model = {"camera_model": lenses[0]["camera_model"]}
     shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else model
-    frames = [_frame(view, {} if shared is lenses[0] else {key: value for key, value in lens.items() if key not in model}) for view, lens in zip(views, lenses)]
+    frames = [
+        _frame(
+            view,
+            {} if shared is lenses[0] else {key: value for key, value in lens.items() if key not in model},
+        )
+        for view, lens in zip(views, lenses)
+    ]
     points = o3d.t.geometry.PointCloud(o3d.core.Tensor(scene.model.points))
     points.point.colors = o3d.core.Tensor(scene.model.colors)
     if len(scene.model.points):
         write_geometry(folder / "sparse_pc.ply", points)
     _write_place(scene, folder)
-    write_json(folder / "transforms.json", {**shared, "frames": frames, "applied_transform": np.eye(4)[:3].tolist(), "orientation_override": "none"}
-               | ({"ply_file_path": "sparse_pc.ply"} if len(scene.model.points) else {}))
+    write_json(
+        folder / "transforms.json",
+        {
+            **shared,
+            "frames": frames,
+            "applied_transform": np.eye(4)[:3].tolist(),
+            "orientation_override": "none",
+        }
+        | ({"ply_file_path": "sparse_pc.ply"} if len(scene.model.points) else {}),
+    )
     return {"photos": len(views), "points": len(scene.model.points)}
 
 
@@ -57,7 +75,9 @@ def write_colmap_text(scene: Scene) -> dict[str, object]:
 
 
 def _write_place(scene: Scene, folder: Path) -> None:
-    """Put the scene's georeference beside an export, as the formats have no place for it; `sc3d import` finds it there."""
+    """Put the scene's georeference beside an export, as the formats have no place for it; `sc3d import` finds
+    it there.
+    """
     found = read_georeference(scene)
     if found is not None:
         write_georeference(Scene(folder), found)

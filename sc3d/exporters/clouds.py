@@ -21,15 +21,21 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
-    """`export/clouds/<id>_<name>.ply` for each class that has points, unlabelled ones too; float64 positions in the CRS, points in their order."""
+    """`export/clouds/<id>_<name>.ply` for each class that has points, unlabelled ones too; float64 positions
+    in the CRS, points in their order.
+    """
     placed = read_placed_cloud(scene, settings)
     table = scene.class_table()
-    present = [label for label in sorted(chosen_classes(scene, settings)) if (placed.labels.label == label).any()]
+    present = [
+        label for label in sorted(chosen_classes(scene, settings)) if (placed.labels.label == label).any()
+    ]
     if not present:
         raise InputError(f"no point has one of the classes {', '.join(settings.classes)}: nothing to write")
     cloud = placed.cloud.clone()
     if "normals" in cloud.point:
-        normals = placed.placement.directions(cloud.point.positions.numpy().astype(np.float64), cloud.point.normals.numpy())
+        normals = placed.placement.directions(
+            cloud.point.positions.numpy().astype(np.float64), cloud.point.normals.numpy()
+        )
         cloud.point.normals = o3d.core.Tensor(np.ascontiguousarray(normals))
     cloud.point.positions = o3d.core.Tensor(np.ascontiguousarray(placed.points))
     counts = {}

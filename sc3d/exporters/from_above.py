@@ -1,4 +1,6 @@
-"""A scene straight from above: the first surface under each cell of a grid, and the cloud point that says what it is."""
+"""A scene straight from above: the first surface under each cell of a grid, and the cloud point that says
+what it is.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,11 @@ GAP = 2  # cells: holes of a bare cloud up to about twice this wide are filled
 class FromAbove:
     """What is looked at, in the CRS.
 
-    points: (N, 3) float64; highest: (H, W) int64 row of the highest point of each cell, tiny gaps closed, -1 = none
+    points: (N, 3) float64; highest: (H, W) int64 row of the highest point of each cell, tiny gaps closed, -1
+        = none
     surface, index: of the mesh, and over the points; None for a bare cloud
-    start: z from which rays go down; reach: largest distance between surface and point, both in units of the CRS
+    start: z from which rays go down; reach: largest distance between surface and point, both in units of the
+        CRS
     """
 
     grid: Grid
@@ -37,7 +41,9 @@ class FromAbove:
 
     @classmethod
     def build(cls, scene: Scene, placed: PlacedCloud, grid: Grid) -> FromAbove:
-        """The scene's mesh where there is one; the highest point of each cell where it has holes or does not exist."""
+        """The scene's mesh where there is one; the highest point of each cell where it has holes or does not
+        exist.
+        """
         points = placed.points
         highest = close_gaps(highest_points(grid, points), GAP)
         if not scene.mesh.exists():
@@ -47,12 +53,21 @@ class FromAbove:
         inside = points.min(axis=0), points.max(axis=0)
         origin = np.round(0.5 * (inside[0] + inside[1]))
         surface = Surface.from_mesh(vertices, mesh.triangle.indices.numpy(), origin)
-        return cls(grid, points, highest, surface, NeighborIndex(points), float(vertices[:, 2].max()) + 1.0, REACH * spacing_of_all(points))
+        return cls(
+            grid,
+            points,
+            highest,
+            surface,
+            NeighborIndex(points),
+            float(vertices[:, 2].max()) + 1.0,
+            REACH * spacing_of_all(points),
+        )
 
     def look(self, first_row: int, num_rows: int) -> tuple[np.ndarray, np.ndarray]:
         """A strip of the grid.
 
-        returns: (num_rows, W) float64 height, CRS, NaN = nothing there; (num_rows, W) int64 row of the point that tells colour and class, -1 = none near
+        returns: (num_rows, W) float64 height, CRS, NaN = nothing there; (num_rows, W) int64 row of the point
+            that tells colour and class, -1 = none near
         """
         rows = self.highest[first_row : first_row + num_rows].copy()
         heights = np.where(rows >= 0, self.points[rows, 2], np.nan)
@@ -60,7 +75,9 @@ class FromAbove:
             return heights, rows
         below = self._cast(first_row, num_rows)
         hit = np.isfinite(below).reshape(rows.shape)
-        centres = np.concatenate([self.grid.centres(first_row, num_rows), below[:, None]], axis=1)[hit.ravel()]
+        centres = np.concatenate([self.grid.centres(first_row, num_rows), below[:, None]], axis=1)[
+            hit.ravel()
+        ]
         if len(centres):
             nearest, distance = self.index.nearest(centres, 1)
             rows[hit] = np.where(distance[:, 0] <= self.reach, nearest[:, 0], -1)
@@ -73,4 +90,6 @@ class FromAbove:
         rays[:, :2] = self.grid.centres(first_row, num_rows) - self.surface.origin[:2]
         rays[:, 2], rays[:, 5] = self.start - self.surface.origin[2], -1.0
         distance = self.surface.scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy().astype(np.float64)
-        return np.where(np.isfinite(distance), np.float64(rays[0, 2]) - distance + self.surface.origin[2], np.nan)
+        return np.where(
+            np.isfinite(distance), np.float64(rays[0, 2]) - distance + self.surface.origin[2], np.nan
+        )

@@ -1,4 +1,6 @@
-"""The labelled cloud as LAZ 1.4: ASPRS class codes, colours, CRS as WKT, and what sc3d knows of each point as extra dimensions."""
+"""The labelled cloud as LAZ 1.4: ASPRS class codes, colours, CRS as WKT, and what sc3d knows of each point as
+extra dimensions.
+"""
 
 from __future__ import annotations
 
@@ -33,18 +35,26 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
-    """`export/labelled.laz`: point format 7 (6 without colours); positions to 1 mm in the CRS, or in the scene's frame without one."""
+    """`export/labelled.laz`: point format 7 (6 without colours); positions to 1 mm in the CRS, or in the
+    scene's frame without one.
+    """
     ids, codes = sorted(chosen_classes(scene, settings)), asprs_codes(scene.class_table())
     low, high, counts, placed = np.full(3, np.inf), np.full(3, -np.inf), np.zeros(256, np.int64), None
     for placed in placed_chunks(scene, settings):
         rows = np.isin(placed.labels.label, ids)
         if rows.any():
-            low, high = np.minimum(low, placed.points[rows].min(axis=0)), np.maximum(high, placed.points[rows].max(axis=0))
+            low, high = (
+                np.minimum(low, placed.points[rows].min(axis=0)),
+                np.maximum(high, placed.points[rows].max(axis=0)),
+            )
         counts += np.bincount(codes[placed.labels.label[rows]], minlength=256)
     if not counts.any():
         raise InputError(f"no point has one of the classes {', '.join(settings.classes)}: nothing to write")
     header, placement = make_header(low, high, placed), placed.placement
-    with atomic_path(outputs(scene, settings)[0]) as temporary, laspy.open(str(temporary), mode="w", header=header) as writer:
+    with (
+        atomic_path(outputs(scene, settings)[0]) as temporary,
+        laspy.open(str(temporary), mode="w", header=header) as writer,
+    ):
         for placed in placed_chunks(scene, settings):
             rows = np.flatnonzero(np.isin(placed.labels.label, ids))
             for start in range(0, len(rows), CHUNK):
@@ -62,13 +72,16 @@ def asprs_codes(table: ClassTable) -> np.ndarray:
 
 
 def make_header(low: np.ndarray, high: np.ndarray, placed: PlacedCloud) -> laspy.LasHeader:
-    """LAS 1.4 header of points between low and high (3,), CRS; InputError if they span more than whole millimetres in 32 bits can hold.
+    """LAS 1.4 header of points between low and high (3,), CRS; InputError if they span more than whole
+    millimetres in 32 bits can hold.
 
     placed: some of them, for what all have
     """
     offsets = np.floor(low / OFFSET_STEP) * OFFSET_STEP
     if ((high - offsets) / SCALE >= 2**31).any():
-        raise InputError(f"the cloud spans {(high - low).max():.0f} units, too much for LAZ at 1 mm: remove stray points first")
+        raise InputError(
+            f"the cloud spans {(high - low).max():.0f} units, too much for LAZ at 1 mm: remove stray points first"
+        )
     header = laspy.LasHeader(version="1.4", point_format=PLAIN if placed.colors is None else COLORS)
     header.scales, header.offsets = np.full(3, SCALE), offsets
     header.generating_software = f"sc3d {sc3d.__version__}"
@@ -76,11 +89,14 @@ def make_header(low: np.ndarray, high: np.ndarray, placed: PlacedCloud) -> laspy
     crs = placed.placement.crs
     header.global_encoding.wkt = True  # point formats 6 and up know no other
     if crs is not None:
-        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")))  # LAS 1.4 asks for WKT 1
+        # LAS 1.4 asks for WKT 1
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")))
     return header
 
 
-def point_record(placed: PlacedCloud, rows: np.ndarray, header: laspy.LasHeader, codes: np.ndarray) -> laspy.ScaleAwarePointRecord:
+def point_record(
+    placed: PlacedCloud, rows: np.ndarray, header: laspy.LasHeader, codes: np.ndarray
+) -> laspy.ScaleAwarePointRecord:
     """The points `rows` (K,) as LAS points; codes: (256,) uint8 ASPRS code of each class id."""
     record = laspy.ScaleAwarePointRecord.zeros(len(rows), header=header)
     record.x, record.y, record.z = placed.points[rows].T
@@ -88,7 +104,12 @@ def point_record(placed: PlacedCloud, rows: np.ndarray, header: laspy.LasHeader,
     record.classification = codes[labels.label[rows]]
     record.return_number = record.number_of_returns = np.ones(len(rows), np.uint8)
     if placed.colors is not None:
-        record.red, record.green, record.blue = placed.colors[rows].T.astype(np.uint16) * 257  # 255 becomes 65535
-    record.confidence, record.state, record.label = labels.confidence[rows], labels.state[rows], labels.label[rows]
+        # 255 becomes 65535
+        record.red, record.green, record.blue = placed.colors[rows].T.astype(np.uint16) * 257
+    record.confidence, record.state, record.label = (
+        labels.confidence[rows],
+        labels.state[rows],
+        labels.label[rows],
+    )
     record.num_views = np.minimum(labels.num_views[rows], np.iinfo(np.uint16).max).astype(np.uint16)
     return record

@@ -24,7 +24,9 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
-    """`export/masks/<photo stem>.png` and `export/confidence/<photo stem>.png` for every photo; usable as `segment --masks`, `--confidence`."""
+    """`export/masks/<photo stem>.png` and `export/confidence/<photo stem>.png` for every photo; usable as
+    `segment --masks`, `--confidence`.
+    """
     cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
     views = scene.model.views
     surface = LabelledSurface.build(cloud, views, scene.mesh)
@@ -44,13 +46,20 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
 
 
 def _comparison(scene: Scene, views: list[View]) -> np.ndarray:
-    """Some photos, evenly spread over the flight, beside the mask that went in and the mask that comes back: (H, W, 3) uint8 RGB."""
+    """Some photos, evenly spread over the flight, beside the mask that went in and the mask that comes back:
+    (H, W, 3) uint8 RGB.
+    """
     palette, rows = scene.class_table().palette, []
-    for view in [views[row] for row in np.unique(np.linspace(0, len(views) - 1, min(SHOWN, len(views))).round().astype(int))]:
+    for view in [
+        views[row]
+        for row in np.unique(np.linspace(0, len(views) - 1, min(SHOWN, len(views))).round().astype(int))
+    ]:
         size, stem = (PANEL, round(PANEL * view.height / view.width)), Path(view.name).stem
         pictures, captions = [], []
         if scene.photo(view.name).exists():
-            pictures.append(cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA))
+            pictures.append(
+                cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA)
+            )
             captions.append(view.name)
         for folder, caption in ((scene.masks, "mask in"), (scene.export / "masks", "mask back")):
             file = folder / f"{stem}.png"
@@ -59,10 +68,14 @@ def _comparison(scene: Scene, views: list[View]) -> np.ndarray:
             captions.append(caption)
         rows.append(side_by_side(pictures, captions))
     width = max(row.shape[1] for row in rows)
-    return np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows])
+    return np.concatenate(
+        [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
+    )
 
 
-def render_mask(surface: LabelledSurface, confidence: np.ndarray, view: View, max_size: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def render_mask(
+    surface: LabelledSurface, confidence: np.ndarray, view: View, max_size: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Labels and confidence of one photo.
 
     confidence: (N,) float32 of the cloud's points, 0 to 1; max_size: longest side, px, 0 = the photo's

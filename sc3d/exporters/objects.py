@@ -45,7 +45,9 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
-    """`export/buildings.geojson` and `trees.geojson` (`*_local.geojson` without a CRS), and both as `objects.gpkg` where pyogrio is installed."""
+    """`export/buildings.geojson` and `trees.geojson` (`*_local.geojson` without a CRS), and both as
+    `objects.gpkg` where pyogrio is installed.
+    """
     placed = read_placed_cloud(scene, settings)
     layers = find_objects(placed, scene.class_table(), settings)
     paths = outputs(scene, settings)
@@ -59,7 +61,9 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
 
 
 def find_objects(placed: PlacedCloud, table: ClassTable, settings: Export) -> dict[str, list[MapObject]]:
-    """Buildings and trees of a labelled cloud, from north to south; InputError if its classes cannot tell them from the ground."""
+    """Buildings and trees of a labelled cloud, from north to south; InputError if its classes cannot tell
+    them from the ground.
+    """
     kinds = split_kinds(placed.labels.label, table)
     points = placed.points * placed.placement.unit  # all lengths below are metres
     pixel = max(CELL * spacing_of_all(points), MIN_CELL)
@@ -71,27 +75,48 @@ def find_objects(placed: PlacedCloud, table: ClassTable, settings: Export) -> di
     canopy = canopy_height(points, kinds.tree, ground, grid)
     crowns = split_crowns(canopy, grid, settings.min_height)
     draw = squared if settings.rectangular else simplified
-    building_outlines = {number: draw(outline, 2 * pixel) for number, outline in trace(buildings, grid).items()}
-    tree_outlines = {number: simplified(shapely.Polygon(outline.exterior), pixel) for number, outline in trace(crowns, grid).items()}
-    tops = np.array([np.quantile(canopy.ravel()[cells], TREE_TOP) for cells in cells_by_number(crowns, int(crowns.max()))])
-    ground_of = [np.array([np.median(ground.ravel()[cells]) for cells in cells_by_number(regions, int(regions.max()))]) for regions in (buildings, crowns)]
-    members = [np.where(chosen, regions.ravel()[grid.flat_cells(points)], 0)
-               for regions, chosen in ((buildings, kinds.building & above), (crowns, kinds.tree & above))]
+    building_outlines = {
+        number: draw(outline, 2 * pixel) for number, outline in trace(buildings, grid).items()
+    }
+    tree_outlines = {
+        number: simplified(shapely.Polygon(outline.exterior), pixel)
+        for number, outline in trace(crowns, grid).items()
+    }
+    tops = np.array(
+        [np.quantile(canopy.ravel()[cells], TREE_TOP) for cells in cells_by_number(crowns, int(crowns.max()))]
+    )
+    ground_of = [
+        np.array([np.median(ground.ravel()[cells]) for cells in cells_by_number(regions, int(regions.max()))])
+        for regions in (buildings, crowns)
+    ]
+    members = [
+        np.where(chosen, regions.ravel()[grid.flat_cells(points)], 0)
+        for regions, chosen in ((buildings, kinds.building & above), (crowns, kinds.tree & above))
+    ]
     return {
-        "buildings": _describe(building_outlines, roof_tops(buildings, roofs, pixel) - ground_of[0], ground_of[0], members[0], (placed, table)),
+        "buildings": _describe(
+            building_outlines,
+            roof_tops(buildings, roofs, pixel) - ground_of[0],
+            ground_of[0],
+            members[0],
+            (placed, table),
+        ),
         "trees": _describe(tree_outlines, tops, ground_of[1], members[1], (placed, table)),
     }
 
 
 def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
-    """Buildings are ASPRS code 6, trees 4 and 5 (3 if no class has those); the ground is 2, 3, 9, 10 or 11, or else whatever is none of these.
+    """Buildings are ASPRS code 6, trees 4 and 5 (3 if no class has those); the ground is 2, 3, 9, 10 or 11,
+    or else whatever is none of these.
 
     labels: (N,) uint8 class ids
     """
     codes = {entry.id: entry.asprs for entry in table}
     tree_codes = {MEDIUM, HIGH} if {MEDIUM, HIGH} & set(codes.values()) else {LOW}
     if BUILDING not in codes.values() and not tree_codes & set(codes.values()):
-        raise InputError('no class has the ASPRS code of buildings (6) or vegetation (3 to 5): add "asprs" to the classes in classes.json')
+        raise InputError(
+            'no class has the ASPRS code of buildings (6) or vegetation (3 to 5): add "asprs" to the classes in classes.json'
+        )
 
     def having(wanted: set[int]) -> np.ndarray:
         return np.isin(labels, [label for label, code in codes.items() if code in wanted])
@@ -101,12 +126,22 @@ def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
     if not ground.any():
         ground = (labels > 0) & ~building & ~tree & ~having(set(NOISE))
     if not ground.any():
-        raise InputError("no point belongs to a ground class, from which heights are measured: label roads or grass too")
+        raise InputError(
+            "no point belongs to a ground class, from which heights are measured: label roads or grass too"
+        )
     return Kinds(building, tree, ground)
 
 
-def _describe(outlines: dict, heights: np.ndarray, ground: np.ndarray, members: np.ndarray, cloud: tuple[PlacedCloud, ClassTable]) -> list[MapObject]:
-    """Objects of numbered outlines in metres; members: (N,) int number of the object that each point belongs to, 0 = none."""
+def _describe(
+    outlines: dict,
+    heights: np.ndarray,
+    ground: np.ndarray,
+    members: np.ndarray,
+    cloud: tuple[PlacedCloud, ClassTable],
+) -> list[MapObject]:
+    """Objects of numbered outlines in metres; members: (N,) int number of the object that each point belongs
+    to, 0 = none.
+    """
     placed, table = cloud
     unit = placed.placement.unit
     objects = []
@@ -115,8 +150,17 @@ def _describe(outlines: dict, heights: np.ndarray, ground: np.ndarray, members: 
         labels = np.bincount(placed.labels.label[rows], minlength=1)
         label = int(np.argmax(labels))
         confidence = float(placed.labels.confidence[rows].astype(np.float64).mean()) if len(rows) else 0.0
-        objects.append(MapObject(
-            polygon if unit == 1 else shapely.transform(polygon, lambda corners: corners / unit), number, table.name(label), label, polygon.area,
-            float(heights[number - 1]), float(ground[number - 1]), confidence, len(rows),
-        ))
+        objects.append(
+            MapObject(
+                polygon if unit == 1 else shapely.transform(polygon, lambda corners: corners / unit),
+                number,
+                table.name(label),
+                label,
+                polygon.area,
+                float(heights[number - 1]),
+                float(ground[number - 1]),
+                confidence,
+                len(rows),
+            )
+        )
     return objects

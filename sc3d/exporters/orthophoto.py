@@ -32,17 +32,30 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
-    """`export/orthophoto.tif` (RGB and alpha), `classes.tif` (ids, 0 = none, names and palette) and `height.tif` (float32 z, CRS), on one grid."""
+    """`export/orthophoto.tif` (RGB and alpha), `classes.tif` (ids, 0 = none, names and palette) and
+    `height.tif` (float32 z, CRS), on one grid.
+    """
     placed = read_placed_cloud(scene, settings)
     unit = placed.placement.unit
-    pixel = (settings.pixel_size or round_to_digit(spacing_of_all(placed.points) * unit * (1 if scene.mesh.exists() else 2))) / unit
+    pixel = (
+        settings.pixel_size
+        or round_to_digit(spacing_of_all(placed.points) * unit * (1 if scene.mesh.exists() else 2))
+    ) / unit
     grid = Grid.around(placed.points, pixel)
     above = FromAbove.build(scene, placed, grid)
     table = scene.class_table()
     color, classes, names, height = outputs(scene, settings)
-    with atomic_path(color) as color_file, atomic_path(classes) as class_file, atomic_path(height) as height_file:
+    with (
+        atomic_path(color) as color_file,
+        atomic_path(classes) as class_file,
+        atomic_path(height) as height_file,
+    ):
         covered = _fill(above, placed, table, (color_file, class_file, height_file))
-        for file, resampling in ((color_file, enums.Resampling.average), (class_file, enums.Resampling.mode), (height_file, enums.Resampling.average)):
+        for file, resampling in (
+            (color_file, enums.Resampling.average),
+            (class_file, enums.Resampling.mode),
+            (height_file, enums.Resampling.average),
+        ):
             _add_overviews(file, resampling)
     with atomic_path(names) as temporary:
         temporary.write_text(category_names(table), encoding="utf-8")
@@ -57,18 +70,31 @@ def round_to_digit(length: float) -> float:
 
 def category_names(table: ClassTable) -> str:
     """GDAL's side file: the name of each class id, in the order of the ids, for the legend."""
-    names = "".join(f"<Category>{escape(table.name(label)) if label in {entry.id for entry in table} | {0} else ''}</Category>" for label in range(table.num_ids))
+    names = "".join(
+        f"<Category>{escape(table.name(label)) if label in {entry.id for entry in table} | {0} else ''}</Category>"
+        for label in range(table.num_ids)
+    )
     return f'<PAMDataset><PAMRasterBand band="1"><CategoryNames>{names}</CategoryNames></PAMRasterBand></PAMDataset>\n'
 
 
 def _fill(above: FromAbove, placed: PlacedCloud, table: ClassTable, files: tuple[Path, Path, Path]) -> float:
     """Write all pixels, strip by strip; returns the share of the cells that have a height."""
     grid, covered = above.grid, 0
-    with _open(files[0], placed, grid, count=4, dtype="uint8", predictor=2) as color, \
-            _open(files[1], placed, grid, count=1, dtype="uint8", nodata=0) as classes, \
-            _open(files[2], placed, grid, count=1, dtype="float32", predictor=3, nodata=NO_HEIGHT) as height:
-        color.colorinterp = [enums.ColorInterp.red, enums.ColorInterp.green, enums.ColorInterp.blue, enums.ColorInterp.alpha]
-        classes.write_colormap(1, {label: (*map(int, table.palette[label]), 255 if label else 0) for label in range(table.num_ids)})
+    with (
+        _open(files[0], placed, grid, count=4, dtype="uint8", predictor=2) as color,
+        _open(files[1], placed, grid, count=1, dtype="uint8", nodata=0) as classes,
+        _open(files[2], placed, grid, count=1, dtype="float32", predictor=3, nodata=NO_HEIGHT) as height,
+    ):
+        color.colorinterp = [
+            enums.ColorInterp.red,
+            enums.ColorInterp.green,
+            enums.ColorInterp.blue,
+            enums.ColorInterp.alpha,
+        ]
+        classes.write_colormap(
+            1,
+            {label: (*map(int, table.palette[label]), 255 if label else 0) for label in range(table.num_ids)},
+        )
         for dataset, name in ((classes, "class"), (height, "height of the surface")):
             dataset.set_band_description(1, name)
         for first_row in tqdm(range(0, grid.height, TILE), desc="rendering maps", unit="strip", disable=None):
@@ -76,8 +102,12 @@ def _fill(above: FromAbove, placed: PlacedCloud, table: ClassTable, files: tuple
             heights, rows = above.look(first_row, num_rows)
             window = rasterio.windows.Window(0, first_row, grid.width, num_rows)
             color.write(_colors(placed, rows), window=window)
-            classes.write(np.where(rows >= 0, placed.labels.label[rows], 0).astype(np.uint8), 1, window=window)
-            height.write(np.where(np.isfinite(heights), heights, NO_HEIGHT).astype(np.float32), 1, window=window)
+            classes.write(
+                np.where(rows >= 0, placed.labels.label[rows], 0).astype(np.uint8), 1, window=window
+            )
+            height.write(
+                np.where(np.isfinite(heights), heights, NO_HEIGHT).astype(np.float32), 1, window=window
+            )
             covered += int(np.isfinite(heights).sum())
     return covered / (grid.height * grid.width)
 
@@ -93,11 +123,23 @@ def _colors(placed: PlacedCloud, rows: np.ndarray) -> np.ndarray:
 
 
 def _open(file: Path, placed: PlacedCloud, grid: Grid, **profile: object):
+    """Rasterio's writer."""
     transform = transforms.from_origin(grid.left, grid.top, grid.pixel, grid.pixel)
     crs = placed.placement.crs
     return rasterio.open(
-        file, "w", driver="GTiff", width=grid.width, height=grid.height, transform=transform, crs=crs.to_wkt() if crs else None, tiled=True,
-        blockxsize=TILE, blockysize=TILE, compress="deflate", bigtiff="if_safer", **profile,
+        file,
+        "w",
+        driver="GTiff",
+        width=grid.width,
+        height=grid.height,
+        transform=transform,
+        crs=crs.to_wkt() if crs else None,
+        tiled=True,
+        blockxsize=TILE,
+        blockysize=TILE,
+        compress="deflate",
+        bigtiff="if_safer",
+        **profile,
     )
 
 

@@ -13,4 +13,6 @@ def load(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise MissingPackageError(f"this format needs {name.split('.')[0]}: pip install 'sc3d[geo]'") from None
+        raise MissingPackageError(
+            f"this format needs {name.split('.')[0]}: pip install 'sc3d[geo]'"
+        ) from None

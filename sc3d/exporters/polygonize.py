@@ -1,4 +1,6 @@
-"""Regions of a grid to polygons: traced along the cells' edges, simplified, and made rectangular where that fits (shapely, rasterio)."""
+"""Regions of a grid to polygons: traced along the cells' edges, simplified, and made rectangular where that
+fits (shapely, rasterio).
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,16 @@ Side = tuple[int, float, float]  # axis that is constant along it (0 = x), its v
 
 
 def trace(regions: np.ndarray, grid: Grid) -> dict[int, shapely.Polygon]:
-    """The outline of each region, in the coordinates of the grid; of regions in several pieces that touch at corners at most, the largest piece.
+    """The outline of each region, in the coordinates of the grid; of regions in several pieces that touch at
+    corners at most, the largest piece.
 
     regions: (H, W) int32, 0 = none
     """
     transform = transforms.from_origin(grid.left, grid.top, grid.pixel, grid.pixel)
     found: dict[int, shapely.Polygon] = {}
-    for geometry, value in features.shapes(regions.astype(np.int32), mask=regions > 0, connectivity=4, transform=transform):
+    for geometry, value in features.shapes(
+        regions.astype(np.int32), mask=regions > 0, connectivity=4, transform=transform
+    ):
         polygon = shapely.geometry.shape(geometry)
         if int(value) not in found or polygon.area > found[int(value)].area:
             found[int(value)] = polygon
@@ -29,7 +34,9 @@ def trace(regions: np.ndarray, grid: Grid) -> dict[int, shapely.Polygon]:
 
 
 def simplified(polygon: shapely.Polygon, tolerance: float) -> shapely.Polygon:
-    """Douglas-Peucker, from the corner farthest from the middle, as the first one always stays; the traced outline if nothing valid is left."""
+    """Douglas-Peucker, from the corner farthest from the middle, as the first one always stays; the traced
+    outline if nothing valid is left.
+    """
     rings = []
     for ring in (polygon.exterior, *polygon.interiors):
         corners = np.asarray(ring.coords)[:-1]
@@ -39,12 +46,18 @@ def simplified(polygon: shapely.Polygon, tolerance: float) -> shapely.Polygon:
 
 
 def squared(polygon: shapely.Polygon, tolerance: float) -> shapely.Polygon:
-    """The outline with right angles only, along its main directions; the simplified one where that would change it too much.
+    """The outline with right angles only, along its main directions; the simplified one where that would
+    change it too much.
 
     tolerance: sides shorter than twice this are steps of the cells or noise, m
     """
     rough, reach = simplified(polygon, tolerance), 2 * tolerance
-    border = np.concatenate([np.asarray(shapely.segmentize(ring, reach / 4).coords)[:-1] for ring in (polygon.exterior, *polygon.interiors)])
+    border = np.concatenate(
+        [
+            np.asarray(shapely.segmentize(ring, reach / 4).coords)[:-1]
+            for ring in (polygon.exterior, *polygon.interiors)
+        ]
+    )
     turn = main_direction(rough)
     sides = _sides(rough.exterior, turn, reach)
     if not sides:
@@ -53,7 +66,9 @@ def squared(polygon: shapely.Polygon, tolerance: float) -> shapely.Polygon:
     rings = []
     for ring in (rough.exterior, *rough.interiors):
         sides = _sides(ring, turn, reach)
-        rings.append(_corners(_fitted(sides, border @ _rotation(turn).T, reach)) @ _rotation(turn) if sides else None)
+        rings.append(
+            _corners(_fitted(sides, border @ _rotation(turn).T, reach)) @ _rotation(turn) if sides else None
+        )
     if rings[0] is None:
         return rough
     result = shapely.Polygon(rings[0], [ring for ring in rings[1:] if ring is not None])
@@ -63,8 +78,12 @@ def squared(polygon: shapely.Polygon, tolerance: float) -> shapely.Polygon:
 
 
 def main_direction(polygon: shapely.Polygon) -> float:
-    """Direction of the sides, radians modulo a right angle: the mean of four times their angles, weighted by squared length."""
-    steps = np.concatenate([np.diff(np.asarray(ring.coords), axis=0) for ring in (polygon.exterior, *polygon.interiors)])
+    """Direction of the sides, radians modulo a right angle: the mean of four times their angles, weighted by
+    squared length.
+    """
+    steps = np.concatenate(
+        [np.diff(np.asarray(ring.coords), axis=0) for ring in (polygon.exterior, *polygon.interiors)]
+    )
     vectors = steps[:, 0] + 1j * steps[:, 1]
     length = np.abs(vectors)
     folded = (np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0) ** 4 * length**2).sum()
@@ -77,7 +96,9 @@ def _rotation(turn: float) -> np.ndarray:
 
 
 def _sides(ring: shapely.LinearRing, turn: float, shortest: float) -> list[Side]:
-    """The sides of a ring in the frame turned by `turn`, the two axes in turns, none shorter than `shortest` unless only four are left; [] if fewer."""
+    """The sides of a ring in the frame turned by `turn`, the two axes in turns, none shorter than `shortest`
+    unless only four are left; [] if fewer.
+    """
     sides = _alternate(np.asarray(ring.coords)[:-1] @ _rotation(turn).T)
     while len(sides) > 4:
         corners = _corners(sides)
@@ -126,13 +147,19 @@ def _corners(sides: list[Side]) -> np.ndarray:
 
 
 def _near(sides: list[Side], border: np.ndarray, reach: float) -> list[np.ndarray]:
-    """For each side, the border points (K, 2) within `reach` of it that are not at its ends; both in the frame of the sides."""
+    """For each side, the border points (K, 2) within `reach` of it that are not at its ends; both in the
+    frame of the sides.
+    """
     corners, found = _corners(sides), []
     for row, (axis, value, _) in enumerate(sides):
         low, high = sorted((corners[row, 1 - axis], corners[(row + 1) % len(sides), 1 - axis]))
         inset = min(0.25 * (high - low), reach)
         along = border[:, 1 - axis]
-        found.append(border[(np.abs(border[:, axis] - value) <= reach) & (along >= low + inset) & (along <= high - inset)])
+        found.append(
+            border[
+                (np.abs(border[:, axis] - value) <= reach) & (along >= low + inset) & (along <= high - inset)
+            ]
+        )
     return found
 
 
@@ -142,7 +169,8 @@ def _tilt(sides: list[Side], border: np.ndarray, reach: float) -> float:
     for (axis, _, _), points in zip(sides, _near(sides, border, reach)):
         if len(points):
             along, across = (points - points.mean(axis=0))[:, [1 - axis, axis]].T
-            products += (along @ across) * (1 if axis else -1)  # the same turn has opposite slopes along x and y
+            # the same turn has opposite slopes along x and y
+            products += (along @ across) * (1 if axis else -1)
             squares += along @ along
     return float(np.arctan2(products, squares)) if squares else 0.0
 
@@ -150,4 +178,7 @@ def _tilt(sides: list[Side], border: np.ndarray, reach: float) -> float:
 def _fitted(sides: list[Side], border: np.ndarray, reach: float) -> list[Side]:
     """Each side moved to the median of the border (N, 2) along it."""
     near = _near(sides, border, reach)
-    return [(axis, float(np.median(points[:, axis])) if len(points) else value, length) for (axis, value, length), points in zip(sides, near)]
+    return [
+        (axis, float(np.median(points[:, axis])) if len(points) else value, length)
+        for (axis, value, length), points in zip(sides, near)
+    ]

@@ -1,4 +1,6 @@
-"""Where exported coordinates lie: the CRS of the scene or a chosen one, or the scene's own frame where there is no georeference."""
+"""Where exported coordinates lie: the CRS of the scene or a chosen one, or the scene's own frame where there
+is no georeference.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ BYTES = 250  # of a point while a cloud is exported as a whole
 
 @dataclass(frozen=True)
 class Placement:
-    """How world coordinates become exported ones. georeference, epsg: None = they stay as they are, one unit = 1 m, z up."""
+    """How world coordinates become exported ones. georeference, epsg: None = they stay as they are, one unit
+    = 1 m, z up.
+    """
 
     georeference: Georeference | None = None
     epsg: int | None = None
@@ -60,11 +64,15 @@ class Placement:
         between = pyproj.Transformer.from_crs(self.georeference.crs, self.crs, always_xy=True)
         east, north = between.transform(points[:, 0], points[:, 1])
         if not np.isfinite([east, north]).all():
-            raise InputError(f"the scene lies outside the area of EPSG:{self.epsg}: choose the CRS of the place with --epsg")
+            raise InputError(
+                f"the scene lies outside the area of EPSG:{self.epsg}: choose the CRS of the place with --epsg"
+            )
         return np.stack([east, north, points[:, 2] * self.georeference.unit / self.unit], axis=1)
 
     def directions(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Unit vectors (N, 3) at world points (N, 3), turned as the CRS is (grid north is not true north); float32."""
+        """Unit vectors (N, 3) at world points (N, 3), turned as the CRS is (grid north is not true north);
+        float32.
+        """
         if self.georeference is None:
             return directions
         turned = self.points(points + directions) - self.points(points)
@@ -73,11 +81,17 @@ class Placement:
 
     def figures(self) -> dict[str, object]:
         """What the summary says about coordinates."""
-        return {"crs": f"EPSG:{self.epsg}" if self.epsg else "none: the scene has no georeference, coordinates are its own"}
+        return {
+            "crs": f"EPSG:{self.epsg}"
+            if self.epsg
+            else "none: the scene has no georeference, coordinates are its own"
+        }
 
 
 def find_placement(scene: Scene, settings: Export) -> Placement:
-    """The scene's georeference with the CRS of `--epsg`; without a georeference, `--epsg` says which CRS the world coordinates are in."""
+    """The scene's georeference with the CRS of `--epsg`; without a georeference, `--epsg` says which CRS the
+    world coordinates are in.
+    """
     georeference = read_georeference(scene)
     if georeference is not None:
         placement = Placement(georeference, settings.epsg or georeference.epsg)
@@ -93,7 +107,10 @@ def find_placement(scene: Scene, settings: Export) -> Placement:
 @lru_cache(maxsize=8)
 def _warn(scene: Scene) -> None:
     """Once per scene, not once per format."""
-    logger.warning("%s has no georeference: coordinates stay those of the scene, z is taken as up and 1 unit as 1 m", scene.path)
+    logger.warning(
+        "%s has no georeference: coordinates stay those of the scene, z is taken as up and 1 unit as 1 m",
+        scene.path,
+    )
 
 
 @dataclass(frozen=True)
@@ -153,12 +170,16 @@ def placed_chunks(scene: Scene, settings: Export) -> Iterator[PlacedCloud]:
 
 
 def chosen_classes(scene: Scene, settings: Export) -> set[int]:
-    """Ids of the classes to write: those named in `--classes`, or all with 0; InputError for a name that is not in the class table."""
+    """Ids of the classes to write: those named in `--classes`, or all with 0; InputError for a name that is
+    not in the class table.
+    """
     table = scene.class_table()
     if not settings.classes:
         return {0} | {entry.id for entry in table}
     ids = {entry.name: entry.id for entry in table}
     for name in settings.classes:
         if name not in ids:
-            raise InputError(f"there is no class {name!r} in {scene.classes}: its classes are {', '.join(ids)}")
+            raise InputError(
+                f"there is no class {name!r} in {scene.classes}: its classes are {', '.join(ids)}"
+            )
     return {ids[name] for name in settings.classes}

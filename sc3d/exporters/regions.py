@@ -7,7 +7,9 @@ from scipy import sparse
 
 
 def connected_cells(groups: np.ndarray, heights: np.ndarray, step: float) -> np.ndarray:
-    """(H, W) int32 component from 1 of the cells of one group (from 1, 0 = no cell) whose neighbours (4) differ by less than `step`; 0 = no cell."""
+    """(H, W) int32 component from 1 of the cells of one group (from 1, 0 = no cell) whose neighbours (4)
+    differ by less than `step`; 0 = no cell.
+    """
     index = np.arange(groups.size).reshape(groups.shape)
     edges = []
     for a, b in neighbors():
@@ -15,7 +17,9 @@ def connected_cells(groups: np.ndarray, heights: np.ndarray, step: float) -> np.
         joined[joined] = np.abs(heights[a][joined] - heights[b][joined]) < step
         edges.append(np.stack([index[a][joined], index[b][joined]]))
     first, second = np.concatenate(edges, axis=1)
-    graph = sparse.coo_matrix((np.ones(len(first), np.int8), (first, second)), shape=(groups.size, groups.size))
+    graph = sparse.coo_matrix(
+        (np.ones(len(first), np.int8), (first, second)), shape=(groups.size, groups.size)
+    )
     _, component = sparse.csgraph.connected_components(graph, directed=False)
     return renumbered(np.where(groups > 0, component.reshape(groups.shape) + 1, 0))
 

@@ -22,8 +22,11 @@ from sc3d.splatting.dataset import load_gaussians
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.lifting import lift, winners
 
-LIFTED_SIZE = 800  # longest side of the masks whose labels are lifted, px; Gaussians are trained at about that size
-GUARD = 32.0  # point spacings: farther from all points of its class, a splat floats before or behind what it was labelled for
+# longest side of the masks whose labels are lifted, px; Gaussians are trained at about that size
+LIFTED_SIZE = 800
+# point spacings: farther from all points of its class, a splat floats before or behind what it was labelled
+# for
+GUARD = 32.0
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,12 @@ class LabelledSplats:
         """Those of the given class ids; InputError if there are none."""
         chosen = np.isin(self.label, sorted(classes))
         if not chosen.any():
-            raise InputError(f"no splat has one of the classes {', '.join(self.table.name(label) for label in sorted(classes))}: nothing to write")
-        return LabelledSplats(self.gaussians[chosen], self.label[chosen], self.confidence[chosen], self.origin, self.table)
+            raise InputError(
+                f"no splat has one of the classes {', '.join(self.table.name(label) for label in sorted(classes))}: nothing to write"
+            )
+        return LabelledSplats(
+            self.gaussians[chosen], self.label[chosen], self.confidence[chosen], self.origin, self.table
+        )
 
     def counts(self) -> dict[str, int]:
         """Number of splats per class name."""
@@ -59,7 +66,9 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
-    """`export/splats.ply`: gaussians.ply with `label` (uchar) and `confidence` (float) per splat; of the chosen classes only."""
+    """`export/splats.ply`: gaussians.ply with `label` (uchar) and `confidence` (float) per splat; of the
+    chosen classes only.
+    """
     chosen, placement = chosen_classes(scene, settings), find_placement(scene, settings)
     splats = label_splats(scene, settings).only(chosen)
     write_splats(outputs(scene, settings)[0], splats, placement)
@@ -76,17 +85,37 @@ def label_splats(scene: Scene, settings: Export) -> LabelledSplats:
     gaussians, origin = load_gaussians(scene)
     surface = LabelledSurface.build(cloud, scene.model.views, scene.mesh)
     views = [undistorted(view.shifted(origin), LIFTED_SIZE) for view in scene.model.views]
-    evidence = lift(gaussians, views, lambda view: render_mask(surface, labels.confidence, view.shifted(-origin)), table.num_ids)
+    evidence = lift(
+        gaussians,
+        views,
+        lambda view: render_mask(surface, labels.confidence, view.shifted(-origin)),
+        table.num_ids,
+    )
     label, confidence = winners(evidence)
     points = cloud.point.positions.numpy().astype(np.float64)
-    floating = distance_to_class(gaussians.means.numpy() + origin, label, points, surface.label) > GUARD / REACH * surface.reach
+    floating = (
+        distance_to_class(gaussians.means.numpy() + origin, label, points, surface.label)
+        > GUARD / REACH * surface.reach
+    )
     if not (label > 0)[~floating].any():
-        raise InputError(f"no splat shows a label of {source}: check that gaussians.ply and this cloud belong together")
-    return LabelledSplats(gaussians, np.where(floating, np.uint8(0), label), np.where(floating, np.float32(0), confidence), origin, table)
+        raise InputError(
+            f"no splat shows a label of {source}: check that gaussians.ply and this cloud belong together"
+        )
+    return LabelledSplats(
+        gaussians,
+        np.where(floating, np.uint8(0), label),
+        np.where(floating, np.float32(0), confidence),
+        origin,
+        table,
+    )
 
 
-def distance_to_class(positions: np.ndarray, label: np.ndarray, points: np.ndarray, point_label: np.ndarray) -> np.ndarray:
-    """(N,) distance of each position (N, 3) to the nearest of the points (P, 3) of the same label; 0 for label 0, infinite if there is none."""
+def distance_to_class(
+    positions: np.ndarray, label: np.ndarray, points: np.ndarray, point_label: np.ndarray
+) -> np.ndarray:
+    """(N,) distance of each position (N, 3) to the nearest of the points (P, 3) of the same label; 0 for
+    label 0, infinite if there is none.
+    """
     distance = np.where(label == 0, 0.0, np.inf)
     for present in np.intersect1d(label[label > 0], point_label):
         rows = np.flatnonzero(label == present)
@@ -95,14 +124,21 @@ def distance_to_class(positions: np.ndarray, label: np.ndarray, points: np.ndarr
 
 
 def write_splats(path: Path, splats: LabelledSplats, placement: Placement) -> None:
-    """3DGS PLY with two more properties, which viewers ignore; positions stay in the local frame, comments say where it lies."""
+    """3DGS PLY with two more properties, which viewers ignore; positions stay in the local frame, comments
+    say where it lies.
+    """
     comments = ["sc3d origin " + " ".join(f"{value:.3f}" for value in splats.origin)]
     if placement.crs is not None:
-        comments.append(f"sc3d EPSG:{placement.epsg} origin " + " ".join(f"{value:.3f}" for value in origin_in_crs(splats, placement)))
+        comments.append(
+            f"sc3d EPSG:{placement.epsg} origin "
+            + " ".join(f"{value:.3f}" for value in origin_in_crs(splats, placement))
+        )
     comments += [f"sc3d label {entry.id} {entry.name}" for entry in splats.table]
     with atomic_path(path) as temporary:
         splats.gaussians.save(temporary, comments)
-        append_properties(temporary, {"label": splats.label.astype(np.uint8), "confidence": splats.confidence.astype("<f4")})
+        append_properties(
+            temporary, {"label": splats.label.astype(np.uint8), "confidence": splats.confidence.astype("<f4")}
+        )
 
 
 def read_splats(path: Path, table: ClassTable) -> LabelledSplats:
@@ -112,15 +148,26 @@ def read_splats(path: Path, table: ClassTable) -> LabelledSplats:
     origins = [line.split()[2:] for line in comments if line.startswith("sc3d origin ")]
     if "label" not in found or "confidence" not in found or not origins:
         raise InputError(f"{path} has no labels: run `sc3d export SCENE --format splats`")
-    return LabelledSplats(gaussians, found["label"].numpy().ravel(), found["confidence"].numpy().ravel(), np.array(origins[0], float), table)
+    return LabelledSplats(
+        gaussians,
+        found["label"].numpy().ravel(),
+        found["confidence"].numpy().ravel(),
+        np.array(origins[0], float),
+        table,
+    )
 
 
 def append_properties(path: Path, columns: dict[str, np.ndarray]) -> None:
-    """Add properties of type uchar and float, (N,) each, to the vertices of a PLY that has float properties and nothing else."""
+    """Add properties of type uchar and float, (N,) each, to the vertices of a PLY that has float properties
+    and nothing else.
+    """
     header, _, body = path.read_bytes().partition(b"\nend_header\n")
     names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property float ")]
     values = np.frombuffer(body, "<f4").reshape(-1, len(names))
-    row = np.empty(len(values), [("known", "<f4", (len(names),)), *((name, column.dtype) for name, column in columns.items())])
+    row = np.empty(
+        len(values),
+        [("known", "<f4", (len(names),)), *((name, column.dtype) for name, column in columns.items())],
+    )
     row["known"] = values
     for name, column in columns.items():
         row[name] = column
@@ -137,6 +184,10 @@ def figures(splats: LabelledSplats, placement: Placement) -> dict[str, object]:
     """What the summary and the sidecar say."""
     labelled = splats.label > 0
     return {
-        "splats": len(splats.label), "labelled": f"{labelled.mean():.1%}", "mean_confidence": round(float(splats.confidence[labelled].mean()), 3),
-        "origin": np.round(origin_in_crs(splats, placement) + 0.0, 3).tolist(), **placement.figures(), "splats_by_class": splats.counts(),
+        "splats": len(splats.label),
+        "labelled": f"{labelled.mean():.1%}",
+        "mean_confidence": round(float(splats.confidence[labelled].mean()), 3),
+        "origin": np.round(origin_in_crs(splats, placement) + 0.0, 3).tolist(),
+        **placement.figures(),
+        "splats_by_class": splats.counts(),
     }

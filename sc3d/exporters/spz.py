@@ -1,4 +1,6 @@
-"""Gaussians as SPZ: a tenth of the PLY's size, for the web; splats of chosen classes, as the format has no room for labels."""
+"""Gaussians as SPZ: a tenth of the PLY's size, for the web; splats of chosen classes, as the format has no
+room for labels.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/splats.spz` (version 4), axes and origin as in splats.ply; with `--classes` of these only.
 
-    What the format keeps: positions to 1/8192 of a unit, logs of scales to 1/32 from -10 on, opacity to 1/510, f_dc to 1/76 between -3.3 and 3.3,
+    What the format keeps: positions to 1/8192 of a unit, logs of scales to 1/32 from -10 on, opacity to
+    1/510, f_dc to 1/76 between -3.3 and 3.3,
     f_rest to 1/32 (first degree) and 1/16 between -1 and 1.
     """
     chosen, placement = chosen_classes(scene, settings), find_placement(scene, settings)
@@ -38,11 +41,16 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
 
 
 def splat_cloud(gaussians: Gaussians) -> o3d.t.geometry.PointCloud:
-    """Gaussians with the attributes that Open3D gives to splats: `scale` is not logarithmic, `opacity` is a logit, `rot` is wxyz of length 1."""
+    """Gaussians with the attributes that Open3D gives to splats: `scale` is not logarithmic, `opacity` is a
+    logit, `rot` is wxyz of length 1.
+    """
     lengths = gaussians.quats.norm(dim=1, keepdim=True)
     parts = {
-        "positions": gaussians.means, "f_dc": gaussians.sh[:, 0], "opacity": gaussians.opacity_logits[:, None],
-        "scale": gaussians.scales, "rot": gaussians.quats / lengths.clamp_min(1e-12),
+        "positions": gaussians.means,
+        "f_dc": gaussians.sh[:, 0],
+        "opacity": gaussians.opacity_logits[:, None],
+        "scale": gaussians.scales,
+        "rot": gaussians.quats / lengths.clamp_min(1e-12),
     }
     if gaussians.sh_degree:
         parts["f_rest"] = gaussians.sh[:, 1:]

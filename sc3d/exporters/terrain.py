@@ -8,13 +8,15 @@ from scipy import ndimage
 from sc3d.geometry.raster import Grid, interpolate
 
 CELL = 2.0  # side of the blocks whose median is the ground, m
-WINDOW = 15.0  # ground that stands out of the lowest of this surrounding by more than STEP is a mislabelled roof or crown, m
+# ground that stands out of the lowest of this surrounding by more than STEP is a mislabelled roof or crown, m
+WINDOW = 15.0
 STEP = 1.5
 SUPPORT = 0.25  # blocks with less than this share of the usual number of ground points rest on strays
 
 
 def ground_height(points: np.ndarray, is_ground: np.ndarray, grid: Grid) -> np.ndarray:
-    """(H, W) float64 height of the ground at the cell centres of `grid`, m: block medians, interpolated across gaps.
+    """(H, W) float64 height of the ground at the cell centres of `grid`, m: block medians, interpolated
+    across gaps.
 
     points: (N, 3) CRS in m; is_ground: (N,) bool, at least one True
     """
@@ -32,7 +34,9 @@ def ground_height(points: np.ndarray, is_ground: np.ndarray, grid: Grid) -> np.n
 
 
 def block_medians(blocks: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """(count,) float64 median of the values (N,) in each block, the lower of the middle two; blocks: (N,) int. NaN where a block is empty."""
+    """(count,) float64 median of the values (N,) in each block, the lower of the middle two; blocks: (N,)
+    int. NaN where a block is empty.
+    """
     order = np.lexsort((values, blocks))
     sizes = np.bincount(blocks, minlength=count)
     ends = np.cumsum(sizes)
@@ -51,4 +55,6 @@ def _stands_out(medians: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _corners(grid: Grid) -> np.ndarray:
-    return np.array([[grid.left, grid.top], [grid.left + grid.width * grid.pixel, grid.top - grid.height * grid.pixel]])
+    return np.array(
+        [[grid.left, grid.top], [grid.left + grid.width * grid.pixel, grid.top - grid.height * grid.pixel]]
+    )

@@ -26,7 +26,8 @@ def canopy_height(points: np.ndarray, is_tree: np.ndarray, ground: np.ndarray, g
 
 
 def split_crowns(canopy: np.ndarray, grid: Grid, min_height: float) -> np.ndarray:
-    """(H, W) int32 number of the tree in each cell, 0 = none: the watershed of the smoothed canopy around its tops.
+    """(H, W) int32 number of the tree in each cell, 0 = none: the watershed of the smoothed canopy around its
+    tops.
 
     canopy: (H, W) m, NaN = none; min_height: lower plants are not trees, m
     """
@@ -47,7 +48,8 @@ def smoothed(heights: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray
 def climb(heights: np.ndarray, tall: np.ndarray, pixel: float) -> np.ndarray:
     """(H, W) int32 number from 1 of the top that each tall cell climbs to, 0 = not tall.
 
-    A cell steps to the highest of its neighbours; from a local maximum on to the highest cell within half the usual width of a crown of that height;
+    A cell steps to the highest of its neighbours; from a local maximum on to the highest cell within half the
+    usual width of a crown of that height;
     where there is none, it is a top. heights: (H, W) m; equal heights are decided by place.
     """
     order = np.lexsort((np.arange(heights.size), np.where(tall, heights, -np.inf).ravel()))
@@ -71,7 +73,9 @@ def climb(heights: np.ndarray, tall: np.ndarray, pixel: float) -> np.ndarray:
 
 
 def crown_width(heights: np.ndarray) -> np.ndarray:
-    """Usual width of the crown of a tree of some height, both in m: 2.5 + 0.009 h^2 (Popescu and Wynne 2004, for mixed stands)."""
+    """Usual width of the crown of a tree of some height, both in m: 2.5 + 0.009 h^2 (Popescu and Wynne 2004,
+    for mixed stands).
+    """
     return 2.51503 + 0.00901 * heights**2
 
 

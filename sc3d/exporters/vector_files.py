@@ -1,4 +1,6 @@
-"""Counted objects as map features: GeoJSON in WGS 84, or in the scene's own metres, and GeoPackage in the CRS where pyogrio is installed."""
+"""Counted objects as map features: GeoJSON in WGS 84, or in the scene's own metres, and GeoPackage in the CRS
+where pyogrio is installed.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,10 @@ DEGREES, METRES = 9, 3  # decimals of coordinates: 0.1 mm and 1 mm
 class MapObject:
     """A building or a tree.
 
-    polygon: shapely polygon in the CRS; number: from 1, per layer; name, label: its class; area: m2 of the outline
-    height: of its top above the ground, m; ground: z of the ground under it, m; confidence: mean of its points, 0 to 1; num_points: of its class
+    polygon: shapely polygon in the CRS; number: from 1, per layer; name, label: its class; area: m2 of the
+        outline
+    height: of its top above the ground, m; ground: z of the ground under it, m; confidence: mean of its
+        points, 0 to 1; num_points: of its class
     """
 
     polygon: object
@@ -40,8 +44,14 @@ class MapObject:
     def properties(self) -> dict[str, object]:
         """What the map shows, by name."""
         return {
-            "id": self.number, "class": self.name, "label": self.label, "area_m2": round(self.area, 2), "height_m": round(self.height, 2),
-            "ground_m": round(self.ground, 2), "confidence": round(self.confidence, 3), "points": self.num_points,
+            "id": self.number,
+            "class": self.name,
+            "label": self.label,
+            "area_m2": round(self.area, 2),
+            "height_m": round(self.height, 2),
+            "ground_m": round(self.ground, 2),
+            "confidence": round(self.confidence, 3),
+            "points": self.num_points,
         }
 
 
@@ -51,12 +61,19 @@ def has_geopackage() -> bool:
 
 
 def write_geojson(path: Path, objects: list[MapObject], placement: Placement) -> None:
-    """RFC 7946: longitude and latitude, WGS 84, outer rings counter-clockwise; without a CRS the scene's metres, which a member of the file says."""
+    """RFC 7946: longitude and latitude, WGS 84, outer rings counter-clockwise; without a CRS the scene's
+    metres, which a member of the file says.
+    """
     collection: dict[str, object] = {"type": "FeatureCollection", "name": path.stem}
     if placement.crs is None:
         collection["coordinates"] = "metres in the scene's own frame, not on Earth"
     collection["features"] = [
-        {"type": "Feature", "id": item.number, "properties": item.properties(), "geometry": {"type": "Polygon", "coordinates": _rings(item, placement)}}
+        {
+            "type": "Feature",
+            "id": item.number,
+            "properties": item.properties(),
+            "geometry": {"type": "Polygon", "coordinates": _rings(item, placement)},
+        }
         for item in objects
     ]
     with atomic_path(path) as temporary:
@@ -72,10 +89,19 @@ def write_geopackage(path: Path, layers: dict[str, list[MapObject]], placement: 
         for name, objects in layers.items():
             rows = [item.properties() for item in objects]
             fields = list(MapObject(None, 0, "", 0, 0.0, 0.0, 0.0, 0.0, 0).properties())
-            columns = [np.array([row[field] for row in rows], types.get(field, np.float64)) for field in fields]
+            columns = [
+                np.array([row[field] for row in rows], types.get(field, np.float64)) for field in fields
+            ]
             geometry = np.array([shapely.to_wkb(item.polygon) for item in objects], object)
             raw.write(
-                str(temporary), geometry, columns, fields, layer=name, driver="GPKG", geometry_type="Polygon", crs=placement.crs.to_wkt(),
+                str(temporary),
+                geometry,
+                columns,
+                fields,
+                layer=name,
+                driver="GPKG",
+                geometry_type="Polygon",
+                crs=placement.crs.to_wkt(),
                 append=temporary.exists(),
             )
 
@@ -86,6 +112,12 @@ def _rings(item: MapObject, placement: Placement) -> list[list[list[float]]]:
     if placement.crs is not None:
         import pyproj
 
-        decimals, forward = DEGREES, pyproj.Transformer.from_crs(placement.crs, "EPSG:4326", always_xy=True).transform
+        decimals, forward = (
+            DEGREES,
+            pyproj.Transformer.from_crs(placement.crs, "EPSG:4326", always_xy=True).transform,
+        )
     rings = [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
-    return [np.round(ring if forward is None else np.stack(forward(*ring.T), axis=1), decimals).tolist() for ring in rings]
+    return [
+        np.round(ring if forward is None else np.stack(forward(*ring.T), axis=1), decimals).tolist()
+        for ring in rings
+    ]

@@ -55,13 +55,15 @@ class View:
     def cone_cosine(self) -> float:
         """Cosine of the largest angle between the optical axis and a ray through the image border.
 
-        Polynomial distortion folds points from far outside the field of view back into the image; nothing beyond this cone is seen.
+        Polynomial distortion folds points from far outside the field of view back into the image; nothing
+        beyond this cone is seen.
         """
         return float(self._border_rays[:, 2].min())
 
     @cached_property
     def frustum(self) -> np.ndarray:
-        """(4, 3) unit normals, camera frame, of planes through the centre; everything in the image lies on their negative side.
+        """(4, 3) unit normals, camera frame, of planes through the centre; everything in the image lies on
+        their negative side.
 
         All zero where the field of view is too wide for planes.
         """
@@ -76,14 +78,20 @@ class View:
     @cached_property
     def _border_rays(self) -> np.ndarray:
         columns, rows = np.arange(0, self.width + 1), np.arange(0, self.height + 1)
-        border = np.concatenate([
-            np.stack([columns, np.zeros_like(columns)], 1), np.stack([columns, np.full_like(columns, self.height)], 1),
-            np.stack([np.zeros_like(rows), rows], 1), np.stack([np.full_like(rows, self.width), rows], 1),
-        ])
+        border = np.concatenate(
+            [
+                np.stack([columns, np.zeros_like(columns)], 1),
+                np.stack([columns, np.full_like(columns, self.height)], 1),
+                np.stack([np.zeros_like(rows), rows], 1),
+                np.stack([np.full_like(rows, self.width), rows], 1),
+            ]
+        )
         return _unit_rays(self.camera, border.astype(np.float64))
 
     def shifted(self, origin: np.ndarray) -> View:
-        """The same view in a world whose origin is moved to `origin` (3,): points there are `points - origin`."""
+        """The same view in a world whose origin is moved to `origin` (3,): points there are `points -
+        origin`.
+        """
         moved = self.cam_from_world.copy()
         moved[:3, 3] += moved[:3, :3] @ np.asarray(origin, dtype=np.float64)
         return replace(self, cam_from_world=moved)
@@ -97,13 +105,22 @@ class View:
         return replace(self, camera=camera)
 
 
-def pinhole_view(name: str, size: tuple[int, int], calibration: tuple[float, float, float, float], cam_from_world: np.ndarray) -> View:
-    """A view without distortion. `size` (width, height) px; `calibration` (fx, fy, cx, cy) px; `cam_from_world` (4, 4)."""
+def pinhole_view(
+    name: str,
+    size: tuple[int, int],
+    calibration: tuple[float, float, float, float],
+    cam_from_world: np.ndarray,
+) -> View:
+    """A view without distortion. `size` (width, height) px; `calibration` (fx, fy, cx, cy) px;
+    `cam_from_world` (4, 4).
+    """
     camera = pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=list(calibration))
     return View(name, camera, np.asarray(cam_from_world, dtype=np.float64))
 
 
-def look_at(centre: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> np.ndarray:
+def look_at(
+    centre: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+) -> np.ndarray:
     """(4, 4) cam_from_world of a camera at `centre` (3,) that looks at `target` (3,), image top towards `up`."""
     forward = np.asarray(target, np.float64) - centre
     forward = forward / np.linalg.norm(forward)
@@ -128,7 +145,8 @@ def rays(view: View, pixels: np.ndarray | None = None) -> tuple[np.ndarray, np.n
     """Viewing rays of pixels.
 
     pixels: (N, 2) px; None = all pixel centres row by row
-    returns: (N, 3) unit directions, world; (N,) z component of each in the camera frame, so that depth = range * z. NaN where the model has no ray.
+    returns: (N, 3) unit directions, world; (N,) z component of each in the camera frame, so that depth =
+        range * z. NaN where the model has no ray.
     """
     pixels = pixel_centres(view.width, view.height) if pixels is None else np.asarray(pixels, np.float64)
     directions_cam = _unit_rays(view.camera, pixels)
@@ -136,7 +154,8 @@ def rays(view: View, pixels: np.ndarray | None = None) -> tuple[np.ndarray, np.n
 
 
 def camera_rays(camera: pycolmap.Camera) -> np.ndarray:
-    """(height * width, 3) float32 unit directions of all pixel centres row by row, camera frame; NaN where the model has no ray.
+    """(height * width, 3) float32 unit directions of all pixel centres row by row, camera frame; NaN where
+    the model has no ray.
 
     Kept for the last few cameras, because photos share cameras and differ by their pose only. Read-only.
     """
@@ -165,24 +184,35 @@ def project(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     seen = (distance > 0) & (depth >= (view.cone_cosine - 1e-6) * distance)
     pixels = np.full((len(points_cam), 2), np.nan)
     if seen.any():
-        pixels[seen] = view.camera.img_from_cam(np.ascontiguousarray(points_cam[seen]), check_cheirality=False)
+        pixels[seen] = view.camera.img_from_cam(
+            np.ascontiguousarray(points_cam[seen]), check_cheirality=False
+        )
     return pixels, depth
 
 
 def in_image(view: View, pixels: np.ndarray) -> np.ndarray:
     """(N,) bool: which of the (N, 2) pixel coordinates lie inside the image; NaN does not."""
-    return (pixels[:, 0] >= 0) & (pixels[:, 0] < view.width) & (pixels[:, 1] >= 0) & (pixels[:, 1] < view.height)
+    return (
+        (pixels[:, 0] >= 0) & (pixels[:, 0] < view.width) & (pixels[:, 1] >= 0) & (pixels[:, 1] < view.height)
+    )
 
 
 def may_see(view: View, low: np.ndarray, high: np.ndarray) -> bool:
     """Whether the image may show something of a box; low, high: (3,) world."""
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    corners = np.array(
+        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    )
     corners_cam = corners @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
-    return not ((corners_cam @ view.frustum.T > 1e-9 * np.abs(corners_cam).max()).all(axis=0) & view.frustum.any(axis=1)).any()
+    return not (
+        (corners_cam @ view.frustum.T > 1e-9 * np.abs(corners_cam).max()).all(axis=0)
+        & view.frustum.any(axis=1)
+    ).any()
 
 
 def undistorted(view: View, max_size: int | None = None) -> View:
-    """A pinhole view of the same pose, with the largest field of view that has no empty borders, longest side at most `max_size` px."""
+    """A pinhole view of the same pose, with the largest field of view that has no empty borders, longest side
+    at most `max_size` px.
+    """
     if view.camera.is_undistorted():
         pinhole = view
     else:
@@ -197,14 +227,20 @@ def undistorted(view: View, max_size: int | None = None) -> View:
 
 
 def resample(image: np.ndarray, view: View, target: View, labels: bool = False) -> np.ndarray:
-    """Warp a photo or label map of `view` (any size of the same aspect) into `target`, a view with the same pose.
+    """Warp a photo or label map of `view` (any size of the same aspect) into `target`, a view with the same
+    pose.
 
-    image: (h, w) or (h, w, 3); returned at the size of `target`. Labels take the nearest pixel and are never mixed.
+    image: (h, w) or (h, w, 3); returned at the size of `target`. Labels take the nearest pixel and are never
+        mixed.
     """
     height, width = image.shape[:2]
     directions_cam = _unit_rays(target.camera, pixel_centres(target.width, target.height))
-    pixels = view.camera.img_from_cam(directions_cam, check_cheirality=False) * [width / view.width, height / view.height]
-    maps = (pixels - 0.5).astype(np.float32).reshape(target.height, target.width, 2)  # cv2: pixel centre = integer
+    pixels = view.camera.img_from_cam(directions_cam, check_cheirality=False) * [
+        width / view.width,
+        height / view.height,
+    ]
+    # cv2: pixel centre = integer
+    maps = (pixels - 0.5).astype(np.float32).reshape(target.height, target.width, 2)
     shrink = width / target.width
     if labels:
         return cv2.remap(image, maps, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)

@@ -1,7 +1,10 @@
-"""Lens models of other programs as COLMAP cameras, exactly; where COLMAP has no such model, within a tolerance or not at all.
+"""Lens models of other programs as COLMAP cameras, exactly; where COLMAP has no such model, within a
+tolerance or not at all.
 
-All models here share one form: normalised image coordinates (perspective x / z, or the angle from the axis for fisheyes) times a radial polynomial,
-plus tangential terms, then focal lengths, skew and principal point. Pixel coordinates are COLMAP's: the centre of the first pixel is (0.5, 0.5).
+All models here share one form: normalised image coordinates (perspective x / z, or the angle from the axis
+for fisheyes) times a radial polynomial,
+plus tangential terms, then focal lengths, skew and principal point. Pixel coordinates are COLMAP's: the
+centre of the first pixel is (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -45,7 +48,9 @@ class Lens:
         return float(np.hypot(x, y))
 
     def radii(self) -> np.ndarray:
-        """Undistorted radii from the middle to the corner of the image; up to where the polynomial folds back, if it does before."""
+        """Undistorted radii from the middle to the corner of the image; up to where the polynomial folds
+        back, if it does before.
+        """
         radius = np.linspace(0, np.pi if self.fisheye else 4 * self.reach + 1, 20 * NUM_RADII)
         distorted = radius * self.factor(radius)
         inside = (distorted <= self.reach) & (np.maximum.accumulate(distorted) == distorted)
@@ -60,25 +65,45 @@ class Lens:
 def to_camera(lens: Lens, tolerance: float, where: str) -> pycolmap.Camera:
     """COLMAP camera of a lens, of the simplest model that holds it.
 
-    tolerance: largest error, px, that may come from what no COLMAP model has. InputError beyond it; `where`: names the camera in the message
+    tolerance: largest error, px, that may come from what no COLMAP model has. InputError beyond it; `where`:
+        names the camera in the message
     """
-    values = np.array([lens.width, lens.height, *lens.focal, *lens.principal, *lens.radial, *lens.tangential, lens.skew, *lens.prism])
+    values = np.array(
+        [
+            lens.width,
+            lens.height,
+            *lens.focal,
+            *lens.principal,
+            *lens.radial,
+            *lens.tangential,
+            lens.skew,
+            *lens.prism,
+        ]
+    )
     if not np.isfinite(values).all() or min(lens.width, lens.height, *lens.focal) <= 0:
         raise InputError(f"{where}: size and focal length must be positive, all parameters finite numbers")
     if max(lens.width, lens.height) > MAX_SIDE or lens.width * lens.height > MAX_PIXELS:
-        raise InputError(f"{where} is {lens.width}x{lens.height}: sizes up to {MAX_PIXELS // 10**6} megapixels are possible")
+        raise InputError(
+            f"{where} is {lens.width}x{lens.height}: sizes up to {MAX_PIXELS // 10**6} megapixels are possible"
+        )
     lens = replace(lens, radial=tuple(np.trim_zeros(lens.radial, "b")))
     lost = abs(lens.skew) * max(lens.principal[1], lens.height - lens.principal[1]) / lens.focal[1]
     if lost > tolerance:
-        raise InputError(f"{where}: pixels that are not rectangular (skew {lens.skew:.3g} px) have no COLMAP model; leaving that out costs up to {lost:.2g} px: "
-                         f"optimise the cameras without it, export undistorted photos, or allow it with --tolerance {_ceiling(lost)}")
+        raise InputError(
+            f"{where}: pixels that are not rectangular (skew {lens.skew:.3g} px) have no COLMAP model; leaving that out costs up to {lost:.2g} px: "
+            f"optimise the cameras without it, export undistorted photos, or allow it with --tolerance {_ceiling(lost)}"
+        )
     model, params = (_fisheye if lens.fisheye else _perspective)(lens, tolerance, where)
-    return pycolmap.Camera(model=model, width=lens.width, height=lens.height, params=[*lens.focal, *lens.principal, *params])
+    return pycolmap.Camera(
+        model=model, width=lens.width, height=lens.height, params=[*lens.focal, *lens.principal, *params]
+    )
 
 
 def _perspective(lens: Lens, tolerance: float, where: str) -> tuple[str, list[float]]:
     if any(lens.prism):
-        raise InputError(f"{where}: a thin prism on a perspective lens has no COLMAP model: export undistorted photos")
+        raise InputError(
+            f"{where}: a thin prism on a perspective lens has no COLMAP model: export undistorted photos"
+        )
     if not lens.radial and not any(lens.tangential):
         return "PINHOLE", []
     radial = [*lens.radial, 0.0, 0.0, 0.0]
@@ -91,7 +116,9 @@ def _perspective(lens: Lens, tolerance: float, where: str) -> tuple[str, list[fl
 
 
 def _rational(lens: Lens, tolerance: float, where: str) -> tuple[list[float], list[float]]:
-    """FULL_OPENCV's k1, k2 and k3..k6 for a polynomial of higher degree: (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)."""
+    """FULL_OPENCV's k1, k2 and k3..k6 for a polynomial of higher degree: (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1
+    + k4 r^2 + k5 r^4 + k6 r^6).
+    """
     radius = lens.radii()
     factor, powers = lens.factor(radius), (radius[:, None] / radius[-1]) ** [2, 4, 6]
     weight = radius[:, None] * np.hstack([powers, -factor[:, None] * powers])
@@ -101,8 +128,10 @@ def _rational(lens: Lens, tolerance: float, where: str) -> tuple[list[float], li
     top, bottom = (np.polynomial.polynomial.polyval(squares, (1.0, *part)) for part in (found[:3], found[3:]))
     lost = float(np.max(np.abs(radius * (top / bottom - factor))) * max(lens.focal))
     if not lost <= tolerance:
-        raise InputError(f"{where}: a radial polynomial up to r^{2 * len(lens.radial)} has no COLMAP model, and the nearest one is up to {lost:.2g} px off: "
-                         f"optimise the cameras without k4, export undistorted photos, or allow it with --tolerance {_ceiling(lost)}")
+        raise InputError(
+            f"{where}: a radial polynomial up to r^{2 * len(lens.radial)} has no COLMAP model, and the nearest one is up to {lost:.2g} px off: "
+            f"optimise the cameras without k4, export undistorted photos, or allow it with --tolerance {_ceiling(lost)}"
+        )
     return list(found[:2]), list(found[2:])
 
 
@@ -113,7 +142,9 @@ def _fisheye(lens: Lens, tolerance: float, where: str) -> tuple[str, list[float]
     if len(lens.radial) <= 4:
         return "THIN_PRISM_FISHEYE", [*radial[:2], *lens.tangential, *radial[2:4], *lens.prism]
     if len(lens.radial) > 6 or any(lens.tangential) or any(lens.prism):
-        raise InputError(f"{where}: this fisheye (radial terms up to r^{2 * len(lens.radial)} with tangential ones) has no COLMAP model: export undistorted photos")
+        raise InputError(
+            f"{where}: this fisheye (radial terms up to r^{2 * len(lens.radial)} with tangential ones) has no COLMAP model: export undistorted photos"
+        )
     return "RAD_TAN_THIN_PRISM_FISHEYE", [*radial[:6], *6 * [0.0]]
 
 

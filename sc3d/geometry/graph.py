@@ -1,6 +1,8 @@
-"""Neighbour graph of a cloud with the joint similarity of eq. 7 as edge weights, in a canonical order of the points.
+"""Neighbour graph of a cloud with the joint similarity of eq. 7 as edge weights, in a canonical order of the
+points.
 
-The points are sorted along a Morton curve first: neighbours are then near in memory, and everything computed on the graph (nearest neighbours of
+The points are sorted along a Morton curve first: neighbours are then near in memory, and everything computed
+on the graph (nearest neighbours of
 equal distance, sums of floats) is the same whatever the order in which the points came.
 """
 
@@ -27,10 +29,12 @@ class Graph:
     """Symmetric graph of N points. All arrays but `order` are in canonical order.
 
     order: (N,) int64 row of the cloud of each point of the graph
-    starts, neighbors, weights: CSR arrays (N + 1,) int64, (E,) int32, (E,) float32; every undirected edge is there twice
+    starts, neighbors, weights: CSR arrays (N + 1,) int64, (E,) int32, (E,) float32; every undirected edge is
+        there twice
     spacings: (N,) float32 local point spacing, world units
     normals: (N, 3) float32 unit
-    curvature: (N,) float32 of eq. 6; roughness: (N,) float32 mean distance of the neighbours from the tangent plane, over that to the farthest
+    curvature: (N,) float32 of eq. 6; roughness: (N,) float32 mean distance of the neighbours from the tangent
+        plane, over that to the farthest
     """
 
     order: np.ndarray
@@ -49,19 +53,28 @@ class Graph:
 
     def sparse(self) -> scipy.sparse.csr_matrix:
         """(N, N) CSR matrix of the weights, canonical order."""
-        return scipy.sparse.csr_matrix((self.weights, self.neighbors, self.starts), shape=(len(self.order),) * 2)
+        return scipy.sparse.csr_matrix(
+            (self.weights, self.neighbors, self.starts), shape=(len(self.order),) * 2
+        )
 
 
 def build_graph(
-    points: np.ndarray, normals: np.ndarray | None, num_neighbors: int, colors: np.ndarray | None = None, ties: tuple[np.ndarray, ...] = (),
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    num_neighbors: int,
+    colors: np.ndarray | None = None,
+    ties: tuple[np.ndarray, ...] = (),
     box: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Graph:
     """Neighbour graph with the joint similarity of eq. 7, times that of colours where given.
 
-    points: (N, 3) world; normals: (N, 3) unit, oriented, or None = estimated and compared up to sign; colors: (N, 3) uint8 or None
+    points: (N, 3) world; normals: (N, 3) unit, oriented, or None = estimated and compared up to sign; colors:
+        (N, 3) uint8 or None
     ties: arrays (N,) that order points of equal position
-    box: lowest and highest corner (3,) of the cloud that the points are a part of, None = of the points: parts of a cloud then have the edges of the whole
-    Edges join points closer than RADIUS x the local spacing; a wider gap has no edge. Curvature is over the same neighbours.
+    box: lowest and highest corner (3,) of the cloud that the points are a part of, None = of the points:
+        parts of a cloud then have the edges of the whole
+    Edges join points closer than RADIUS x the local spacing; a wider gap has no edge. Curvature is over the
+    same neighbours.
     """
     low, high = (points.min(axis=0), points.max(axis=0)) if box is None else box
     local, scale = normalised(points, low, high), float((high - low).max()) or 1.0
@@ -71,26 +84,44 @@ def build_graph(
     if oriented:
         normals = np.ascontiguousarray(normals[order], np.float32)
     else:
-        normals = estimate_normals(local, neighbors) if neighbors.shape[1] > 2 else np.tile(np.float32([0, 0, 1]), (len(points), 1))
+        normals = (
+            estimate_normals(local, neighbors)
+            if neighbors.shape[1] > 2
+            else np.tile(np.float32([0, 0, 1]), (len(points), 1))
+        )
     bend, roughness = _shape(local, normals, neighbors, distances)
-    reach = RADIUS * np.maximum(distances[:, min(SPACING_NEIGHBOR, distances.shape[1]) - 1], 1e-12) if distances.shape[1] else np.ones(len(points))
+    reach = (
+        RADIUS * np.maximum(distances[:, min(SPACING_NEIGHBOR, distances.shape[1]) - 1], 1e-12)
+        if distances.shape[1]
+        else np.ones(len(points))
+    )
     _cut(neighbors, distances, reach.astype(np.float32))
     del distances  # as large as all the edges
-    shades = np.zeros((len(points), 0), np.float32) if colors is None else colors[order].astype(np.float32) / np.float32(255)
+    shades = (
+        np.zeros((len(points), 0), np.float32)
+        if colors is None
+        else colors[order].astype(np.float32) / np.float32(255)
+    )
     starts, columns = _link(neighbors)
     del neighbors
     weights = np.empty(starts[-1], np.float32)
     _weigh(starts, columns, normals, bend, shades, oriented, weights)
-    return Graph(order, starts, columns, weights, (reach / RADIUS * scale).astype(np.float32), normals, bend, roughness)
+    return Graph(
+        order, starts, columns, weights, (reach / RADIUS * scale).astype(np.float32), normals, bend, roughness
+    )
 
 
 def normalised(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 positions in the unit cube over the box from low to high (3,): the same for a world in other units or with an offset."""
+    """(N, 3) float32 positions in the unit cube over the box from low to high (3,): the same for a world in
+    other units or with an offset.
+    """
     return ((np.asarray(points, np.float64) - low) / (float((high - low).max()) or 1.0)).astype(np.float32)
 
 
 def canonical_order(points: np.ndarray, ties: tuple[np.ndarray, ...] = ()) -> np.ndarray:
-    """(N,) int64 rows along a Morton curve; within a cell by x, y, z, then by `ties`. points: (N, 3) float32 in the unit cube."""
+    """(N,) int64 rows along a Morton curve; within a cell by x, y, z, then by `ties`. points: (N, 3) float32
+    in the unit cube.
+    """
     code = _morton((points * np.float32((1 << MORTON_BITS) - 1)).astype(np.int64))
     keys = (points[:, 2], points[:, 1], points[:, 0], code)
     order = np.lexsort(keys)
@@ -100,12 +131,17 @@ def canonical_order(points: np.ndarray, ties: tuple[np.ndarray, ...] = ()) -> np
     return order
 
 
-def similarity(normals: np.ndarray, bend: np.ndarray, rows: np.ndarray, columns: np.ndarray, oriented: bool = True) -> np.ndarray:
-    """(E,) float32 weights of eq. 7 for the edges rows-columns: alpha (1 - angle / pi) + beta exp(-gamma |difference of curvature|).
+def similarity(
+    normals: np.ndarray, bend: np.ndarray, rows: np.ndarray, columns: np.ndarray, oriented: bool = True
+) -> np.ndarray:
+    """(E,) float32 weights of eq. 7 for the edges rows-columns: alpha (1 - angle / pi) + beta exp(-gamma
+    |difference of curvature|).
 
     Without orientation the angle is that of the lines, scaled to the same range.
     """
-    return _similarities(np.asarray(normals, np.float32), np.asarray(bend, np.float32), rows, columns, oriented)
+    return _similarities(
+        np.asarray(normals, np.float32), np.asarray(bend, np.float32), rows, columns, oriented
+    )
 
 
 def _morton(cells: np.ndarray) -> np.ndarray:
@@ -118,7 +154,9 @@ def _morton(cells: np.ndarray) -> np.ndarray:
 
 
 def _others(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The `count` nearest others (N, K) int32 of each point and their distances (N, K) float32: a point need not come first among coinciding ones."""
+    """The `count` nearest others (N, K) int32 of each point and their distances (N, K) float32: a point need
+    not come first among coinciding ones.
+    """
     index, count = NeighborIndex(points, np.zeros(3)), min(count, len(points) - 1)
     kept = np.empty((len(points), count), np.int32)
     lengths = np.empty(kept.shape, np.float32)
@@ -130,6 +168,7 @@ def _others(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 @numba.njit(cache=True, parallel=True)
 def _drop_self(neighbors, distances, first, kept, lengths):
+    """See _others; rows are points from `first` on."""
     for i in numba.prange(len(neighbors)):
         position = 0
         for k in range(neighbors.shape[1]):
@@ -147,7 +186,9 @@ def _shape(points, normals, neighbors, distances):
         x, y, z, away = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
         for k in range(count):
             j = neighbors[i, k]
-            cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
+            cosine = (
+                normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
+            )
             sign = np.float32(-1) if cosine < 0 else np.float32(1)
             x, y, z = x + sign * normals[j, 0], y + sign * normals[j, 1], z + sign * normals[j, 2]
             away += abs(
@@ -164,6 +205,7 @@ def _shape(points, normals, neighbors, distances):
 
 @numba.njit(cache=True)
 def _edge(normals, bend, i, j, oriented):
+    """Eq. 7."""
     cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
     cosine = min(max(cosine, np.float32(-1)), np.float32(1))
     angle = np.arccos(cosine) if oriented else 2 * np.arccos(abs(cosine))
@@ -180,6 +222,7 @@ def _similarities(normals, bend, rows, columns, oriented):
 
 @numba.njit(cache=True, parallel=True)
 def _cut(neighbors, distances, reach):
+    """Neighbours out of reach become -1."""
     for i in numba.prange(len(neighbors)):
         for k in range(neighbors.shape[1]):
             if distances[i, k] > reach[i]:
@@ -188,6 +231,7 @@ def _cut(neighbors, distances, reach):
 
 @numba.njit(cache=True)
 def _one_way(neighbors, i, k):
+    """Does the other end lack this edge?"""
     for m in range(neighbors.shape[1]):
         if neighbors[neighbors[i, k], m] == i:
             return False
@@ -220,10 +264,10 @@ def _link(neighbors):
 
 @numba.njit(cache=True, parallel=True)
 def _weigh(starts, columns, normals, bend, shades, oriented, weights):
+    """Eq. 7 is symmetric to the bit: each end computes the same."""
     for i in numba.prange(len(starts) - 1):
         for edge in range(starts[i], starts[i + 1]):
             j, squared = columns[edge], 0.0
             for channel in range(shades.shape[1]):
                 squared += (shades[i, channel] - shades[j, channel]) ** 2
             weights[edge] = _edge(normals, bend, i, j, oriented) * np.exp(-squared / (2 * COLOR_WIDTH**2))
-

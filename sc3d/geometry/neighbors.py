@@ -14,7 +14,8 @@ CHUNK = 500_000  # queries per batch: bounds memory, not results
 class NeighborIndex:
     """A KD-tree over (N, 3) points, world; N >= 1.
 
-    origin: (3,) what the points are shifted by, so that UTM positions keep their precision; None = their first point. The parts of a cloud find the
+    origin: (3,) what the points are shifted by, so that UTM positions keep their precision; None = their
+        first point. The parts of a cloud find the
     same distances, to the last bit, if their origin is the same.
     """
 
@@ -24,7 +25,9 @@ class NeighborIndex:
             raise ValueError("an empty cloud has no neighbours")
         self.num_points = len(points)
         self._origin = np.array(points[0] if origin is None else origin, np.float64)
-        self._search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(np.ascontiguousarray(points - self._origin, np.float32)))
+        self._search = o3d.core.nns.NearestNeighborSearch(
+            o3d.core.Tensor(np.ascontiguousarray(points - self._origin, np.float32))
+        )
         self._search.knn_index()
 
     def nearest(self, queries: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -46,9 +49,11 @@ class NeighborIndex:
 
 
 def point_spacing(distances: np.ndarray) -> float:
-    """Sampling distance of a surface cloud: the side of the area per point, from the median distance to the farthest of K neighbours.
+    """Sampling distance of a surface cloud: the side of the area per point, from the median distance to the
+    farthest of K neighbours.
 
-    distances: (N, K + 1) of points to themselves, column 0 = self; K = 8 or so makes grids and random samples agree
+    distances: (N, K + 1) of points to themselves, column 0 = self; K = 8 or so makes grids and random samples
+        agree
     returns: d_K / sqrt(K / pi), world units; 0 if all points coincide
     """
     count = distances.shape[1] - 1
@@ -56,7 +61,8 @@ def point_spacing(distances: np.ndarray) -> float:
 
 
 def estimate_normals(points: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
-    """Unit normals: eigenvector of the smallest eigenvalue of the neighbourhood covariance (eq. 5); the sign is arbitrary.
+    """Unit normals: eigenvector of the smallest eigenvalue of the neighbourhood covariance (eq. 5); the sign
+    is arbitrary.
 
     points: (N, 3) world; neighbors: (N, K) rows, K >= 3
     returns: (N, 3) float32
@@ -71,11 +77,14 @@ def estimate_normals(points: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
     return normals
 
 
-def orient_normals(points: np.ndarray, normals: np.ndarray, centres: np.ndarray, visible_from: np.ndarray | None = None) -> np.ndarray:
+def orient_normals(
+    points: np.ndarray, normals: np.ndarray, centres: np.ndarray, visible_from: np.ndarray | None = None
+) -> np.ndarray:
     """Flip normals towards the cameras.
 
     points, normals: (N, 3); centres: (M, 3) camera centres, world
-    visible_from: (N,) row of a camera that sees the point, -1 = none known; None or -1: the nearest camera centre
+    visible_from: (N,) row of a camera that sees the point, -1 = none known; None or -1: the nearest camera
+        centre
     """
     origin = centres[0]
     nearest = NeighborIndex(centres).nearest(points, 1)[0][:, 0]
@@ -88,7 +97,8 @@ def orient_normals(points: np.ndarray, normals: np.ndarray, centres: np.ndarray,
 def curvature(normals: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
     """Dispersion of a normal against its neighbours: |n_i - mean_j n_j| (eq. 6).
 
-    Each neighbour normal is sign-aligned with n_i, so that unoriented normals give the same value as oriented ones of a smooth surface.
+    Each neighbour normal is sign-aligned with n_i, so that unoriented normals give the same value as oriented
+    ones of a smooth surface.
 
     normals: (N, 3) unit; neighbors: (N, K) rows
     returns: (N,) float32, 0 = plane
@@ -98,5 +108,7 @@ def curvature(normals: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
         part = slice(start, start + CHUNK)
         around = normals[neighbors[part]]
         signs = np.where(np.einsum("nki,ni->nk", around, normals[part]) < 0, np.float32(-1), np.float32(1))
-        result[part] = np.linalg.norm(normals[part] - np.einsum("nki,nk->ni", around, signs) / around.shape[1], axis=1)
+        result[part] = np.linalg.norm(
+            normals[part] - np.einsum("nki,nk->ni", around, signs) / around.shape[1], axis=1
+        )
     return result

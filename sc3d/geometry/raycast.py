@@ -1,4 +1,5 @@
-"""First surfaces and visibility with Open3D's `RaycastingScene`, from a mesh or from the surfels of a bare cloud.
+"""First surfaces and visibility with Open3D's `RaycastingScene`, from a mesh or from the surfels of a bare
+cloud.
 
 Distances along rays are ranges (from the camera centre); depth = range * z component of the unit ray.
 """
@@ -18,7 +19,8 @@ from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, point_spaci
 RAYS = 1 << 19  # cast at a time: bounds memory, not results
 SURFEL_NEIGHBORS = 8
 FLAT, SCATTERED = 0.8, 0.38  # half width of a surfel, in distances to the farthest neighbour
-RANGE_TOLERANCE, MIN_COSINE = 0.005, 0.2  # depth tolerance: share of the range, and the cosine of incidence below which it grows no more
+# depth tolerance: share of the range, and the cosine of incidence below which it grows no more
+RANGE_TOLERANCE, MIN_COSINE = 0.005, 0.2
 MAX_ROUGHNESS = 0.12  # mean distance of flat neighbours from the tangent plane, in the same unit
 MIN_SUPPORT = 4  # points around a surfel, itself not counted; fewer: a floater, which blocks nothing
 
@@ -27,9 +29,11 @@ class RayTarget(Protocol):
     """What rays can hit: `Surface` here, `traversal.VoxelSurface`."""
 
     def cast(self, view: View, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rays from the centre of `view` along (K, 3) float32 unit directions in its camera frame, NaN = no ray.
+        """Rays from the centre of `view` along (K, 3) float32 unit directions in its camera frame, NaN = no
+        ray.
 
-        returns: (K,) float32 range, world units, inf = nothing hit; (K,) float32 |cosine| between ray and surface normal
+        returns: (K,) float32 range, world units, inf = nothing hit; (K,) float32 |cosine| between ray and
+            surface normal
         """
 
 
@@ -44,12 +48,16 @@ class Surface:
     def from_mesh(cls, vertices: np.ndarray, triangles: np.ndarray, origin: np.ndarray) -> Surface:
         """vertices: (V, 3) world; triangles: (T, 3) rows of vertices."""
         scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(o3d.core.Tensor(np.ascontiguousarray(vertices - origin, np.float32)), o3d.core.Tensor(np.ascontiguousarray(triangles, np.uint32)))
+        scene.add_triangles(
+            o3d.core.Tensor(np.ascontiguousarray(vertices - origin, np.float32)),
+            o3d.core.Tensor(np.ascontiguousarray(triangles, np.uint32)),
+        )
         return cls(scene, np.asarray(origin, np.float64))
 
     @classmethod
     def from_cloud(cls, points: np.ndarray, normals: np.ndarray | None, origin: np.ndarray) -> Surface:
-        """Squares in the tangent planes of the points, large enough to touch their neighbours (a surfel cloud).
+        """Squares in the tangent planes of the points, large enough to touch their neighbours (a surfel
+        cloud).
 
         points: (N, 3) world; normals: (N, 3) or None = estimated. Lone points (floaters) get no surfel.
         """
@@ -66,7 +74,14 @@ class Surface:
             part = slice(first, min(first + RAYS, count))
             _aim(directions[part], view.cam_from_world, start, bundle)
             hit = self.scene.cast_rays(o3d.core.Tensor.from_numpy(bundle[: part.stop - first]))
-            _measure(directions[part], bundle, hit["t_hit"].numpy(), hit["primitive_normals"].numpy(), distance[part], incidence[part])
+            _measure(
+                directions[part],
+                bundle,
+                hit["t_hit"].numpy(),
+                hit["primitive_normals"].numpy(),
+                distance[part],
+                incidence[part],
+            )
         return distance, incidence
 
 
@@ -93,13 +108,19 @@ def first_surface(surface: RayTarget, view: View) -> FirstSurface:
 
 @numba.njit(parallel=True, cache=True)
 def _aim(directions, cam_from_world, origin, bundle):
-    """Rays (K, 6) from `origin` (3,) along directions (K, 3) turned from the camera into the world; those without direction point nowhere."""
+    """Rays (K, 6) from `origin` (3,) along directions (K, 3) turned from the camera into the world; those
+    without direction point nowhere.
+    """
     for k in numba.prange(len(directions)):
         x, y, z = np.float64(directions[k, 0]), np.float64(directions[k, 1]), np.float64(directions[k, 2])
         lost = not np.isfinite(x + y + z)
         for axis in range(3):
             bundle[k, axis] = origin[axis]
-            bundle[k, 3 + axis] = 0.0 if lost else x * cam_from_world[0, axis] + y * cam_from_world[1, axis] + z * cam_from_world[2, axis]
+            bundle[k, 3 + axis] = (
+                0.0
+                if lost
+                else x * cam_from_world[0, axis] + y * cam_from_world[1, axis] + z * cam_from_world[2, axis]
+            )
 
 
 @numba.njit(parallel=True, cache=True)
@@ -107,7 +128,9 @@ def _measure(directions, bundle, t_hit, normals, distance, incidence):
     """Range (K,), infinite without a ray or a hit, and |cosine| (K,) between ray and surface normal."""
     for k in numba.prange(len(directions)):
         distance[k] = t_hit[k] if np.isfinite(directions[k, 2]) else np.float32(np.inf)
-        incidence[k] = abs(normals[k, 0] * bundle[k, 3] + normals[k, 1] * bundle[k, 4] + normals[k, 2] * bundle[k, 5])
+        incidence[k] = abs(
+            normals[k, 0] * bundle[k, 3] + normals[k, 1] * bundle[k, 4] + normals[k, 2] * bundle[k, 5]
+        )
 
 
 def surface_points(first: FirstSurface, view: View, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -116,8 +139,15 @@ def surface_points(first: FirstSurface, view: View, rows: np.ndarray, columns: n
     return view.centre + directions * first.range[rows, columns, None]
 
 
-def nearest_points(first: FirstSurface, view: View, index: NeighborIndex, max_distance: float, wanted: np.ndarray | None = None) -> np.ndarray:
-    """(H, W) int32 row of the cloud point nearest to the first surface at each pixel; -1 = nothing hit, or no point within `max_distance`.
+def nearest_points(
+    first: FirstSurface,
+    view: View,
+    index: NeighborIndex,
+    max_distance: float,
+    wanted: np.ndarray | None = None,
+) -> np.ndarray:
+    """(H, W) int32 row of the cloud point nearest to the first surface at each pixel; -1 = nothing hit, or no
+    point within `max_distance`.
 
     index: over the cloud, world; wanted: (H, W) bool pixels to look at, None = all
     """
@@ -149,10 +179,13 @@ class Sighting:
     depth: np.ndarray
 
 
-def see_points(view: View, points: np.ndarray, normals: np.ndarray | None, first: FirstSurface | None, voxel_size: float) -> Sighting:
+def see_points(
+    view: View, points: np.ndarray, normals: np.ndarray | None, first: FirstSurface | None, voxel_size: float
+) -> Sighting:
     """Which points a view sees: inside the image, facing the camera, and not behind the first surface.
 
-    A point is visible iff its range <= first range + tol, tol = max(voxel_size, 0.5 % of the range) / max(|cos incidence|, 0.2).
+    A point is visible iff its range <= first range + tol, tol = max(voxel_size, 0.5 % of the range) /
+    max(|cos incidence|, 0.2).
     points: (N, 3) world; normals: (N, 3) or None (then every point faces the camera)
     first: first surface of the view; None = no occlusion test
     """
@@ -161,33 +194,54 @@ def see_points(view: View, points: np.ndarray, normals: np.ndarray | None, first
     columns, rows = pixels[inside, 0].astype(np.int32), pixels[inside, 1].astype(np.int32)
     towards = view.centre - points[inside]
     distance = np.linalg.norm(towards, axis=1)
-    cosine = np.ones(len(inside)) if normals is None else np.einsum("ij,ij->i", normals[inside], towards) / distance
+    cosine = (
+        np.ones(len(inside))
+        if normals is None
+        else np.einsum("ij,ij->i", normals[inside], towards) / distance
+    )
     excess = np.zeros(len(inside))
     keep = np.ones(len(inside), bool)
     if first is not None:
-        tolerance = np.maximum(voxel_size, RANGE_TOLERANCE * distance) / np.maximum(np.abs(cosine), MIN_COSINE)
+        tolerance = np.maximum(voxel_size, RANGE_TOLERANCE * distance) / np.maximum(
+            np.abs(cosine), MIN_COSINE
+        )
         excess = np.maximum(distance - first.range[rows, columns], 0) / tolerance
         keep = (excess <= 1) & (cosine > 0)
     seen = inside[keep]
     return Sighting(
-        seen, rows[keep], columns[keep], excess[keep].astype(np.float32), np.abs(cosine[keep]).astype(np.float32), depth[seen].astype(np.float32)
+        seen,
+        rows[keep],
+        columns[keep],
+        excess[keep].astype(np.float32),
+        np.abs(cosine[keep]).astype(np.float32),
+        depth[seen].astype(np.float32),
     )
 
 
 def surfels(
-    points: np.ndarray, normals: np.ndarray | None, spacing: float | None = None, wanted: np.ndarray | None = None
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    spacing: float | None = None,
+    wanted: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Two triangles per point in its tangent plane.
 
-    points: (N, 3) local frame; normals: (N, 3) or None; spacing: of the whole cloud that they are part of, None = their own; wanted: (N,) bool, None = all
+    points: (N, 3) local frame; normals: (N, 3) or None; spacing: of the whole cloud that they are part of,
+        None = their own; wanted: (N,) bool, None = all
     returns: (4 K, 3) vertices and (2 K, 3) triangles of the K <= N points that have support
 
-    Half width: FLAT times the distance to the 8th neighbour, which leaves a hole at about 1 of 700 places of a randomly sampled surface;
-    SCATTERED times it where the neighbours do not lie in a plane (leaves), so that crowns do not swell and their gaps stay open.
+    Half width: FLAT times the distance to the 8th neighbour, which leaves a hole at about 1 of 700 places of
+    a randomly sampled surface;
+    SCATTERED times it where the neighbours do not lie in a plane (leaves), so that crowns do not swell and
+    their gaps stay open.
     """
     neighbors, distances = NeighborIndex(points, np.zeros(3)).nearest(points, SURFEL_NEIGHBORS + 1)
     if normals is None:
-        normals = estimate_normals(points, neighbors) if neighbors.shape[1] > 3 else np.tile(np.float32([0, 0, 1]), (len(points), 1))
+        normals = (
+            estimate_normals(points, neighbors)
+            if neighbors.shape[1] > 3
+            else np.tile(np.float32([0, 0, 1]), (len(points), 1))
+        )
     spacing = spacing or point_spacing(distances) or 1.0
     supported = (distances[:, 1:] < 4 * spacing).sum(axis=1) >= min(MIN_SUPPORT, len(points) - 1)
     supported &= True if wanted is None else wanted
@@ -199,7 +253,9 @@ def surfels(
     first_axis = np.cross(normal, helper)
     first_axis /= np.linalg.norm(first_axis, axis=1, keepdims=True)
     second_axis = np.cross(normal, first_axis)
-    corners = [centre + half * (u * first_axis + v * second_axis) for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    corners = [
+        centre + half * (u * first_axis + v * second_axis) for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    ]
     vertices = np.stack(corners, axis=1).reshape(-1, 3)
     base = 4 * np.arange(len(centre))[:, None]
     return vertices, np.concatenate([base + [[0, 1, 2]], base + [[0, 2, 3]]], axis=1).reshape(-1, 3)

@@ -1,4 +1,6 @@
-"""Depth maps to a surface: a truncated signed distance field (TSDF) on Open3D's `VoxelBlockGrid`, then mesh and cloud."""
+"""Depth maps to a surface: a truncated signed distance field (TSDF) on Open3D's `VoxelBlockGrid`, then mesh
+and cloud.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +17,27 @@ Part = tuple[o3d.t.geometry.TriangleMesh, o3d.t.geometry.PointCloud]  # a surfac
 
 
 class DepthFusion:
-    """Fuses float32 depth maps of pinhole views. The views' world must be local (float32-safe); `voxel_size` in its units."""
+    """Fuses float32 depth maps of pinhole views. The views' world must be local (float32-safe); `voxel_size`
+    in its units.
+    """
 
     def __init__(self, voxel_size: float, block_count: int = 50_000) -> None:
         self.voxel_size = voxel_size
         self._grid = o3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight", "color"), (o3d.core.float32,) * 3, ((1,), (1,), (3,)), voxel_size, BLOCK, block_count, CPU
+            ("tsdf", "weight", "color"),
+            (o3d.core.float32,) * 3,
+            ((1,), (1,), (3,)),
+            voxel_size,
+            BLOCK,
+            block_count,
+            CPU,
         )
 
     def integrate(self, view: View, depth: np.ndarray, color: np.ndarray, depth_max: float) -> None:
         """Add one view.
 
-        depth: (H, W) float32 z, world units, 0 = no surface known; color: (H, W, 3) uint8 RGB; depth_max: farther depths are ignored
+        depth: (H, W) float32 z, world units, 0 = no surface known; color: (H, W, 3) uint8 RGB; depth_max:
+            farther depths are ignored
         """
         if not view.camera.is_undistorted():
             raise ValueError("depth fusion needs a pinhole view: use cameras.undistorted")
@@ -35,22 +46,34 @@ class DepthFusion:
         matrix = view.matrix.copy()
         matrix[:2, 2] -= 0.5  # Open3D counts pixel centres as whole numbers
         intrinsic, extrinsic = o3d.core.Tensor(matrix), o3d.core.Tensor(view.cam_from_world)
-        depth_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth, np.float32)[..., None]))
-        color_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(color, np.float32) / np.float32(255)))
-        blocks = self._grid.compute_unique_block_coordinates(depth_image, intrinsic, extrinsic, 1.0, depth_max, TRUNCATION)
-        self._grid.integrate(blocks, depth_image, color_image, intrinsic, extrinsic, 1.0, depth_max, TRUNCATION)
+        depth_image = o3d.t.geometry.Image(
+            o3d.core.Tensor(np.ascontiguousarray(depth, np.float32)[..., None])
+        )
+        color_image = o3d.t.geometry.Image(
+            o3d.core.Tensor(np.ascontiguousarray(color, np.float32) / np.float32(255))
+        )
+        blocks = self._grid.compute_unique_block_coordinates(
+            depth_image, intrinsic, extrinsic, 1.0, depth_max, TRUNCATION
+        )
+        self._grid.integrate(
+            blocks, depth_image, color_image, intrinsic, extrinsic, 1.0, depth_max, TRUNCATION
+        )
 
     def mesh(self, min_weight: float = 0.5) -> o3d.t.geometry.TriangleMesh:
         """Triangles of the zero level set seen by more than `min_weight` views."""
         if not self._grid.hashmap().size():
-            return o3d.t.geometry.TriangleMesh(o3d.core.Tensor.zeros((0, 3)), o3d.core.Tensor.zeros((0, 3), o3d.core.int32))
+            return o3d.t.geometry.TriangleMesh(
+                o3d.core.Tensor.zeros((0, 3)), o3d.core.Tensor.zeros((0, 3), o3d.core.int32)
+            )
         mesh = self._grid.extract_triangle_mesh(min_weight)
         if "colors" in mesh.vertex:  # interpolation overshoots a little
             mesh.vertex.colors = mesh.vertex.colors.clip(0, 1)
         return mesh_in_order(mesh)
 
     def cloud(self, min_weight: float = 0.5) -> o3d.t.geometry.PointCloud:
-        """Points where the zero level set crosses the grid's edges: positions, colors uint8, unit normals out of the surface."""
+        """Points where the zero level set crosses the grid's edges: positions, colors uint8, unit normals out
+        of the surface.
+        """
         if not self._grid.hashmap().size():
             return o3d.t.geometry.PointCloud(o3d.core.Tensor.zeros((0, 3)))
         cloud = self._grid.extract_point_cloud(min_weight)
@@ -59,17 +82,23 @@ class DepthFusion:
             cloud.point.colors = o3d.core.Tensor(colors)
         if "normals" in cloud.point:
             normals = cloud.point.normals.numpy()
-            cloud.point.normals = o3d.core.Tensor(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12).astype(np.float32))
+            cloud.point.normals = o3d.core.Tensor(
+                normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12).astype(np.float32)
+            )
         return cloud_in_order(cloud)
 
 
 def cloud_in_order(cloud: o3d.t.geometry.PointCloud) -> o3d.t.geometry.PointCloud:
-    """The same points ordered by z, y, x: Open3D's hash maps return them in an order that depends on the threads."""
+    """The same points ordered by z, y, x: Open3D's hash maps return them in an order that depends on the
+    threads.
+    """
     return cloud.select_by_index(o3d.core.Tensor(np.lexsort(cloud.point.positions.numpy().T)))
 
 
 def mesh_in_order(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleMesh:
-    """The same for a mesh: vertices by z, y, x, triangles by their vertices, each from its first one on in the sense that it had."""
+    """The same for a mesh: vertices by z, y, x, triangles by their vertices, each from its first one on in
+    the sense that it had.
+    """
     order = np.lexsort(mesh.vertex.positions.numpy().T)
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
@@ -84,26 +113,32 @@ def mesh_in_order(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleM
 
 
 def pixel_squares(view: View, depth: np.ndarray, color: np.ndarray, wanted: np.ndarray) -> Part:
-    """The surface that a single depth map shows, where nothing better is known: a square as large as the pixel, facing the camera.
+    """The surface that a single depth map shows, where nothing better is known: a square as large as the
+    pixel, facing the camera.
 
-    Squares, not a connected sheet: between leaves, a sheet would hang in the air along the view's rays and hide things from other views.
+    Squares, not a connected sheet: between leaves, a sheet would hang in the air along the view's rays and
+    hide things from other views.
 
     view: pinhole; depth: (H, W) z, world units, 0 = none; color: (H, W, 3) uint8; wanted: (H, W) bool
-    returns: mesh with vertex colours and normals, and cloud of the squares' centres with colors uint8 and normals; both may be empty
+    returns: mesh with vertex colours and normals, and cloud of the squares' centres with colors uint8 and
+        normals; both may be empty
     """
     rows, columns = np.nonzero(wanted & (depth > 0))
     z = depth[rows, columns].astype(np.float64)
     right, down, forward = view.cam_from_world[:3, :3]
     directions, ray_z = rays(view, np.stack([columns + 0.5, rows + 0.5], axis=1))
     points = view.centre + directions * (z / ray_z)[:, None]
-    half = (0.75 * z / view.focal)[:, None]  # more than half a pixel: neighbours overlap, seen from elsewhere too
+    # more than half a pixel: neighbours overlap, seen from elsewhere too
+    half = (0.75 * z / view.focal)[:, None]
     corners = [points + half * (u * right + v * down) for u, v in ((-1, -1), (-1, 1), (1, 1), (1, -1))]
     base = 4 * np.arange(len(points))[:, None]
     triangles = np.concatenate([base + [[0, 1, 2]], base + [[0, 2, 3]]], axis=1).reshape(-1, 3)
     vertices = np.stack(corners, axis=1).reshape(-1, 3).astype(np.float32)
     mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles.astype(np.int32)))
     mesh.vertex.normals = o3d.core.Tensor(np.tile(-forward.astype(np.float32), (len(vertices), 1)))
-    mesh.vertex.colors = o3d.core.Tensor(np.repeat(color[rows, columns].astype(np.float32) / np.float32(255), 4, axis=0))
+    mesh.vertex.colors = o3d.core.Tensor(
+        np.repeat(color[rows, columns].astype(np.float32) / np.float32(255), 4, axis=0)
+    )
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points.astype(np.float32)))
     cloud.point.normals = o3d.core.Tensor(np.tile(-forward.astype(np.float32), (len(points), 1)))
     cloud.point.colors = o3d.core.Tensor(color[rows, columns])
@@ -121,4 +156,6 @@ def near_mesh(points: np.ndarray, mesh: o3d.t.geometry.TriangleMesh, distance: f
     """(N,) bool: which of the (N, 3) points lie within `distance` of the mesh, in the mesh's own frame."""
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(mesh)
-    return scene.compute_distance(o3d.core.Tensor(np.ascontiguousarray(points, np.float32))).numpy() <= distance
+    return (
+        scene.compute_distance(o3d.core.Tensor(np.ascontiguousarray(points, np.float32))).numpy() <= distance
+    )

@@ -8,14 +8,19 @@ from scipy.spatial import cKDTree
 
 
 def neighbour_views(
-    tracks: list[np.ndarray] | None, points: np.ndarray, centres: np.ndarray, count: int = 8, angles: tuple[float, float] = (5.0, 30.0)
+    tracks: list[np.ndarray] | None,
+    points: np.ndarray,
+    centres: np.ndarray,
+    count: int = 8,
+    angles: tuple[float, float] = (5.0, 30.0),
 ) -> list[np.ndarray]:
     """Neighbours of every view, best first.
 
     tracks: per view (T,) row indices into `points` of the sparse points it sees; None = unknown
     points: (N, 3) sparse points; centres: (V, 3) camera centres, the same frame
     count: how many to keep; angles: median triangulation angle allowed, degrees
-    returns: per view (<= count,) int64 indices of other views. Ranked by the number of shared points among those whose median angle is in
+    returns: per view (<= count,) int64 indices of other views. Ranked by the number of shared points among
+        those whose median angle is in
         `angles`; a view with fewer than `count` of them is filled up by `nearest_views`.
     """
     centres = np.asarray(centres, np.float64)
@@ -27,17 +32,28 @@ def neighbour_views(
     for view, fallback in enumerate(near):
         candidates = np.argsort(-shared[view], kind="stable")[: 4 * count]
         candidates = candidates[(shared[view, candidates] >= 10) & (candidates != view)]
-        kept = [other for other in candidates if angles[0] <= _median_angle(tracks, points, centres, view, other) <= angles[1]][:count]
+        kept = [
+            other
+            for other in candidates
+            if angles[0] <= _median_angle(tracks, points, centres, view, other) <= angles[1]
+        ][:count]
         # A fallback view must share something where tracks are known, otherwise it may look the other way.
-        extra = [other for other in fallback if other not in kept and (shared[view, other] > 0 or not shared[view].any())]
+        extra = [
+            other
+            for other in fallback
+            if other not in kept and (shared[view, other] > 0 or not shared[view].any())
+        ]
         result.append(np.array((kept + extra)[:count], np.int64))
     return result
 
 
-def nearest_views(centres: np.ndarray, count: int = 8, distances: tuple[float, float] = (0.5, 6.0)) -> list[np.ndarray]:
+def nearest_views(
+    centres: np.ndarray, count: int = 8, distances: tuple[float, float] = (0.5, 6.0)
+) -> list[np.ndarray]:
     """Neighbours by camera distance alone, nearest first, for poses without tracks.
 
-    centres: (V, 3); distances: allowed range in units of the median distance of a camera to the nearest one, so that scene units do not matter
+    centres: (V, 3); distances: allowed range in units of the median distance of a camera to the nearest one,
+        so that scene units do not matter
     returns: per view (<= count,) int64; if none is in range, the nearest ones at another place
     """
     centres = np.asarray(centres, np.float64)
@@ -67,9 +83,13 @@ def _shared_counts(tracks: list[np.ndarray], num_points: int) -> np.ndarray:
     return shared
 
 
-def _median_angle(tracks: list[np.ndarray], points: np.ndarray, centres: np.ndarray, view: int, other: int) -> float:
+def _median_angle(
+    tracks: list[np.ndarray], points: np.ndarray, centres: np.ndarray, view: int, other: int
+) -> float:
     """Median angle at the shared points between the directions to both cameras, degrees."""
     common = points[np.intersect1d(tracks[view], tracks[other])]
     to_view, to_other = centres[view] - common, centres[other] - common
-    cosine = (to_view * to_other).sum(1) / np.maximum(np.linalg.norm(to_view, axis=1) * np.linalg.norm(to_other, axis=1), 1e-12)
+    cosine = (to_view * to_other).sum(1) / np.maximum(
+        np.linalg.norm(to_view, axis=1) * np.linalg.norm(to_other, axis=1), 1e-12
+    )
     return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1)))))

@@ -15,19 +15,22 @@ from sc3d.geometry.voxels import FIXED, SIDES
 
 MIN_POINTS = 3  # in a voxel: never a floater
 MIN_SUPPORT = 5  # points in a voxel and the 26 around it; fewer: a floater
-SLACK = 0.25  # planes reach this far beyond their voxel, in voxels, so that no ray slips through between two of them ...
+# planes reach this far beyond their voxel, in voxels, so that no ray slips through between two of them ...
+SLACK = 0.25
 MARGIN = 0.25  # ... and this far beyond its outermost points where no voxel goes on
 SAME = 0.7  # cosine between normals of one surface
 COHERENT = 0.85  # length of the mean normal around a gap
 GAP_VOXELS = 3  # voxels around a gap that agree on its plane
-GAP_CENTRE = 0.75  # their points' mean is at most this far from the gap, in voxels along the plane: nothing grows beyond an edge
+# their points' mean is at most this far from the gap, in voxels along the plane: nothing grows beyond an edge
+GAP_CENTRE = 0.75
 
 
 class Matter(NamedTuple):
     """What is in the V voxels that hold points, for kernels; `lookup` is their `VoxelLookup` everywhere.
 
     keys: (V,) int64 voxel keys
-    moments: (V, 2, 7) int64 of each side: number of points, sums of their positions (from the voxel's corner, in voxels) and normals, in FIXED
+    moments: (V, 2, 7) int64 of each side: number of points, sums of their positions (from the voxel's corner,
+        in voxels) and normals, in FIXED
     flat: (V,) bool as in `normal_sides`
     """
 
@@ -40,7 +43,8 @@ class Matter(NamedTuple):
 def sum_up(vectors, sides, starts, keys, moments, shapes):
     """Fill moments as in Matter and shapes (V, 2, 12) as in `Patches`, with boxes that just hold the points.
 
-    vectors: positions (N, 3) float64 in voxels from the grid's zero, and normals (N, 3) float32; points sorted by voxel
+    vectors: positions (N, 3) float64 in voxels from the grid's zero, and normals (N, 3) float32; points
+        sorted by voxel
     """
     positions, normals = vectors
     for voxel in numba.prange(len(keys)):
@@ -84,20 +88,30 @@ def empty_around(matter, lookup, found):
 
 @numba.njit(parallel=True, cache=True)
 def close_gaps(matter, lookup, keys, closed, shapes):
-    """closed (C,): does a voxel without points lie amid points of one plane that crosses it? Then shapes (C, 2, 12) gets that plane."""
+    """closed (C,): does a voxel without points lie amid points of one plane that crosses it? Then shapes (C,
+    2, 12) gets that plane.
+    """
     for row in numba.prange(len(keys)):
         total, shape = np.zeros(7, np.int64), shapes[row, 0]
-        if _sum_around(matter, lookup, keys[row], total) < GAP_VOXELS or total[0] < MIN_SUPPORT or _write_plane(total, shape) < COHERENT:
+        if (
+            _sum_around(matter, lookup, keys[row], total) < GAP_VOXELS
+            or total[0] < MIN_SUPPORT
+            or _write_plane(total, shape) < COHERENT
+        ):
             continue
         offset, normal = shape[:3].astype(np.float64) - 0.5, shape[3:6].astype(np.float64)
         away = (offset * normal).sum()
-        closed[row] = abs(away) <= 0.5 * np.abs(normal).sum() and _length(offset - away * normal) <= GAP_CENTRE
+        closed[row] = (
+            abs(away) <= 0.5 * np.abs(normal).sum() and _length(offset - away * normal) <= GAP_CENTRE
+        )
         shape[6:9], shape[9:] = -SLACK, 1 + SLACK
 
 
 @numba.njit(cache=True)
 def _sum_around(matter, lookup, key, total):
-    """Add to total (7,) the moments of the flat voxels around `key` whose sides face as the fullest of them does; returns the number of sides."""
+    """Add to total (7,) the moments of the flat voxels around `key` whose sides face as the fullest of them
+    does; returns the number of sides.
+    """
     x, y, z = voxel_position(key)
     rows, reference, most, num = np.full(27, -1, np.int64), np.zeros(3), 0, 0
     for k in range(27):
@@ -124,7 +138,9 @@ def _sum_around(matter, lookup, key, total):
 
 @numba.njit(parallel=True, cache=True)
 def widen(keys, lookup, flat, shapes):
-    """Let the boxes of shapes (V, 2, 12) reach beyond their points: planes to where the next voxel goes on with them, all by a margin."""
+    """Let the boxes of shapes (V, 2, 12) reach beyond their points: planes to where the next voxel goes on
+    with them, all by a margin.
+    """
     for voxel in numba.prange(len(keys)):
         x, y, z = voxel_position(keys[voxel])
         shape = shapes[voxel]
@@ -143,7 +159,9 @@ def widen(keys, lookup, flat, shapes):
 
 @numba.njit(cache=True)
 def _write_plane(total, shape):
-    """Write mean position and unit mean normal of moments (7,) to shape (6 or more,); returns the length of the mean normal."""
+    """Write mean position and unit mean normal of moments (7,) to shape (6 or more,); returns the length of
+    the mean normal.
+    """
     length = _length(total[4:])
     for axis in range(3):
         shape[axis] = total[1 + axis] / FIXED / total[0]
@@ -153,4 +171,5 @@ def _write_plane(total, shape):
 
 @numba.njit(cache=True)
 def _length(vector):
+    """Of (3,), at least 1e-9 so that it can divide."""
     return max(np.sqrt(float(vector[0]) ** 2 + float(vector[1]) ** 2 + float(vector[2]) ** 2), 1e-9)

@@ -1,7 +1,10 @@
-"""What a ray hits inside a voxel: the plane of the voxel's own points, so that ranges are finer than voxels (METHOD section 3).
+"""What a ray hits inside a voxel: the plane of the voxel's own points, so that ranges are finer than voxels
+(METHOD section 3).
 
-A voxel with few points and few around it is a floater and blocks nothing; an empty one amid the points of a plane is a gap and gets that plane.
-Sums are integers relative to the voxel, so patches depend neither on the order of the points nor on where the world's zero is.
+A voxel with few points and few around it is a floater and blocks nothing; an empty one amid the points of a
+plane is a gap and gets that plane.
+Sums are integers relative to the voxel, so patches depend neither on the order of the points nor on where the
+world's zero is.
 """
 
 from __future__ import annotations
@@ -28,8 +31,10 @@ class Patches:
     """What blocks rays in each of V voxels, one patch per side.
 
     keys: (V,) int64 voxel keys (`voxel_keys`), rising; lookup: their rows
-    shapes: (V, 2, 12) float32 in voxels from the voxel's corner: mean of the points, unit normal, lowest and highest corner of a box that clips the plane.
-    Mean NaN = no points on this side; normal 0 = the points scatter (leaves, edges): a ray that meets the box is stopped beside their mean.
+    shapes: (V, 2, 12) float32 in voxels from the voxel's corner: mean of the points, unit normal, lowest and
+        highest corner of a box that clips the plane.
+    Mean NaN = no points on this side; normal 0 = the points scatter (leaves, edges): a ray that meets the box
+    is stopped beside their mean.
     origin: (3,) float64 world position of the grid's zero; voxel_size: world units
     """
 
@@ -41,13 +46,19 @@ class Patches:
 
 
 def surface_patches(points: np.ndarray, normals: np.ndarray, voxel_size: float) -> Patches:
-    """The patches of a cloud. points: (N, 3) float64 world, N >= 1; normals: (N, 3) float32 unit, towards the outside."""
+    """The patches of a cloud. points: (N, 3) float64 world, N >= 1; normals: (N, 3) float32 unit, towards the
+    outside.
+    """
     points, normals = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(normals, np.float32)
-    origin = points.min(axis=0) - (BLOCK + ORIGIN_SHIFT) * voxel_size  # room for the voxels around those with points
+    # room for the voxels around those with points
+    origin = points.min(axis=0) - (BLOCK + ORIGIN_SHIFT) * voxel_size
     sorting = sort_by_voxel(points, voxel_size, origin)
     sides, flat = normal_sides(normals, sorting)
     keys, order = sorting.keys, sorting.order
-    moments, shapes = np.zeros((len(keys), SIDES, 7), np.int64), np.full((len(keys), SIDES, 12), np.nan, np.float32)
+    moments, shapes = (
+        np.zeros((len(keys), SIDES, 7), np.int64),
+        np.full((len(keys), SIDES, 12), np.nan, np.float32),
+    )
     positions = points[order]
     positions -= origin
     positions /= voxel_size

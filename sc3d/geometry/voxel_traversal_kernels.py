@@ -1,7 +1,9 @@
 """The kernels of `traversal`: one ray through blocks and voxels, in voxel units.
 
-Of crossings at the same time the lower axis comes first, everywhere; that makes the visited voxels those of a DDA over single voxels, to the bit.
-What takes the records is inlined, as in `voting_kernels`. The lookup is a flat part of `Grid`: numba passes no nested records to parallel loops.
+Of crossings at the same time the lower axis comes first, everywhere; that makes the visited voxels those of a
+DDA over single voxels, to the bit.
+What takes the records is inlined, as in `voting_kernels`. The lookup is a flat part of `Grid`: numba passes
+no nested records to parallel loops.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ NEVER = 1e300  # its inverse
 
 
 class Grid(NamedTuple):
-    """The patches by block and voxel, for kernels: the fields of a `VoxelLookup`, and `shapes` as in `Patches`."""
+    """The patches by block and voxel, for kernels: the fields of a `VoxelLookup`, and `shapes` as in
+    `Patches`.
+    """
 
     table: np.ndarray
     rows: np.ndarray
@@ -44,14 +48,19 @@ class Ray(NamedTuple):
 
 @numba.njit(cache=True)
 def _locate(axis, position, direction, inverse, time, by):
-    """Voxel of a ray along `axis` after all crossings before that of axis `by` at `time`; of crossings at the same time, the lower axis comes first."""
+    """Voxel of a ray along `axis` after all crossings before that of axis `by` at `time`; of crossings at the
+    same time, the lower axis comes first.
+    """
     start = np.int64(np.floor(position))
     if direction == 0.0:
         return start
     step = np.int64(1) if direction > 0 else np.int64(-1)
     ahead = np.int64(direction > 0)  # from a voxel to the number of the face that it is left by
-    moved = max((np.int64(np.floor(position + direction * time)) - start) * step, np.int64(0))  # right up to rounding
-    while moved > 0 and not _before((start + step * (moved - 1) + ahead - position) * inverse, axis, time, by):
+    # right up to rounding
+    moved = max((np.int64(np.floor(position + direction * time)) - start) * step, np.int64(0))
+    while moved > 0 and not _before(
+        (start + step * (moved - 1) + ahead - position) * inverse, axis, time, by
+    ):
         moved -= 1
     while _before((start + step * moved + ahead - position) * inverse, axis, time, by):
         moved += 1
@@ -65,6 +74,7 @@ def _before(crossing, axis, time, by):
 
 @numba.njit(cache=True)
 def _earliest(tx, ty, tz):
+    """The axis."""
     if tx <= ty:
         return 0 if tx <= tz else 2
     return 1 if ty <= tz else 2
@@ -83,16 +93,30 @@ def _entry(low, high, position, direction, inverse):
 
 @numba.njit(cache=True, inline="always")
 def _hit(shapes, ray, voxel, x, y, z):
-    """Range in voxels, infinity = none, and |cosine| of the nearer patch of a voxel at x, y, z; shapes as in `Patches`."""
+    """Range in voxels, infinity = none, and |cosine| of the nearer patch of a voxel at x, y, z; shapes as in
+    `Patches`.
+    """
     px, py, pz = ray.px - x, ray.py - y, ray.pz - z
     nearest, incidence = np.inf, 0.0
     for side in range(SIDES):
         if np.isnan(shapes[voxel, side, 0]):
             continue
-        ax, ay, az = (shapes[voxel, side, 6] - px) * ray.ix, (shapes[voxel, side, 7] - py) * ray.iy, (shapes[voxel, side, 8] - pz) * ray.iz
-        bx, by, bz = (shapes[voxel, side, 9] - px) * ray.ix, (shapes[voxel, side, 10] - py) * ray.iy, (shapes[voxel, side, 11] - pz) * ray.iz
+        ax, ay, az = (
+            (shapes[voxel, side, 6] - px) * ray.ix,
+            (shapes[voxel, side, 7] - py) * ray.iy,
+            (shapes[voxel, side, 8] - pz) * ray.iz,
+        )
+        bx, by, bz = (
+            (shapes[voxel, side, 9] - px) * ray.ix,
+            (shapes[voxel, side, 10] - py) * ray.iy,
+            (shapes[voxel, side, 11] - pz) * ray.iz,
+        )
         enter, leave = max(min(ax, bx), min(ay, by), min(az, bz)), min(max(ax, bx), max(ay, by), max(az, bz))
-        nx, ny, nz = np.float64(shapes[voxel, side, 3]), np.float64(shapes[voxel, side, 4]), np.float64(shapes[voxel, side, 5])
+        nx, ny, nz = (
+            np.float64(shapes[voxel, side, 3]),
+            np.float64(shapes[voxel, side, 4]),
+            np.float64(shapes[voxel, side, 5]),
+        )
         mx, my, mz = shapes[voxel, side, 0] - px, shapes[voxel, side, 1] - py, shapes[voxel, side, 2] - pz
         if nx == 0.0 and ny == 0.0 and nz == 0.0:
             slope = 1.0
@@ -107,17 +131,37 @@ def _hit(shapes, ray, voxel, x, y, z):
 
 @numba.njit(cache=True, inline="always")
 def _walk(grid, ray, slot, bx, by, bz, time, side):
-    """First hit inside a block, which the ray enters at `time` by a face of axis `side` (-1 = it starts inside)."""
-    x = _locate(0, ray.px, ray.dx, ray.ix, time, side) if side != 0 else bx * BLOCK + (0 if ray.dx > 0 else BLOCK - 1)
-    y = _locate(1, ray.py, ray.dy, ray.iy, time, side) if side != 1 else by * BLOCK + (0 if ray.dy > 0 else BLOCK - 1)
-    z = _locate(2, ray.pz, ray.dz, ray.iz, time, side) if side != 2 else bz * BLOCK + (0 if ray.dz > 0 else BLOCK - 1)
+    """First hit inside a block, which the ray enters at `time` by a face of axis `side` (-1 = it starts
+    inside).
+    """
+    x = (
+        _locate(0, ray.px, ray.dx, ray.ix, time, side)
+        if side != 0
+        else bx * BLOCK + (0 if ray.dx > 0 else BLOCK - 1)
+    )
+    y = (
+        _locate(1, ray.py, ray.dy, ray.iy, time, side)
+        if side != 1
+        else by * BLOCK + (0 if ray.dy > 0 else BLOCK - 1)
+    )
+    z = (
+        _locate(2, ray.pz, ray.dz, ray.iz, time, side)
+        if side != 2
+        else bz * BLOCK + (0 if ray.dz > 0 else BLOCK - 1)
+    )
     ux, uy, uz = x - bx * BLOCK, y - by * BLOCK, z - bz * BLOCK
-    tx, ty, tz = (x + (ray.dx >= 0) - ray.px) * ray.ix, (y + (ray.dy >= 0) - ray.py) * ray.iy, (z + (ray.dz >= 0) - ray.pz) * ray.iz
+    tx, ty, tz = (
+        (x + (ray.dx >= 0) - ray.px) * ray.ix,
+        (y + (ray.dy >= 0) - ray.py) * ray.iy,
+        (z + (ray.dz >= 0) - ray.pz) * ray.iz,
+    )
     nearest, incidence = np.inf, 0.0
     while (ux | uy | uz) & ~(BLOCK - 1) == 0:
         voxel = grid.rows[slot, (uz * BLOCK + uy) * BLOCK + ux]
         if voxel >= 0:
-            nearest, incidence = _hit(grid.shapes, ray, voxel, bx * BLOCK + ux, by * BLOCK + uy, bz * BLOCK + uz)
+            nearest, incidence = _hit(
+                grid.shapes, ray, voxel, bx * BLOCK + ux, by * BLOCK + uy, bz * BLOCK + uz
+            )
             if nearest < np.inf:
                 break
         axis = _earliest(tx, ty, tz)
@@ -147,9 +191,21 @@ def _trace(grid, ray):
         return nearest, incidence
     if time >= 0.0:
         side = 2 if ez == time else (1 if ey == time else 0)
-    bx = _locate(0, ray.px, ray.dx, ray.ix, time, side) // BLOCK if side != 0 else (lx if ray.dx > 0 else hx - 1)
-    by = _locate(1, ray.py, ray.dy, ray.iy, time, side) // BLOCK if side != 1 else (ly if ray.dy > 0 else hy - 1)
-    bz = _locate(2, ray.pz, ray.dz, ray.iz, time, side) // BLOCK if side != 2 else (lz if ray.dz > 0 else hz - 1)
+    bx = (
+        _locate(0, ray.px, ray.dx, ray.ix, time, side) // BLOCK
+        if side != 0
+        else (lx if ray.dx > 0 else hx - 1)
+    )
+    by = (
+        _locate(1, ray.py, ray.dy, ray.iy, time, side) // BLOCK
+        if side != 1
+        else (ly if ray.dy > 0 else hy - 1)
+    )
+    bz = (
+        _locate(2, ray.pz, ray.dz, ray.iz, time, side) // BLOCK
+        if side != 2
+        else (lz if ray.dz > 0 else hz - 1)
+    )
     tx = ((bx + (ray.dx >= 0)) * BLOCK - ray.px) * ray.ix
     ty = ((by + (ray.dy >= 0)) * BLOCK - ray.py) * ray.iy
     tz = ((bz + (ray.dz >= 0)) * BLOCK - ray.pz) * ray.iz
@@ -178,12 +234,24 @@ def _trace(grid, ray):
 @numba.njit(cache=True)
 def _ray(start, x, y, z):
     x, y, z = x if abs(x) >= STILL else 0.0, y if abs(y) >= STILL else 0.0, z if abs(z) >= STILL else 0.0
-    return Ray(start[0], start[1], start[2], x, y, z, 1 / x if x != 0 else NEVER, 1 / y if y != 0 else NEVER, 1 / z if z != 0 else NEVER)
+    return Ray(
+        start[0],
+        start[1],
+        start[2],
+        x,
+        y,
+        z,
+        1 / x if x != 0 else NEVER,
+        1 / y if y != 0 else NEVER,
+        1 / z if z != 0 else NEVER,
+    )
 
 
 @numba.njit(parallel=True, cache=True)
 def cast_rays(directions, cam_from_world, start, voxel_size, grid, result):
-    """Fill result (2, K): range in world units and |cosine| of the first hit along directions (K, 3), camera frame; start: (3,) voxels of the grid."""
+    """Fill result (2, K): range in world units and |cosine| of the first hit along directions (K, 3), camera
+    frame; start: (3,) voxels of the grid.
+    """
     for k in numba.prange(len(directions)):
         x, y, z = np.float64(directions[k, 0]), np.float64(directions[k, 1]), np.float64(directions[k, 2])
         result[0, k], result[1, k] = np.inf, 0.0

@@ -49,16 +49,21 @@ def fit_similarity(source: np.ndarray, target: np.ndarray, weights: np.ndarray |
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
 
 
-def fit_similarity_robust(source: np.ndarray, target: np.ndarray, max_error: float) -> tuple[Similarity, np.ndarray]:
+def fit_similarity_robust(
+    source: np.ndarray, target: np.ndarray, max_error: float
+) -> tuple[Similarity, np.ndarray]:
     """Similarity that most of the (N, 3) pairs agree on.
 
-    Starts from the triple whose fit has the smallest median residual, keeps the pairs within `max_error` (units of the target) and refits.
+    Starts from the triple whose fit has the smallest median residual, keeps the pairs within `max_error`
+    (units of the target) and refits.
     returns: the similarity; (N,) bool, the pairs kept. Fewer than three may be left.
     """
     fit, kept = fit_similarity(source, target), None
     if len(source) > 3:
         fits = [fit_similarity(source[triple], target[triple]) for triple in _triples(len(source))]
-        fit = min(fits, key=lambda candidate: np.median(np.linalg.norm(candidate.apply(source) - target, axis=1)))
+        fit = min(
+            fits, key=lambda candidate: np.median(np.linalg.norm(candidate.apply(source) - target, axis=1))
+        )
     for _ in range(10):
         agreed = np.linalg.norm(fit.apply(source) - target, axis=1) <= max_error
         if agreed.sum() < 3 or (kept is not None and (agreed == kept).all()):
@@ -76,7 +81,9 @@ def _triples(count: int) -> list[np.ndarray]:
 
 
 def flight_shape(positions: np.ndarray, sigma: float) -> str:
-    """What positions (N, 3) with standard deviation `sigma` (m) can define: "point" (nothing), "line" (all but the roll about it), "area" (a frame)."""
+    """What positions (N, 3) with standard deviation `sigma` (m) can define: "point" (nothing), "line" (all
+    but the roll about it), "area" (a frame).
+    """
     spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
     if len(positions) < 3 or spread[0] < 3 * sigma:
         return "point"
@@ -84,7 +91,9 @@ def flight_shape(positions: np.ndarray, sigma: float) -> str:
 
 
 def main_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(3, 3) rows: two directions in the main plane of (N, 3) points and its normal, right-handed; (3,) median point on it."""
+    """(3, 3) rows: two directions in the main plane of (N, 3) points and its normal, right-handed; (3,)
+    median point on it.
+    """
     middle = np.median(points, axis=0)
     distance = np.linalg.norm(points - middle, axis=1)
     near = points[distance <= np.quantile(distance, LEVEL_SHARE)]

@@ -1,7 +1,9 @@
 """Focal length where photos alone do not tell it: a flight that looks straight down from one height.
 
-There a longer focal length and a higher flight make the same photos. Self-calibration then returns whatever absorbs the lens' and the shutter's
-small faults: on 18 photos flown at 40 m it was 20 % too long, and with it every height, at a reprojection error 1 % smaller. EXIF is better than that.
+There a longer focal length and a higher flight make the same photos. Self-calibration then returns whatever
+absorbs the lens' and the shutter's
+small faults: on 18 photos flown at 40 m it was 20 % too long, and with it every height, at a reprojection
+error 1 % smaller. EXIF is better than that.
 """
 
 from __future__ import annotations
@@ -28,11 +30,15 @@ EXIF_BLOCK, FOCAL_35MM, EXIF_WIDTH = 0x8769, 0xA405, 0xA002
 def exif_focal(photo: Path) -> float | None:
     """Focal length in px that DJI's XMP or EXIF states; None if neither does.
 
-    The 35 mm equivalent is that of the whole sensor. Photos of 16:9 are crops of 4:3 sensors, whose diagonal is 5/4 of the width.
+    The 35 mm equivalent is that of the whole sensor. Photos of 16:9 are crops of 4:3 sensors, whose diagonal
+    is 5/4 of the width.
     """
     with open_image(photo) as image:
         (width, height), exif = image.size, image.getexif().get_ifd(EXIF_BLOCK)
-    calibrated, original = read_dji_xmp(photo).get("CalibratedFocalLength", 0.0), _number(exif.get(EXIF_WIDTH)) or width
+    calibrated, original = (
+        read_dji_xmp(photo).get("CalibratedFocalLength", 0.0),
+        _number(exif.get(EXIF_WIDTH)) or width,
+    )
     if calibrated > 0:
         return calibrated * max(width, height) / original
     equivalent = _number(exif.get(FOCAL_35MM))
@@ -42,7 +48,9 @@ def exif_focal(photo: Path) -> float | None:
 
 
 def tells_focal(model: pycolmap.Reconstruction) -> bool:
-    """Whether the views of a model differ enough in direction or height for self-calibration of the focal length."""
+    """Whether the views of a model differ enough in direction or height for self-calibration of the focal
+    length.
+    """
     images = [model.image(image_id) for image_id in model.reg_image_ids()]
     axes = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
     mean = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))
@@ -57,17 +65,25 @@ def anchor_focal(model: pycolmap.Reconstruction, photos: Path, flight: Flight | 
     returns: estimated and stated focal length (px) of the first camera; empty if EXIF states none
     """
     first = {}
-    for image in sorted((model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name):
+    for image in sorted(
+        (model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name
+    ):
         first.setdefault(image.camera_id, image.name)
     stated = {camera_id: exif_focal(photos / name) for camera_id, name in first.items()}
     if not stated or any(focal is None for focal in stated.values()):
-        logger.warning("EXIF states no focal length to keep: where all photos look the same way from one height, heights may be wrong by a constant factor")
+        logger.warning(
+            "EXIF states no focal length to keep: where all photos look the same way from one height, heights may be wrong by a constant factor"
+        )
         return {}
     main = model.image(min(model.reg_image_ids(), key=lambda image_id: model.image(image_id).name)).camera_id
     estimated = model.camera(main).mean_focal_length()
     if not tells_focal(model):
-        logger.warning("all photos look the same way from one height, which leaves focal length and height open: EXIF's %.0f px is kept (free it came to %.0f px). "
-                       "Heights are right within a few per cent; oblique photos would do better", stated[main], estimated)
+        logger.warning(
+            "all photos look the same way from one height, which leaves focal length and height open: EXIF's %.0f px is kept (free it came to %.0f px). "
+            "Heights are right within a few per cent; oblique photos would do better",
+            stated[main],
+            estimated,
+        )
     _stretch(model, stated[main] / estimated)
     for camera_id, focal in stated.items():
         camera = model.camera(camera_id)
@@ -79,7 +95,9 @@ def anchor_focal(model: pycolmap.Reconstruction, photos: Path, flight: Flight | 
 
 
 def adjust(model: pycolmap.Reconstruction, flight: Flight | None, refine_focal: bool) -> None:
-    """Bundle adjustment of a whole model, with the flight's GPS as priors where there is any (the model is then moved onto it)."""
+    """Bundle adjustment of a whole model, with the flight's GPS as priors where there is any (the model is
+    then moved onto it).
+    """
     config, options = pycolmap.BundleAdjustmentConfig(), pycolmap.BundleAdjustmentOptions()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
@@ -89,20 +107,31 @@ def adjust(model: pycolmap.Reconstruction, flight: Flight | None, refine_focal: 
         pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     else:
         prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
-        pycolmap.create_pose_prior_bundle_adjuster(options, prior_options, config, pose_priors(model, flight), model).solve()
+        pycolmap.create_pose_prior_bundle_adjuster(
+            options, prior_options, config, pose_priors(model, flight), model
+        ).solve()
     model.update_point_3d_errors()
 
 
 def pose_priors(model: pycolmap.Reconstruction, flight: Flight) -> list[pycolmap.PosePrior]:
     """Priors of the registered photos that have GPS."""
     images = [model.image(image_id) for image_id in model.reg_image_ids()]
-    return [pycolmap.PosePrior(corr_data_id=image.data_id, position=flight.positions[image.name],
-                               position_covariance=np.diag(flight.tags[image.name].sigma ** 2),
-                               coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN) for image in images if image.name in flight.tags]
+    return [
+        pycolmap.PosePrior(
+            corr_data_id=image.data_id,
+            position=flight.positions[image.name],
+            position_covariance=np.diag(flight.tags[image.name].sigma ** 2),
+            coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+        )
+        for image in images
+        if image.name in flight.tags
+    ]
 
 
 def _stretch(model: pycolmap.Reconstruction, factor: float) -> None:
-    """Stretch the points along the common viewing direction, away from the cameras, so that they project as before with a focal length times `factor`."""
+    """Stretch the points along the common viewing direction, away from the cameras, so that they project as
+    before with a focal length times `factor`.
+    """
     images = [model.image(image_id) for image_id in model.reg_image_ids()]
     mean = np.mean([image.cam_from_world().rotation.matrix()[2] for image in images], axis=0)
     mean /= np.linalg.norm(mean)

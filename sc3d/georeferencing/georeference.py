@@ -1,11 +1,15 @@
-"""Where a scene lies on Earth: `georeference.json`, and world coordinates to a projected CRS and back, point by point.
+"""Where a scene lies on Earth: `georeference.json`, and world coordinates to a projected CRS and back, point
+by point.
 
 The world of a georeferenced scene is one of two things:
-- local ENU: metres east, north and up of `origin` on the plane that touches the WGS 84 ellipsoid there. This is not a map projection: a UTM grid
-  turns against it (convergence) and stretches it (scale, curvature), so every point goes through geocentric coordinates;
+- local ENU: metres east, north and up of `origin` on the plane that touches the WGS 84 ellipsoid there. This
+    is not a map projection: a UTM grid
+  turns against it (convergence) and stretches it (scale, curvature), so every point goes through geocentric
+  coordinates;
 - the CRS itself minus `offset`, as COLMAP models of other tools in large coordinates are.
 `local_from_world` is a similarity in front of either, for scenes whose world is neither.
-Heights pass through unchanged (ellipsoidal as the GPS gives them; drones often give others, hence `altitude_offset`).
+Heights pass through unchanged (ellipsoidal as the GPS gives them; drones often give others, hence
+`altitude_offset`).
 """
 
 from __future__ import annotations
@@ -38,8 +42,10 @@ class Georeference:
     """How the world of a scene lies in a projected CRS.
 
     epsg: code of a projected CRS; its axes are used in the order easting, northing
-    offset: (3,) easting, northing, height near the scene, in units of the CRS: subtract it before float32 work. Without `origin`: world = CRS - offset
-    origin: latitude, longitude (degrees) and ellipsoidal height (m) of the local ENU frame, WGS 84; None = the world is the CRS minus `offset`
+    offset: (3,) easting, northing, height near the scene, in units of the CRS: subtract it before float32
+        work. Without `origin`: world = CRS - offset
+    origin: latitude, longitude (degrees) and ellipsoidal height (m) of the local ENU frame, WGS 84; None =
+        the world is the CRS minus `offset`
     local_from_world: (4, 4) similarity from the world to ENU (or to the CRS minus offset)
     altitude_offset: added to all heights on the way to the CRS, m
     figures: residuals of the alignment, for reports
@@ -96,10 +102,14 @@ class Georeference:
     def _project(self, enu: np.ndarray) -> np.ndarray:
         latitude, longitude, height = enu_to_geodetic(enu, self.origin).T
         easting, northing = self._crs_from_geodetic.transform(longitude, latitude)
-        return _require_finite(np.stack([easting, northing, (height + self.altitude_offset) / self.unit], axis=1), self.epsg)
+        return _require_finite(
+            np.stack([easting, northing, (height + self.altitude_offset) / self.unit], axis=1), self.epsg
+        )
 
     def _unproject(self, points: np.ndarray) -> np.ndarray:
-        longitude, latitude = self._crs_from_geodetic.transform(points[:, 0], points[:, 1], direction="INVERSE")
+        longitude, latitude = self._crs_from_geodetic.transform(
+            points[:, 0], points[:, 1], direction="INVERSE"
+        )
         geodetic = np.stack([latitude, longitude, points[:, 2] * self.unit - self.altitude_offset], axis=1)
         return geodetic_to_enu(_require_finite(geodetic, self.epsg), self.origin)
 
@@ -108,15 +118,31 @@ class Georeference:
         return _transformer("EPSG:4326", self.crs)
 
 
-def from_origin(origin: tuple[float, float, float], epsg: int | None = None, altitude_offset: float = 0.0, figures: dict | None = None) -> Georeference:
-    """Georeference of a world in local ENU at `origin` (latitude, longitude, height); `epsg` None = the UTM zone there (WGS 84)."""
+def from_origin(
+    origin: tuple[float, float, float],
+    epsg: int | None = None,
+    altitude_offset: float = 0.0,
+    figures: dict | None = None,
+) -> Georeference:
+    """Georeference of a world in local ENU at `origin` (latitude, longitude, height); `epsg` None = the UTM
+    zone there (WGS 84).
+    """
     origin = tuple(float(value) for value in origin)
     zone = epsg or utm_epsg(origin[0], origin[1])
-    here = Georeference(zone, (0.0, 0.0, 0.0), origin, altitude_offset=altitude_offset).to_crs(np.zeros((1, 3)))[0]
+    here = Georeference(zone, (0.0, 0.0, 0.0), origin, altitude_offset=altitude_offset).to_crs(
+        np.zeros((1, 3))
+    )[0]
     offset = tuple(float(value) for value in np.round(here))
     area = projected_crs(zone).area_of_use
-    if area is not None and not (area.south <= origin[0] <= area.north and area.west <= origin[1] <= area.east):
-        logger.warning("EPSG:%d is made for %s: the scene at latitude %.4f, longitude %.4f lies outside", zone, area.name, *origin[:2])
+    if area is not None and not (
+        area.south <= origin[0] <= area.north and area.west <= origin[1] <= area.east
+    ):
+        logger.warning(
+            "EPSG:%d is made for %s: the scene at latitude %.4f, longitude %.4f lies outside",
+            zone,
+            area.name,
+            *origin[:2],
+        )
     return Georeference(zone, offset, origin, altitude_offset=altitude_offset, figures=figures or {})
 
 
@@ -139,14 +165,21 @@ def read_georeference(scene: Scene) -> Georeference | None:
             if known.get(name) is not None:
                 known[name] = _numbers(known[name], (3,))
         if "local_from_world" in known:
-            known["local_from_world"] = tuple(tuple(row) for row in np.reshape(_numbers(known["local_from_world"], (4, 4)), (4, 4)).tolist())
-        georeference = Georeference(**known | {"epsg": int(known["epsg"]), "altitude_offset": float(known.get("altitude_offset", 0.0))})
+            known["local_from_world"] = tuple(
+                tuple(row) for row in np.reshape(_numbers(known["local_from_world"], (4, 4)), (4, 4)).tolist()
+            )
+        georeference = Georeference(
+            **known
+            | {"epsg": int(known["epsg"]), "altitude_offset": float(known.get("altitude_offset", 0.0))}
+        )
         if not np.linalg.det(np.asarray(georeference.local_from_world)[:3, :3]) > 0:
             raise ValueError("local_from_world is not a similarity")
         if georeference.origin is not None and (np.abs(georeference.origin) > LARGEST).any():
             raise ValueError("origin is not latitude, longitude and height")
     except (TypeError, ValueError, KeyError, OverflowError) as error:
-        raise InputError(f'{path} cannot be used ({error!r}): {{"epsg": 32615, "offset": [e, n, h]}} is the least it holds') from None
+        raise InputError(
+            f'{path} cannot be used ({error!r}): {{"epsg": 32615, "offset": [e, n, h]}} is the least it holds'
+        ) from None
     projected_crs(georeference.epsg)
     return georeference
 
@@ -166,9 +199,13 @@ def projected_crs(epsg: int) -> pyproj.CRS:
     try:
         crs = pyproj.CRS.from_epsg(epsg)
     except pyproj.exceptions.CRSError:
-        raise InputError(f"EPSG:{epsg} is unknown: give the code of a projected CRS, such as 32615 for WGS 84 / UTM zone 15N") from None
+        raise InputError(
+            f"EPSG:{epsg} is unknown: give the code of a projected CRS, such as 32615 for WGS 84 / UTM zone 15N"
+        ) from None
     if not crs.is_projected:
-        raise InputError(f"EPSG:{epsg} ({crs.name}) is not a projected CRS: choose one with eastings and northings, such as a UTM zone")
+        raise InputError(
+            f"EPSG:{epsg} ({crs.name}) is not a projected CRS: choose one with eastings and northings, such as a UTM zone"
+        )
     return crs
 
 
@@ -179,12 +216,16 @@ def utm_epsg(latitude: float, longitude: float) -> int:
 
     found = query_utm_crs_info("WGS 84", AreaOfInterest(longitude, latitude, longitude, latitude))
     if not found:
-        raise InputError(f"no UTM zone at latitude {latitude}, longitude {longitude}: choose a projected CRS with --epsg")
+        raise InputError(
+            f"no UTM zone at latitude {latitude}, longitude {longitude}: choose a projected CRS with --epsg"
+        )
     return int(found[0].code)
 
 
 def enu_to_geodetic(enu: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
-    """(N, 3) metres east, north, up of `origin` to (N, 3) latitude, longitude (degrees), ellipsoidal height (m), WGS 84."""
+    """(N, 3) metres east, north, up of `origin` to (N, 3) latitude, longitude (degrees), ellipsoidal height
+    (m), WGS 84.
+    """
     longitude, latitude, height = _topocentric(origin).transform(*np.asarray(enu, np.float64).T)
     return np.stack([latitude, longitude, height], axis=1)
 
@@ -196,10 +237,14 @@ def geodetic_to_enu(geodetic: np.ndarray, origin: tuple[float, float, float]) ->
 
 
 def crs_to_geodetic(points: np.ndarray, crs: pyproj.CRS) -> np.ndarray:
-    """(N, 3) easting, northing, height (unit of the CRS), or longitude, latitude, height of a geographic CRS, to latitude, longitude, height (m)."""
+    """(N, 3) easting, northing, height (unit of the CRS), or longitude, latitude, height of a geographic CRS,
+    to latitude, longitude, height (m).
+    """
     points = np.asarray(points, np.float64)
     unit = crs.axis_info[0].unit_conversion_factor if crs.is_projected else 1.0
-    longitude, latitude = _transformer("EPSG:4326", crs).transform(points[:, 0], points[:, 1], direction="INVERSE")
+    longitude, latitude = _transformer("EPSG:4326", crs).transform(
+        points[:, 0], points[:, 1], direction="INVERSE"
+    )
     return np.stack([latitude, longitude, points[:, 2] * unit], axis=1)
 
 
@@ -232,5 +277,7 @@ def _numbers(values: object, shape: tuple[int, ...]) -> tuple[float, ...]:
 
 def _require_finite(points: np.ndarray, epsg: int) -> np.ndarray:
     if not np.isfinite(points).all():
-        raise InputError(f"the scene lies outside the area of EPSG:{epsg}: choose the CRS of the place with --epsg")
+        raise InputError(
+            f"the scene lies outside the area of EPSG:{epsg}: choose the CRS of the place with --epsg"
+        )
     return points

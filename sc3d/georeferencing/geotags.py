@@ -12,10 +12,20 @@ import numpy as np
 from sc3d.georeferencing.georeference import geodetic_to_enu
 from sc3d.io.images import open_image
 
-STANDARD_DEVIATION = (1.0, 1.0, 1.0)  # m, of GPS that states none: what positions of one flight are worth against one another
-SMALLEST_DEVIATION = 0.05  # m; RTK states the antenna's, but shutter and antenna are neither at one time nor in one place
+# m, of GPS that states none: what positions of one flight are worth against one another
+STANDARD_DEVIATION = (1.0, 1.0, 1.0)
+# m; RTK states the antenna's, but shutter and antenna are neither at one time nor in one place
+SMALLEST_DEVIATION = 0.05
 HEAD = 1 << 20  # bytes of a photo that are searched for XMP
-LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE, HORIZONTAL_ERROR = 1, 2, 3, 4, 5, 6, 31
+LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE, HORIZONTAL_ERROR = (
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    31,
+)
 GPS_BLOCK = 0x8825
 
 
@@ -37,7 +47,9 @@ class Geotag:
     @property
     def sigma(self) -> np.ndarray:
         """(3,) standard deviations to compute with, m."""
-        return np.maximum(STANDARD_DEVIATION if self.deviation is None else self.deviation, SMALLEST_DEVIATION)
+        return np.maximum(
+            STANDARD_DEVIATION if self.deviation is None else self.deviation, SMALLEST_DEVIATION
+        )
 
 
 def read_geotags(folder: Path, names: list[str]) -> dict[str, Geotag]:
@@ -47,18 +59,36 @@ def read_geotags(folder: Path, names: list[str]) -> dict[str, Geotag]:
 
 
 def read_geotag(photo: Path) -> Geotag | None:
-    """The geotag of a photo; None without a usable latitude, longitude and altitude. InputError if the file is not an image."""
+    """The geotag of a photo; None without a usable latitude, longitude and altitude. InputError if the file
+    is not an image.
+    """
     with open_image(photo) as image:
         exif = image.getexif().get_ifd(GPS_BLOCK)
     xmp = read_dji_xmp(photo)
     latitude = _angle(exif.get(LATITUDE), exif.get(LATITUDE_REF), "S")
     longitude = _angle(exif.get(LONGITUDE), exif.get(LONGITUDE_REF), "W")
     altitude = _number(exif.get(ALTITUDE))
-    altitude = xmp.get("AbsoluteAltitude", math.nan) if math.isnan(altitude) else -altitude if exif.get(ALTITUDE_REF) in (1, b"\x01") else altitude
+    altitude = (
+        xmp.get("AbsoluteAltitude", math.nan)
+        if math.isnan(altitude)
+        else -altitude
+        if exif.get(ALTITUDE_REF) in (1, b"\x01")
+        else altitude
+    )
     geodetic = (latitude, longitude, altitude)
-    if not all(math.isfinite(value) for value in geodetic) or abs(latitude) > 90 or abs(longitude) > 180 or latitude == longitude == 0:
+    if (
+        not all(math.isfinite(value) for value in geodetic)
+        or abs(latitude) > 90
+        or abs(longitude) > 180
+        or latitude == longitude == 0
+    ):
         return None
-    return Geotag(geodetic, _deviation(xmp, _number(exif.get(HORIZONTAL_ERROR))), xmp.get("RelativeAltitude"), xmp.get("RtkFlag", 0) >= 16)
+    return Geotag(
+        geodetic,
+        _deviation(xmp, _number(exif.get(HORIZONTAL_ERROR))),
+        xmp.get("RelativeAltitude"),
+        xmp.get("RtkFlag", 0) >= 16,
+    )
 
 
 def read_dji_xmp(photo: Path) -> dict[str, float]:
@@ -67,13 +97,17 @@ def read_dji_xmp(photo: Path) -> dict[str, float]:
         head = file.read(HEAD)
     start = head.find(b"<x:xmpmeta")
     text = head[start : head.find(b"</x:xmpmeta>", start)].decode("utf-8", "replace") if start >= 0 else ""
-    pairs = re.findall(r"drone-dji:(\w+)\s*=\s*[\"']([^\"']*)[\"']", text) + re.findall(r"<drone-dji:(\w+)>([^<]*)</drone-dji:\w+>", text)
+    pairs = re.findall(r"drone-dji:(\w+)\s*=\s*[\"']([^\"']*)[\"']", text) + re.findall(
+        r"<drone-dji:(\w+)>([^<]*)</drone-dji:\w+>", text
+    )
     numbers = {name: _number(value) for name, value in pairs}
     return {name: value for name, value in numbers.items() if math.isfinite(value)}
 
 
 def enu_positions(tags: dict[str, Geotag], origin: tuple[float, float, float]) -> np.ndarray:
-    """(N, 3) positions of the tags, in their order, m east, north, up of `origin` (latitude, longitude, height)."""
+    """(N, 3) positions of the tags, in their order, m east, north, up of `origin` (latitude, longitude,
+    height).
+    """
     return geodetic_to_enu(np.array([tag.geodetic for tag in tags.values()]).reshape(-1, 3), origin)
 
 

@@ -28,9 +28,11 @@ from sc3d.georeferencing.geotags import Geotag, enu_positions, read_geotags
 logger = logging.getLogger(__name__)
 
 MIN_GPS = 3  # a similarity needs three positions
-OUTLIER = 5.0  # standard deviations, and not less than OUTLIER_METRES: a position this far off takes no part in the fit
+# standard deviations, and not less than OUTLIER_METRES: a position this far off takes no part in the fit
+OUTLIER = 5.0
 OUTLIER_METRES = 10.0
-SAME_SCALE, SAME_ANGLE = 1e-3, 1e-3  # relative, radians: a model within these of ENU is ENU, its rest is the noise of GPS
+# relative, radians: a model within these of ENU is ENU, its rest is the noise of GPS
+SAME_SCALE, SAME_ANGLE = 1e-3, 1e-3
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,8 @@ class Flight:
 
     tags: by photo name, in the order of the names
     shape: "line" (the roll about it stays open) or "area"
-    origin: latitude, longitude (degrees), altitude (m) of the local ENU frame; that of the first photo as a rule
+    origin: latitude, longitude (degrees), altitude (m) of the local ENU frame; that of the first photo as a
+        rule
     """
 
     tags: dict[str, Geotag]
@@ -56,20 +59,26 @@ def read_flight(folder: Path, names: list[str]) -> Flight | None:
     """GPS of the photos (names relative to `folder`); None, with a warning, where it can place no model."""
     tags = read_geotags(folder, names)
     if len(tags) < MIN_GPS:
-        logger.warning("%s: the model gets no scale, no north and no position", f"only {len(tags)} of {len(names)} photos have GPS" if tags else
-                       "no photo has GPS")
+        logger.warning(
+            "%s: the model gets no scale, no north and no position",
+            f"only {len(tags)} of {len(names)} photos have GPS" if tags else "no photo has GPS",
+        )
         return None
     sigma = np.median([tag.sigma for tag in tags.values()], axis=0)
     origin = next(iter(tags.values())).geodetic
     positions = enu_positions(tags, origin)
     shape = flight_shape(positions, float(sigma[:2].mean()))
     if shape == "point":
-        logger.warning("all GPS positions lie within %.1f m of one another, no more than they err: they give no scale, and none is used",
-                       float(np.linalg.norm(np.ptp(positions, axis=0))))
+        logger.warning(
+            "all GPS positions lie within %.1f m of one another, no more than they err: they give no scale, and none is used",
+            float(np.linalg.norm(np.ptp(positions, axis=0))),
+        )
         return None
     if shape == "line":
-        logger.warning("all photos with GPS lie on one line: GPS leaves the tilt about it open, the main plane of the points is taken for level. "
-                       "A second strip beside the first, or ground control points (--gcp), would fix it")
+        logger.warning(
+            "all photos with GPS lie on one line: GPS leaves the tilt about it open, the main plane of the points is taken for level. "
+            "A second strip beside the first, or ground control points (--gcp), would fix it"
+        )
     if len(tags) < len(names):
         logger.warning("%d of %d photos have GPS; the others follow", len(tags), len(names))
     return Flight(tags, shape, origin)
@@ -78,19 +87,27 @@ def read_flight(folder: Path, names: list[str]) -> Flight | None:
 def place(flight: Flight, centres: dict[str, np.ndarray], points: np.ndarray) -> Similarity | None:
     """Similarity from a model's frame to the flight's ENU.
 
-    centres: camera centre (3,) by photo name, photos without GPS included; points: (P, 3) of the model, for the level of a flight along a line
+    centres: camera centre (3,) by photo name, photos without GPS included; points: (P, 3) of the model, for
+        the level of a flight along a line
     returns: None if fewer than three cameras have GPS or fit it
     """
     names = [name for name in flight.tags if name in centres]
     if len(names) < MIN_GPS:
         return None
-    source, target = np.array([centres[name] for name in names]), np.array([flight.positions[name] for name in names])
+    source, target = (
+        np.array([centres[name] for name in names]),
+        np.array([flight.positions[name] for name in names]),
+    )
     sigma = np.median([flight.tags[name].sigma for name in names])
     fit, kept = fit_similarity_robust(source, target, max(OUTLIER * sigma, OUTLIER_METRES))
     if kept.sum() < MIN_GPS:
         return None
     if not kept.all():
-        logger.warning("GPS of %d photos is wrong and left out of the alignment: %s", (~kept).sum(), ", ".join(np.array(names)[~kept]))
+        logger.warning(
+            "GPS of %d photos is wrong and left out of the alignment: %s",
+            (~kept).sum(),
+            ", ".join(np.array(names)[~kept]),
+        )
     return _rolled(fit, target[kept], points) if flight.shape == "line" else fit
 
 
@@ -104,19 +121,31 @@ def _rolled(fit: Similarity, positions: np.ndarray, points: np.ndarray) -> Simil
 
 
 def residuals(flight: Flight, centres: dict[str, np.ndarray]) -> dict[str, float]:
-    """How far camera centres (ENU) lie from their GPS: root mean squares in m, and the count; empty without any."""
-    offsets = np.array([centres[name] - flight.positions[name] for name in flight.tags if name in centres]).reshape(-1, 3)
+    """How far camera centres (ENU) lie from their GPS: root mean squares in m, and the count; empty without
+    any.
+    """
+    offsets = np.array(
+        [centres[name] - flight.positions[name] for name in flight.tags if name in centres]
+    ).reshape(-1, 3)
     if not len(offsets):
         return {}
     squares = (offsets**2).mean(axis=0)
-    return {"photos": len(offsets), "rms": _metres(np.sqrt(squares.sum())), "rms_horizontal": _metres(np.sqrt(squares[:2].sum())),
-            "rms_vertical": _metres(np.sqrt(squares[2])), "rtk_photos": sum(tag.rtk for tag in flight.tags.values())}
+    return {
+        "photos": len(offsets),
+        "rms": _metres(np.sqrt(squares.sum())),
+        "rms_horizontal": _metres(np.sqrt(squares[:2].sum())),
+        "rms_vertical": _metres(np.sqrt(squares[2])),
+        "rtk_photos": sum(tag.rtk for tag in flight.tags.values()),
+    }
 
 
-def find_georeference(flight: Flight, centres: dict[str, np.ndarray], points: np.ndarray, epsg: int | None) -> Georeference | None:
+def find_georeference(
+    flight: Flight, centres: dict[str, np.ndarray], points: np.ndarray, epsg: int | None
+) -> Georeference | None:
     """Georeference of a model whose photos have GPS, whatever frame it is in; the model stays as it is.
 
-    A model in local ENU (as `reconstruct` makes it) or in a CRS is recognised; any other gets a similarity in front. None if GPS and cameras do not fit.
+    A model in local ENU (as `reconstruct` makes it) or in a CRS is recognised; any other gets a similarity in
+    front. None if GPS and cameras do not fit.
     """
     crs = _in_crs(flight, centres, epsg)
     if crs is not None:
@@ -125,14 +154,28 @@ def find_georeference(flight: Flight, centres: dict[str, np.ndarray], points: np
     if fit is None:
         return None
     if abs(fit.scale - 1) < SAME_SCALE and fit.angle < SAME_ANGLE:
-        origin = tuple(float(value) for value in enu_to_geodetic(fit.apply(np.zeros((1, 3))), flight.origin)[0])
+        origin = tuple(
+            float(value) for value in enu_to_geodetic(fit.apply(np.zeros((1, 3))), flight.origin)[0]
+        )
         return from_origin(origin, epsg, figures={"gps": residuals(replace(flight, origin=origin), centres)})
-    found = from_origin(flight.origin, epsg, figures={"gps": residuals(flight, dict(zip(centres, fit.apply(np.array(list(centres.values()))))))})
-    return Georeference(found.epsg, found.offset, found.origin, tuple(tuple(row) for row in fit.matrix.tolist()), figures=found.figures)
+    found = from_origin(
+        flight.origin,
+        epsg,
+        figures={"gps": residuals(flight, dict(zip(centres, fit.apply(np.array(list(centres.values()))))))},
+    )
+    return Georeference(
+        found.epsg,
+        found.offset,
+        found.origin,
+        tuple(tuple(row) for row in fit.matrix.tolist()),
+        figures=found.figures,
+    )
 
 
 def _in_crs(flight: Flight, centres: dict[str, np.ndarray], epsg: int | None) -> Georeference | None:
-    """The georeference of a model whose world is a CRS (`epsg`, or the UTM zone), within what GPS may err; None for any other."""
+    """The georeference of a model whose world is a CRS (`epsg`, or the UTM zone), within what GPS may err;
+    None for any other.
+    """
     georeference = Georeference(epsg or utm_epsg(*flight.origin[:2]), (0.0, 0.0, 0.0))
     names = [name for name in flight.tags if name in centres]
     found = crs_to_geodetic(np.array([centres[name] for name in names]), georeference.crs)

@@ -1,4 +1,6 @@
-"""From the frame of a cloud or model to that of the scene: large coordinates, a CRS of its own, or the world already."""
+"""From the frame of a cloud or model to that of the scene: large coordinates, a CRS of its own, or the world
+already.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +21,26 @@ FAR = 20.0  # times the extent of the cameras: a cloud farther away than this is
 
 
 def near_origin(project: Project, epsg: int | None) -> Project:
-    """A project with large coordinates moved near the origin, world = CRS - offset; any other unchanged. `epsg`: the CRS of the coordinates."""
+    """A project with large coordinates moved near the origin, world = CRS - offset; any other unchanged.
+    `epsg`: the CRS of the coordinates.
+    """
     centres = np.array([view.centre for view in project.views])
     if project.georeference is not None or np.abs(np.median(centres, axis=0)).max() < LARGE:
         return project
     if epsg is None:
-        logger.warning("the cameras have coordinates of a CRS, but nothing says which: pass --epsg to make use of it")
+        logger.warning(
+            "the cameras have coordinates of a CRS, but nothing says which: pass --epsg to make use of it"
+        )
         return project
     projected_crs(epsg)
     offset = whole_offset(centres)
-    return replace(project, views=[view.shifted(offset) for view in project.views], points=project.points - offset,
-                   georeference=Georeference(epsg, tuple(offset.tolist())), offset=offset)
+    return replace(
+        project,
+        views=[view.shifted(offset) for view in project.views],
+        points=project.points - offset,
+        georeference=Georeference(epsg, tuple(offset.tolist())),
+        offset=offset,
+    )
 
 
 def whole_offset(points: np.ndarray) -> np.ndarray:
@@ -37,14 +48,19 @@ def whole_offset(points: np.ndarray) -> np.ndarray:
     return np.round(np.median(points, axis=0)) * [1.0, 1.0, 0.0]
 
 
-def to_world(positions: np.ndarray, epsg: int | None, georeference: Georeference | None, views: list[View], name: str) -> tuple[np.ndarray, str]:
+def to_world(
+    positions: np.ndarray, epsg: int | None, georeference: Georeference | None, views: list[View], name: str
+) -> tuple[np.ndarray, str]:
     """Positions of a cloud in the world of a scene, and what they were taken for: "world" or "EPSG:...".
 
-    epsg: CRS of the positions as its file or the user says; None = not stated: the world, unless only the scene's CRS brings it to the cameras
+    epsg: CRS of the positions as its file or the user says; None = not stated: the world, unless only the
+        scene's CRS brings it to the cameras
     """
     if epsg is not None:
         if georeference is None:
-            raise InputError(f"{name} is in EPSG:{epsg}, but nothing says where the scene's cameras are: run `sc3d georeference` on the scene first")
+            raise InputError(
+                f"{name} is in EPSG:{epsg}, but nothing says where the scene's cameras are: run `sc3d georeference` on the scene first"
+            )
         return georeference.from_crs(_reproject(positions, epsg, georeference)), f"EPSG:{epsg}"
     centres = np.array([view.centre for view in views]).reshape(-1, 3)
     if georeference is not None and len(centres) and _far(positions, centres):
@@ -52,7 +68,10 @@ def to_world(positions: np.ndarray, epsg: int | None, georeference: Georeference
         if not _far(moved, centres):
             return moved, f"EPSG:{georeference.epsg}"
     if len(centres) and _far(positions, centres):
-        logger.warning("%s lies far from the cameras: it seems to be in another frame (--epsg says which CRS it is in)", name)
+        logger.warning(
+            "%s lies far from the cameras: it seems to be in another frame (--epsg says which CRS it is in)",
+            name,
+        )
     return positions, "world"
 
 
@@ -63,10 +82,15 @@ def _reproject(positions: np.ndarray, epsg: int, georeference: Georeference) -> 
     import pyproj
 
     source = projected_crs(epsg)
-    east, north = pyproj.Transformer.from_crs(source, georeference.crs, always_xy=True).transform(positions[:, 0], positions[:, 1])
+    east, north = pyproj.Transformer.from_crs(source, georeference.crs, always_xy=True).transform(
+        positions[:, 0], positions[:, 1]
+    )
     if not np.isfinite([east, north]).all():
         raise InputError(f"positions outside the area of EPSG:{epsg}: it is another CRS")
-    return np.stack([east, north, positions[:, 2] * source.axis_info[0].unit_conversion_factor / georeference.unit], axis=1)
+    return np.stack(
+        [east, north, positions[:, 2] * source.axis_info[0].unit_conversion_factor / georeference.unit],
+        axis=1,
+    )
 
 
 def _far(positions: np.ndarray, centres: np.ndarray) -> bool:

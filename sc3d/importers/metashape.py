@@ -1,8 +1,10 @@
 """Agisoft Metashape and PhotoScan: cameras exported as XML (File > Export > Export Cameras > Agisoft XML).
 
-A camera's `transform` is chunk from camera, axes as in COLMAP; the transform of its component (or of the chunk) is a similarity from there to
+A camera's `transform` is chunk from camera, axes as in COLMAP; the transform of its component (or of the
+chunk) is a similarity from there to
 geocentric coordinates, or to local ones without a CRS. Distortion (manual, appendix "Camera models"):
-    x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 xy        u = w/2 + cx + x' f + x' b1 + y' b2
+    x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 xy        u = w/2 + cx + x' f + x' b1 +
+    y' b2
     y' = y (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p2 (r2 + 2 y2) + 2 p1 xy        v = h/2 + cy + y' f
 so p1 and p2 are OpenCV's p2 and p1. A fisheye has the angle from the axis in place of the radius.
 """
@@ -28,7 +30,15 @@ logger = logging.getLogger(__name__)
 
 EXPECTED = "an XML file of File > Export > Export Cameras > Agisoft XML is expected"
 FISHEYE = ("fisheye", "equidistant_fisheye")
-PARAMETERS = {"f", "fx", "fy", "cx", "cy", "skew", *(f"{letter}{number}" for letter in "kpb" for number in "1234")}
+PARAMETERS = {
+    "f",
+    "fx",
+    "fy",
+    "cx",
+    "cy",
+    "skew",
+    *(f"{letter}{number}" for letter in "kpb" for number in "1234"),
+}
 GEOCENTRIC = 1e6  # m: nearer to its centre than this nothing is on Earth
 
 
@@ -53,16 +63,36 @@ def files(path: Path) -> list[Path]:
 
 def read(path: Path, settings: Import) -> Project:
     chunk = _chunk(path)
-    cameras = {sensor.get("id"): to_camera(_lens(sensor, path), settings.tolerance, f"{path}, sensor {sensor.get('label')!r}")
-               for sensor in chunk.iterfind("./sensors/sensor") if _calibration(sensor) is not None}
-    enabled = [camera for camera in chunk.iterfind("./cameras//camera") if camera.get("enabled", "true") not in ("0", "false")]
-    placed = [camera for camera in enabled if camera.find("transform") is not None and camera.get("sensor_id") in cameras]
+    cameras = {
+        sensor.get("id"): to_camera(
+            _lens(sensor, path), settings.tolerance, f"{path}, sensor {sensor.get('label')!r}"
+        )
+        for sensor in chunk.iterfind("./sensors/sensor")
+        if _calibration(sensor) is not None
+    }
+    enabled = [
+        camera
+        for camera in chunk.iterfind("./cameras//camera")
+        if camera.get("enabled", "true") not in ("0", "false")
+    ]
+    placed = [
+        camera
+        for camera in enabled
+        if camera.find("transform") is not None and camera.get("sensor_id") in cameras
+    ]
     transforms = _transforms(chunk, placed, path)
     kept = [camera for camera in placed if camera.get("component_id") in transforms]
     if len(kept) < len(placed):
-        logger.warning("%s: %d photos of other components are left out, as nothing says how these lie to one another", path, len(placed) - len(kept))
+        logger.warning(
+            "%s: %d photos of other components are left out, as nothing says how these lie to one another",
+            path,
+            len(placed) - len(kept),
+        )
     poses = [_pose(camera, transforms[camera.get("component_id")], path) for camera in kept]
-    views = [View(camera.get("label", ""), cameras[camera.get("sensor_id")], pose) for camera, pose in zip(kept, poses)]
+    views = [
+        View(camera.get("label", ""), cameras[camera.get("sensor_id")], pose)
+        for camera, pose in zip(kept, poses)
+    ]
     moved, georeference = _to_local(views, chunk, path)
     return Project("metashape", moved, georeference=georeference, notes={"chunk": chunk.get("label", "")})
 
@@ -82,14 +112,19 @@ def _chunk(path: Path) -> ElementTree.Element:
 
 def _calibration(sensor: ElementTree.Element) -> ElementTree.Element | None:
     found = sensor.findall("calibration")
-    return next((calibration for calibration in found if calibration.get("class") == "adjusted"), found[-1] if found else None)
+    return next(
+        (calibration for calibration in found if calibration.get("class") == "adjusted"),
+        found[-1] if found else None,
+    )
 
 
 def _lens(sensor: ElementTree.Element, path: Path) -> Lens:
     where, calibration = f"{path}, sensor {sensor.get('label')!r}", _calibration(sensor)
     kind = calibration.get("type") or sensor.get("type", "frame")
     if kind != "frame" and kind not in FISHEYE:
-        raise InputError(f"{where}: {kind} sensors have no COLMAP model: only frame and fisheye (equidistant) have")
+        raise InputError(
+            f"{where}: {kind} sensors have no COLMAP model: only frame and fisheye (equidistant) have"
+        )
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     try:
@@ -99,18 +134,44 @@ def _lens(sensor: ElementTree.Element, path: Path) -> Lens:
     except (AttributeError, TypeError, ValueError, KeyError):
         raise InputError(f"{where}: its calibration lacks size or focal length") from None
     if values.get("p3", 0) or values.get("p4", 0):
-        raise InputError(f"{where}: p3 and p4 have no COLMAP model: optimise the cameras without them, or export undistorted photos")
+        raise InputError(
+            f"{where}: p3 and p4 have no COLMAP model: optimise the cameras without them, or export undistorted photos"
+        )
     stretch = values["fx"] - focal if "fx" in values else values.get("b1", 0)
-    principal = (values.get("cx", 0) + width / 2, values.get("cy", 0) + height / 2) if "f" in values else (values["cx"], values["cy"])  # PhotoScan 1.0: absolute
-    return Lens(width, height, (focal + stretch, focal), principal, tuple(values.get(f"k{n}", 0.0) for n in "1234"),
-                (values.get("p2", 0.0), values.get("p1", 0.0)), kind in FISHEYE, values.get("b2", values.get("skew", 0.0)))
+    # PhotoScan 1.0: absolute
+    principal = (
+        (values.get("cx", 0) + width / 2, values.get("cy", 0) + height / 2)
+        if "f" in values
+        else (values["cx"], values["cy"])
+    )
+    return Lens(
+        width,
+        height,
+        (focal + stretch, focal),
+        principal,
+        tuple(values.get(f"k{n}", 0.0) for n in "1234"),
+        (values.get("p2", 0.0), values.get("p1", 0.0)),
+        kind in FISHEYE,
+        values.get("b2", values.get("skew", 0.0)),
+    )
 
 
-def _transforms(chunk: ElementTree.Element, cameras: list[ElementTree.Element], path: Path) -> dict[str | None, Similarity]:
-    """Similarity to the world by component id, for all components that share a frame: those with a transform, or else the largest one alone."""
+def _transforms(
+    chunk: ElementTree.Element, cameras: list[ElementTree.Element], path: Path
+) -> dict[str | None, Similarity]:
+    """Similarity to the world by component id, for all components that share a frame: those with a transform,
+    or else the largest one alone.
+    """
     ids = [camera.get("component_id") for camera in cameras]
-    components = {component.get("id"): component.find("transform") for component in chunk.iterfind("./components/component")}
-    own = {key: _similarity(components[key], path) for key in dict.fromkeys(ids) if components.get(key) is not None}
+    components = {
+        component.get("id"): component.find("transform")
+        for component in chunk.iterfind("./components/component")
+    }
+    own = {
+        key: _similarity(components[key], path)
+        for key in dict.fromkeys(ids)
+        if components.get(key) is not None
+    }
     if own:
         return own
     whole, biggest = chunk.find("transform"), max(dict.fromkeys(ids), key=ids.count, default=None)
@@ -118,12 +179,21 @@ def _transforms(chunk: ElementTree.Element, cameras: list[ElementTree.Element], 
 
 
 def _similarity(transform: ElementTree.Element, path: Path) -> Similarity:
-    if transform.find("rotation") is None and transform.text and transform.text.strip():  # a 4x4 matrix, as PhotoScan 1.0 writes it
+    # a 4x4 matrix, as PhotoScan 1.0 writes it
+    if transform.find("rotation") is None and transform.text and transform.text.strip():
         matrix = _numbers(transform, 16, path).reshape(4, 4)
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
         return Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
-    rotation = np.eye(3) if transform.find("rotation") is None else _numbers(transform.find("rotation"), 9, path).reshape(3, 3)
-    translation = np.zeros(3) if transform.find("translation") is None else _numbers(transform.find("translation"), 3, path)
+    rotation = (
+        np.eye(3)
+        if transform.find("rotation") is None
+        else _numbers(transform.find("rotation"), 9, path).reshape(3, 3)
+    )
+    translation = (
+        np.zeros(3)
+        if transform.find("translation") is None
+        else _numbers(transform.find("translation"), 3, path)
+    )
     scale = 1.0 if transform.find("scale") is None else float(_numbers(transform.find("scale"), 1, path)[0])
     return Similarity(scale, rotation, translation)
 
@@ -132,7 +202,11 @@ def _pose(camera: ElementTree.Element, world_from_chunk: Similarity, path: Path)
     """(4, 4) cam_from_world."""
     chunk_from_cam = _numbers(camera.find("transform"), 16, path).reshape(4, 4)
     centre = world_from_chunk.apply(chunk_from_cam[None, :3, 3])[0]
-    return rigid((world_from_chunk.rotation @ chunk_from_cam[:3, :3]).T, centre, f"{path}, camera {camera.get('label')!r}")
+    return rigid(
+        (world_from_chunk.rotation @ chunk_from_cam[:3, :3]).T,
+        centre,
+        f"{path}, camera {camera.get('label')!r}",
+    )
 
 
 def _numbers(element: ElementTree.Element, count: int, path: Path) -> np.ndarray:
@@ -145,21 +219,29 @@ def _numbers(element: ElementTree.Element, count: int, path: Path) -> np.ndarray
     return values
 
 
-def _to_local(views: list[View], chunk: ElementTree.Element, path: Path) -> tuple[list[View], Georeference | None]:
+def _to_local(
+    views: list[View], chunk: ElementTree.Element, path: Path
+) -> tuple[list[View], Georeference | None]:
     """Views in local ENU and the georeference, if the chunk has a CRS on Earth; unchanged views otherwise."""
     crs = _crs(chunk, path)
     if not views or crs is None:
         return views, None
     middle = np.median([view.centre for view in views], axis=0)
     if np.linalg.norm(middle) < GEOCENTRIC:
-        logger.warning("%s names a CRS, but its cameras are not in geocentric coordinates: the place stays unknown", path)
+        logger.warning(
+            "%s names a CRS, but its cameras are not in geocentric coordinates: the place stays unknown", path
+        )
         return views, None
-    frame = middle + 1000 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])  # points that show how one frame lies in the other
+    # points that show how one frame lies in the other
+    frame = middle + 1000 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
     geodetic = _geodetic(frame, crs)
     origin = tuple(round(float(value), digits) for value, digits in zip(geodetic[0], (6, 6, 0)))
     enu = fit_similarity(frame - middle, geodetic_to_enu(geodetic, origin))
     centres = enu.apply(np.array([view.centre for view in views]) - middle)
-    moved = [View(view.name, view.camera, rigid(view.cam_from_world[:3, :3] @ enu.rotation.T, centre, str(path))) for view, centre in zip(views, centres)]
+    moved = [
+        View(view.name, view.camera, rigid(view.cam_from_world[:3, :3] @ enu.rotation.T, centre, str(path)))
+        for view, centre in zip(views, centres)
+    ]
     return moved, from_origin(origin, crs.to_epsg() if crs.is_projected else None)
 
 
@@ -181,7 +263,9 @@ def _geodetic(points: np.ndarray, crs: pyproj.CRS) -> np.ndarray:
     """(N, 3) latitude, longitude, height on WGS 84 of geocentric coordinates on the datum of a CRS."""
     ellipsoid, geographic = crs.ellipsoid, crs.geodetic_crs
     cart = pyproj.Transformer.from_pipeline(
-        f"+proj=pipeline +step +inv +proj=cart +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r} +step +proj=unitconvert +xy_in=rad +xy_out=deg")
-    return crs_to_geodetic(np.stack(cart.transform(*points.T), axis=1), geographic if geographic.is_geographic else pyproj.CRS.from_epsg(4326))
-
-
+        f"+proj=pipeline +step +inv +proj=cart +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r} +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    )
+    return crs_to_geodetic(
+        np.stack(cart.transform(*points.T), axis=1),
+        geographic if geographic.is_geographic else pyproj.CRS.from_epsg(4326),
+    )

@@ -12,14 +12,22 @@ from sc3d.importers.project import Project
 from sc3d.io.atomic import atomic_path
 
 MAX_POINTS = 100_000  # sparse points that are made from a cloud
-CELLS = 64  # along the longer side of a photo: where tracks are guessed, the nearest points of a cell are seen
+# along the longer side of a photo: where tracks are guessed, the nearest points of a cell are seen
+CELLS = 64
 NEAR = 0.03  # of the distance
 
 
-def write_model(path: Path, views: list[View], points: np.ndarray, colors: np.ndarray, observations: list[tuple[np.ndarray, np.ndarray]]) -> None:
+def write_model(
+    path: Path,
+    views: list[View],
+    points: np.ndarray,
+    colors: np.ndarray,
+    observations: list[tuple[np.ndarray, np.ndarray]],
+) -> None:
     """Write a binary COLMAP model.
 
-    points, colors: (P, 3) float64 and uint8; observations: per view rows (K,) of points and their pixels (K, 2)
+    points, colors: (P, 3) float64 and uint8; observations: per view rows (K,) of points and their pixels (K,
+        2)
     """
     model, cameras = pycolmap.Reconstruction(), {}
     for view in views:
@@ -32,7 +40,9 @@ def write_model(path: Path, views: list[View], points: np.ndarray, colors: np.nd
         view_id = model.num_images() + 1
         _, pixels = observations[view_id - 1]
         keypoints = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
-        image = pycolmap.Image(name=view.name, camera_id=cameras[key].camera_id, image_id=view_id, points2D=keypoints)
+        image = pycolmap.Image(
+            name=view.name, camera_id=cameras[key].camera_id, image_id=view_id, points2D=keypoints
+        )
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_world[:3]))
     tracks = [pycolmap.Track() for _ in points]
     for number, (rows, _) in enumerate(observations, start=1):
@@ -46,9 +56,13 @@ def write_model(path: Path, views: list[View], points: np.ndarray, colors: np.nd
 
 
 def write_copy(path: Path, project: Project) -> None:
-    """Write the COLMAP model that a project was read from, with the names and the frame of the project; all else in it is kept."""
+    """Write the COLMAP model that a project was read from, with the names and the frame of the project; all
+    else in it is kept.
+    """
     model = project.model
-    images = sorted((model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name)
+    images = sorted(
+        (model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name
+    )
     for image, view in zip(images, project.views, strict=True):
         image.name = view.name
     if project.offset.any():
@@ -67,7 +81,9 @@ def sample(points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def guess_observations(views: list[View], points: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """What the views see of points without tracks: those inside the photo that are nearest, or nearly so, in their cell of it."""
+    """What the views see of points without tracks: those inside the photo that are nearest, or nearly so, in
+    their cell of it.
+    """
     return [_visible(view, points) for view in views]
 
 

@@ -1,6 +1,7 @@
 """nerfstudio and instant-ngp: `transforms.json`.
 
-`transform_matrix` is world from camera with OpenGL axes (x right, y up, z backwards). `applied_transform` (and `applied_scale`) lead from the original
+`transform_matrix` is world from camera with OpenGL axes (x right, y up, z backwards). `applied_transform`
+(and `applied_scale`) lead from the original
 frame to that of the file; they are undone, so that clouds and meshes in the original frame fit.
 """
 
@@ -54,7 +55,14 @@ def read(path: Path, settings: Import) -> Project:
         cameras[lens] = camera
         views.append(View(_tidy(name), camera, rigid(world_from_cam.T, centre, where)))
     points, colors = _points(file.parent, content, original, scale)
-    return Project("nerfstudio", views, points, colors, photos=file.parent, notes={"applied_transform": "undone" if "applied_transform" in content else "none"})
+    return Project(
+        "nerfstudio",
+        views,
+        points,
+        colors,
+        photos=file.parent,
+        notes={"applied_transform": "undone" if "applied_transform" in content else "none"},
+    )
 
 
 def _lens(content: dict, frame: dict, photo: Path, where: str) -> Lens:
@@ -69,7 +77,9 @@ def _lens(content: dict, frame: dict, photo: Path, where: str) -> Lens:
 
     model = str(content.get("camera_model", frame.get("camera_model", "OPENCV")))
     if model not in PERSPECTIVE | {"OPENCV_FISHEYE"}:
-        raise InputError(f"{where}: the camera model {model} has no COLMAP model that is known here; {', '.join(sorted(PERSPECTIVE))} and OPENCV_FISHEYE have")
+        raise InputError(
+            f"{where}: the camera model {model} has no COLMAP model that is known here; {', '.join(sorted(PERSPECTIVE))} and OPENCV_FISHEYE have"
+        )
     width, height = number("w"), number("h")
     if width is None or height is None:
         width, height = image_size(photo)
@@ -78,10 +88,19 @@ def _lens(content: dict, frame: dict, photo: Path, where: str) -> Lens:
     if focal is None:
         raise InputError(f"{where}: neither fl_x nor camera_angle_x is given")
     listed = content.get("distortion_params", frame.get("distortion_params"))
-    k1, k2, k3, k4, p1, p2 = listed if listed is not None else [number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+    k1, k2, k3, k4, p1, p2 = (
+        listed if listed is not None else [number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+    )
     fisheye = model == "OPENCV_FISHEYE"
-    return Lens(int(width), int(height), (focal, number("fl_y", focal)), (number("cx", width / 2), number("cy", height / 2)), (k1, k2, k3, k4),
-                (0.0, 0.0) if fisheye else (p1, p2), fisheye)
+    return Lens(
+        int(width),
+        int(height),
+        (focal, number("fl_y", focal)),
+        (number("cx", width / 2), number("cy", height / 2)),
+        (k1, k2, k3, k4),
+        (0.0, 0.0) if fisheye else (p1, p2),
+        fisheye,
+    )
 
 
 def _original_from_saved(content: dict, file: Path) -> tuple[np.ndarray, float]:
@@ -97,7 +116,11 @@ def _matrix(rows: object, where: str) -> np.ndarray:
         matrix = np.array(rows, np.float64)
         if matrix.shape == (3, 4):
             matrix = np.vstack([matrix, [0, 0, 0, 1]])
-        if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:3, :3])) < 1e-12:
+        if (
+            matrix.shape != (4, 4)
+            or not np.isfinite(matrix).all()
+            or abs(np.linalg.det(matrix[:3, :3])) < 1e-12
+        ):
             raise ValueError
     except (TypeError, ValueError):
         raise InputError(f"{where} is no 4x4 matrix of finite numbers that can be inverted") from None
@@ -111,8 +134,12 @@ def _points(folder: Path, content: dict, original: np.ndarray, scale: float) -> 
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     cloud = read_cloud(file)
     points = cloud.point.positions.numpy().astype(np.float64) / scale @ original[:3, :3].T + original[:3, 3]
-    colors = cloud.point.colors.numpy() if "colors" in cloud.point else np.full((len(points), 3), 128, np.uint8)
-    return points, colors if colors.dtype == np.uint8 else np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8)
+    colors = (
+        cloud.point.colors.numpy() if "colors" in cloud.point else np.full((len(points), 3), 128, np.uint8)
+    )
+    return points, colors if colors.dtype == np.uint8 else np.clip(np.rint(colors * 255), 0, 255).astype(
+        np.uint8
+    )
 
 
 def _tidy(name: str) -> str:
@@ -120,14 +147,35 @@ def _tidy(name: str) -> str:
 
 
 def camera_parameters(camera: pycolmap.Camera, where: str) -> dict[str, object]:
-    """The keys of transforms.json for a camera, the inverse of what `read` does; InputError for models that the format has not."""
+    """The keys of transforms.json for a camera, the inverse of what `read` does; InputError for models that
+    the format has not.
+    """
     params, model = list(camera.params), camera.model_name
-    simple = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2}
+    simple = {
+        "SIMPLE_PINHOLE": 0,
+        "SIMPLE_RADIAL": 1,
+        "RADIAL": 2,
+        "SIMPLE_RADIAL_FISHEYE": 1,
+        "RADIAL_FISHEYE": 2,
+    }
     if model in simple:
         params = [params[0], *params[:3], *params[3:]]
-    names = {"OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"), "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3"),
-             "PINHOLE": ()}.get(model, ("k1", "k2"))
-    if model not in {*simple, "PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"} or (model == "FULL_OPENCV" and any(params[9:])):
-        raise InputError(f"{where}: transforms.json has no model like {model}: export undistorted photos or a COLMAP model instead")
+    names = {
+        "OPENCV": ("k1", "k2", "p1", "p2"),
+        "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+        "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3"),
+        "PINHOLE": (),
+    }.get(model, ("k1", "k2"))
+    if model not in {*simple, "PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"} or (
+        model == "FULL_OPENCV" and any(params[9:])
+    ):
+        raise InputError(
+            f"{where}: transforms.json has no model like {model}: export undistorted photos or a COLMAP model instead"
+        )
     keys = dict(zip(("fl_x", "fl_y", "cx", "cy", *names), [float(value) for value in params]))
-    return {"camera_model": "OPENCV_FISHEYE" if "FISHEYE" in model else "OPENCV", "w": camera.width, "h": camera.height, **keys}
+    return {
+        "camera_model": "OPENCV_FISHEYE" if "FISHEYE" in model else "OPENCV",
+        "w": camera.width,
+        "h": camera.height,
+        **keys,
+    }

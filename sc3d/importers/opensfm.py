@@ -1,8 +1,12 @@
-"""OpenSfM and OpenDroneMap: `reconstruction.json`, `tracks.csv` for the observations, `reference_lla` or ODM's `coords.txt` for the place.
+"""OpenSfM and OpenDroneMap: `reconstruction.json`, `tracks.csv` for the observations, `reference_lla` or
+ODM's `coords.txt` for the place.
 
-Focal lengths and principal points are in units of the longer side of the photo, the latter from its middle; `rotation` is the axis-angle vector of
-cam from world. The world is local ENU at `reference_lla`. ODM keeps that as `reconstruction.topocentric.json` and writes `reconstruction.json` anew in
-UTM minus the offset of `odm_georeferencing/coords.txt`, with rotations that are then rounded to the nearest: the topocentric file is read if it is there.
+Focal lengths and principal points are in units of the longer side of the photo, the latter from its middle;
+`rotation` is the axis-angle vector of
+cam from world. The world is local ENU at `reference_lla`. ODM keeps that as `reconstruction.topocentric.json`
+and writes `reconstruction.json` anew in
+UTM minus the offset of `odm_georeferencing/coords.txt`, with rotations that are then rounded to the nearest:
+the topocentric file is read if it is there.
 """
 
 from __future__ import annotations
@@ -27,9 +31,18 @@ logger = logging.getLogger(__name__)
 EXPECTED = "a folder with reconstruction.json, or with opensfm/reconstruction.json (ODM), is expected"
 FILE, TOPOCENTRIC = "reconstruction.json", "reconstruction.topocentric.json"
 # projection types: names of the radial coefficients, and whether p1, p2 and a principal point belong to them
-PERSPECTIVE = {"perspective": ("k1", "k2"), "simple_radial": ("k1",), "radial": ("k1", "k2"), "brown": ("k1", "k2", "k3")}
-FISHEYE = {"fisheye": ("k1", "k2"), "fisheye_opencv": ("k1", "k2", "k3", "k4"), "fisheye62": ("k1", "k2", "k3", "k4", "k5", "k6"),
-           "fisheye624": ("k1", "k2", "k3", "k4", "k5", "k6")}
+PERSPECTIVE = {
+    "perspective": ("k1", "k2"),
+    "simple_radial": ("k1",),
+    "radial": ("k1", "k2"),
+    "brown": ("k1", "k2", "k3"),
+}
+FISHEYE = {
+    "fisheye": ("k1", "k2"),
+    "fisheye_opencv": ("k1", "k2", "k3", "k4"),
+    "fisheye62": ("k1", "k2", "k3", "k4", "k5", "k6"),
+    "fisheye624": ("k1", "k2", "k3", "k4", "k5", "k6"),
+}
 
 
 def matches(path: Path) -> bool:
@@ -38,18 +51,36 @@ def matches(path: Path) -> bool:
 
 def files(path: Path) -> list[Path]:
     folder = _folder(path)
-    return [folder / FILE, folder / TOPOCENTRIC, folder / "tracks.csv", folder.parent / "odm_georeferencing" / "coords.txt"]
+    return [
+        folder / FILE,
+        folder / TOPOCENTRIC,
+        folder / "tracks.csv",
+        folder.parent / "odm_georeferencing" / "coords.txt",
+    ]
 
 
 def read(path: Path, settings: Import) -> Project:
     folder = _folder(path)
-    file = next(file for file in (path if path.is_file() else folder / TOPOCENTRIC, folder / TOPOCENTRIC, folder / FILE) if file.is_file())
+    file = next(
+        file
+        for file in (path if path.is_file() else folder / TOPOCENTRIC, folder / TOPOCENTRIC, folder / FILE)
+        if file.is_file()
+    )
     parts = read_json(file)
-    if not isinstance(parts, list) or not all(isinstance(part, dict) and "shots" in part and "cameras" in part for part in parts) or not parts:
+    if (
+        not isinstance(parts, list)
+        or not all(isinstance(part, dict) and "shots" in part and "cameras" in part for part in parts)
+        or not parts
+    ):
         raise InputError(f"{file} is no list of reconstructions")
     part = max(parts, key=lambda part: len(part["shots"]))
     if len(parts) > 1:
-        logger.warning("%s has %d separate reconstructions: the one with most photos (%d) is taken", file, len(parts), len(part["shots"]))
+        logger.warning(
+            "%s has %d separate reconstructions: the one with most photos (%d) is taken",
+            file,
+            len(parts),
+            len(part["shots"]),
+        )
     cameras = {}
     for name, camera in part["cameras"].items():
         where = f"{file}, camera {name!r}"
@@ -59,42 +90,85 @@ def read(path: Path, settings: Import) -> Project:
     root = folder.parent if folder.name == "opensfm" else folder
     observations = _observations(folder / "tracks.csv", views, rows)
     program = "odm" if root != folder else "opensfm"
-    return Project(program, views, points, colors, observations, root / "images", _georeference(part, file, root, views), {"read": file.name})
+    return Project(
+        program,
+        views,
+        points,
+        colors,
+        observations,
+        root / "images",
+        _georeference(part, file, root, views),
+        {"read": file.name},
+    )
 
 
 def _folder(path: Path) -> Path | None:
     """The OpenSfM folder of a path: itself, `opensfm` in it, or the parent of a reconstruction file."""
     if path.is_file():
         return path.parent if path.name.startswith("reconstruction") and path.suffix == ".json" else None
-    return next((folder for folder in (path / "opensfm", path) if (folder / FILE).is_file() or (folder / TOPOCENTRIC).is_file()), None)
+    return next(
+        (
+            folder
+            for folder in (path / "opensfm", path)
+            if (folder / FILE).is_file() or (folder / TOPOCENTRIC).is_file()
+        ),
+        None,
+    )
 
 
 def _lens(camera: dict, where: str) -> Lens:
     kind = camera.get("projection_type", "perspective")
     if kind not in PERSPECTIVE | FISHEYE:
-        raise InputError(f"{where}: the projection type {kind!r} has no COLMAP model: undistort the photos first")
+        raise InputError(
+            f"{where}: the projection type {kind!r} has no COLMAP model: undistort the photos first"
+        )
     try:
         width, height = int(camera["width"]), int(camera["height"])
         size = max(width, height)
         focal = [float(camera.get(key, camera.get("focal", "nan"))) * size for key in ("focal_x", "focal_y")]
         if kind in ("perspective", "fisheye"):
             focal = [float(camera["focal"]) * size] * 2
-        principal = (float(camera.get("c_x", 0)) * size + width / 2, float(camera.get("c_y", 0)) * size + height / 2)
+        principal = (
+            float(camera.get("c_x", 0)) * size + width / 2,
+            float(camera.get("c_y", 0)) * size + height / 2,
+        )
         radial = tuple(float(camera.get(name, 0)) for name in (PERSPECTIVE | FISHEYE)[kind])
-        tangential = tuple(float(camera.get(name, 0)) for name in ("p1", "p2")) if kind in ("brown", "fisheye62", "fisheye624") else (0.0, 0.0)
+        tangential = (
+            tuple(float(camera.get(name, 0)) for name in ("p1", "p2"))
+            if kind in ("brown", "fisheye62", "fisheye624")
+            else (0.0, 0.0)
+        )
         prism = [float(camera.get(f"s{number}", 0)) for number in range(4)]
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{where} lacks a number: {error}") from None
     if kind == "fisheye624" and (prism[1] or prism[3]):
-        raise InputError(f"{where}: a thin prism of the fourth order has no COLMAP model: undistort the photos first")
-    return Lens(width, height, tuple(focal), principal, radial, tangential, kind in FISHEYE, prism=(prism[0], prism[2]) if kind == "fisheye624" else (0.0, 0.0))
+        raise InputError(
+            f"{where}: a thin prism of the fourth order has no COLMAP model: undistort the photos first"
+        )
+    return Lens(
+        width,
+        height,
+        tuple(focal),
+        principal,
+        radial,
+        tangential,
+        kind in FISHEYE,
+        prism=(prism[0], prism[2]) if kind == "fisheye624" else (0.0, 0.0),
+    )
 
 
 def _view(name: str, shot: dict, cameras: dict[str, pycolmap.Camera], where: str) -> View:
     try:
-        rotation, translation = np.array(shot["rotation"], np.float64), np.array(shot["translation"], np.float64)
+        rotation, translation = (
+            np.array(shot["rotation"], np.float64),
+            np.array(shot["translation"], np.float64),
+        )
         camera = cameras[shot["camera"]]
-        if rotation.shape != (3,) or translation.shape != (3,) or not np.isfinite([rotation, translation]).all():
+        if (
+            rotation.shape != (3,)
+            or translation.shape != (3,)
+            or not np.isfinite([rotation, translation]).all()
+        ):
             raise ValueError("three finite numbers each are expected")
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{where}: rotation, translation or camera cannot be used ({error})") from None
@@ -106,16 +180,26 @@ def _points(points: dict, file: Path) -> tuple[np.ndarray, np.ndarray, dict[str,
     """(P, 3) positions, (P, 3) colours, and the row of each track."""
     try:
         positions = np.array([point["coordinates"] for point in points.values()], np.float64).reshape(-1, 3)
-        colors = np.array([point.get("color", (128, 128, 128)) for point in points.values()], np.float64).reshape(-1, 3)
+        colors = np.array(
+            [point.get("color", (128, 128, 128)) for point in points.values()], np.float64
+        ).reshape(-1, 3)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file} has points that cannot be used ({error!r})") from None
     kept, colors = np.isfinite(positions).all(axis=1), np.nan_to_num(colors)
     names = [name for name, keep in zip(points, kept) if keep]
-    return positions[kept], np.clip(np.rint(colors[kept]), 0, 255).astype(np.uint8), {str(name): row for row, name in enumerate(names)}
+    return (
+        positions[kept],
+        np.clip(np.rint(colors[kept]), 0, 255).astype(np.uint8),
+        {str(name): row for row, name in enumerate(names)},
+    )
 
 
-def _observations(file: Path, views: list[View], rows: dict[str, int]) -> list[tuple[np.ndarray, np.ndarray]] | None:
-    """Rows of the points that each view sees and their pixels, from tracks.csv (all versions have photo, track, feature, x, y in front)."""
+def _observations(
+    file: Path, views: list[View], rows: dict[str, int]
+) -> list[tuple[np.ndarray, np.ndarray]] | None:
+    """Rows of the points that each view sees and their pixels, from tracks.csv (all versions have photo,
+    track, feature, x, y in front).
+    """
     if not file.is_file():
         return None
     seen: dict[str, tuple[list[int], list[tuple[float, float]]]] = {view.name: ([], []) for view in views}
@@ -126,7 +210,10 @@ def _observations(file: Path, views: list[View], rows: dict[str, int]) -> list[t
                 seen[words[0]][0].append(rows[words[1]])
                 seen[words[0]][1].append((float(words[3]), float(words[4])))
     middles = [(max(view.width, view.height), np.array([view.width, view.height]) / 2) for view in views]
-    return [(np.array(seen[view.name][0], int), np.array(seen[view.name][1]).reshape(-1, 2) * size + middle) for view, (size, middle) in zip(views, middles)]
+    return [
+        (np.array(seen[view.name][0], int), np.array(seen[view.name][1]).reshape(-1, 2) * size + middle)
+        for view, (size, middle) in zip(views, middles)
+    ]
 
 
 def _georeference(part: dict, file: Path, root: Path, views: list[View]) -> Georeference | None:
@@ -142,8 +229,14 @@ def _georeference(part: dict, file: Path, root: Path, views: list[View]) -> Geor
 
 
 def _is_topocentric(part: dict, views: list[View]) -> bool:
-    """Whether cameras lie at their `gps_position`, which OpenSfM keeps in ENU whatever frame the reconstruction is in."""
-    offsets = [np.subtract(shot["gps_position"], view.centre) for shot, view in zip(part["shots"].values(), views) if len(shot.get("gps_position") or []) == 3]
+    """Whether cameras lie at their `gps_position`, which OpenSfM keeps in ENU whatever frame the
+    reconstruction is in.
+    """
+    offsets = [
+        np.subtract(shot["gps_position"], view.centre)
+        for shot, view in zip(part["shots"].values(), views)
+        if len(shot.get("gps_position") or []) == 3
+    ]
     return bool(offsets) and float(np.linalg.norm(np.median(offsets, axis=0)[:2])) < 20.0
 
 
@@ -152,7 +245,9 @@ def _utm(coords: Path) -> Georeference:
     try:
         crs, offset = parse_crs(lines[0], coords), [float(word) for word in lines[1].split()[:2]]
     except (IndexError, ValueError):
-        raise InputError(f"{coords}: a CRS and an offset (easting northing) are expected in its first two lines") from None
+        raise InputError(
+            f"{coords}: a CRS and an offset (easting northing) are expected in its first two lines"
+        ) from None
     epsg = crs.to_epsg()
     if epsg is None:
         raise InputError(f"{coords}: the CRS {lines[0]!r} has no EPSG code")

@@ -1,6 +1,8 @@
-"""Pix4Dmapper: `*_calibrated_camera_parameters.txt` in `1_initial/params`, with `*_offset.xyz` and `*_wkt.prj` beside it.
+"""Pix4Dmapper: `*_calibrated_camera_parameters.txt` in `1_initial/params`, with `*_offset.xyz` and
+`*_wkt.prj` beside it.
 
-The model is m = K [R | -R t] X with OpenCV's axes and distortion; the world is the project's CRS minus the offset; (0, 0) is the corner of the first pixel.
+The model is m = K [R | -R t] X with OpenCV's axes and distortion; the world is the project's CRS minus the
+offset; (0, 0) is the corner of the first pixel.
 """
 
 from __future__ import annotations
@@ -20,7 +22,9 @@ from sc3d.settings.reconstruction import Import
 
 logger = logging.getLogger(__name__)
 
-EXPECTED = "a project folder with 1_initial/params/*_calibrated_camera_parameters.txt, or that file, is expected"
+EXPECTED = (
+    "a project folder with 1_initial/params/*_calibrated_camera_parameters.txt, or that file, is expected"
+)
 SUFFIX = "calibrated_camera_parameters.txt"
 LINES = 10  # per photo
 
@@ -36,7 +40,10 @@ def files(path: Path) -> list[Path]:
 def read(path: Path, settings: Import) -> Project:
     file = _file(path)
     try:
-        lines = [(number, line.strip()) for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines(), start=1)]
+        lines = [
+            (number, line.strip())
+            for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines(), start=1)
+        ]
     except UnicodeDecodeError:
         raise InputError(f"{file} is no text file") from None
     header = [line.lower() for _, line in lines[:8]]
@@ -44,7 +51,9 @@ def read(path: Path, settings: Import) -> Project:
         raise InputError(f"{file}: Pix4D's fisheye polynomial has no COLMAP model: export undistorted photos")
     body = [(number, line) for number, line in lines if line][_header_length(lines, file) :]
     if len(body) % LINES:
-        raise InputError(f"{file} is cut off or of another layout: {LINES} lines per photo are expected after the header, {len(body)} lines are there")
+        raise InputError(
+            f"{file} is cut off or of another layout: {LINES} lines per photo are expected after the header, {len(body)} lines are there"
+        )
     cameras: dict[Lens, object] = {}
     views = []
     for start in range(0, len(body), LINES):
@@ -58,7 +67,14 @@ def read(path: Path, settings: Import) -> Project:
 def _file(path: Path) -> Path | None:
     if path.is_file():
         return path if path.name.endswith(SUFFIX) else None
-    return next((file for folder in (path, path / "params", path / "1_initial" / "params") for file in sorted(folder.glob(f"*{SUFFIX}"))), None)
+    return next(
+        (
+            file
+            for folder in (path, path / "params", path / "1_initial" / "params")
+            for file in sorted(folder.glob(f"*{SUFFIX}"))
+        ),
+        None,
+    )
 
 
 def _header_length(lines: list[tuple[int, str]], file: Path) -> int:
@@ -66,7 +82,9 @@ def _header_length(lines: list[tuple[int, str]], file: Path) -> int:
     filled = [line for _, line in lines if line]
     found = [row for row, line in enumerate(filled[:12]) if line.lower().startswith("camera model")]
     if not found:
-        raise InputError(f"{file} does not start as Pix4D writes it, with fileName ... camera model m = K [R|-Rt] X")
+        raise InputError(
+            f"{file} does not start as Pix4D writes it, with fileName ... camera model m = K [R|-Rt] X"
+        )
     return found[0] + 1
 
 
@@ -76,14 +94,35 @@ def _block(lines: list[tuple[int, str]], file: Path) -> tuple[str, Lens, np.ndar
     try:
         width, height = (int(word) for word in size)
         rows = [np.array(line.split(), np.float64) for _, line in lines[1:]]
-        matrix, radial, tangential, centre, rotation = np.stack(rows[:3]), rows[3], rows[4], rows[5], np.stack(rows[6:])
-        if (matrix.shape, radial.shape, tangential.shape, centre.shape, rotation.shape) != ((3, 3), (3,), (2,), (3,), (3, 3)):
+        matrix, radial, tangential, centre, rotation = (
+            np.stack(rows[:3]),
+            rows[3],
+            rows[4],
+            rows[5],
+            np.stack(rows[6:]),
+        )
+        if (matrix.shape, radial.shape, tangential.shape, centre.shape, rotation.shape) != (
+            (3, 3),
+            (3,),
+            (2,),
+            (3,),
+            (3, 3),
+        ):
             raise ValueError
     except ValueError:
-        raise InputError(f"{file}, line {lines[0][0]}: name, width and height, then K [3x3], distortion [3] and [2], position [3] and rotation [3x3] "
-                         "are expected") from None
-    lens = Lens(width, height, (float(matrix[0, 0]), float(matrix[1, 1])), (float(matrix[0, 2]), float(matrix[1, 2])), tuple(radial.tolist()),
-                tuple(tangential.tolist()), skew=float(matrix[0, 1]))
+        raise InputError(
+            f"{file}, line {lines[0][0]}: name, width and height, then K [3x3], distortion [3] and [2], position [3] and rotation [3x3] "
+            "are expected"
+        ) from None
+    lens = Lens(
+        width,
+        height,
+        (float(matrix[0, 0]), float(matrix[1, 1])),
+        (float(matrix[0, 2]), float(matrix[1, 2])),
+        tuple(radial.tolist()),
+        tuple(tangential.tolist()),
+        skew=float(matrix[0, 1]),
+    )
     return name, lens, rotation, centre
 
 
@@ -99,11 +138,19 @@ def _georeference(file: Path) -> Georeference | None:
         return None
     try:
         crs = pyproj.CRS.from_wkt(projection.read_text(encoding="utf-8").strip())
-        offset = np.array(offset_file.read_text(encoding="utf-8").replace(",", " ").split(), np.float64)[:3] if offset_file.is_file() else np.zeros(3)
+        offset = (
+            np.array(offset_file.read_text(encoding="utf-8").replace(",", " ").split(), np.float64)[:3]
+            if offset_file.is_file()
+            else np.zeros(3)
+        )
     except (pyproj.exceptions.CRSError, ValueError):
-        raise InputError(f"{projection} or {offset_file} cannot be understood: a WKT of a CRS and three numbers are expected") from None
+        raise InputError(
+            f"{projection} or {offset_file} cannot be understood: a WKT of a CRS and three numbers are expected"
+        ) from None
     crs = crs.sub_crs_list[0] if crs.is_compound else crs
     if not crs.is_projected or crs.to_epsg() is None or offset.shape != (3,):
-        logger.warning("%s: %s has no EPSG code of a projected CRS: the place stays unknown", projection, crs.name)
+        logger.warning(
+            "%s: %s has no EPSG code of a projected CRS: the place stays unknown", projection, crs.name
+        )
         return None
     return Georeference(crs.to_epsg(), tuple(offset.tolist()))

@@ -17,7 +17,8 @@ from sc3d.io.limits import FARTHEST
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import
 
-PROGRAMS = ("nerfstudio", "opensfm", "odm", "metashape", "pix4d", "colmap")  # in the order in which they are tried
+# in the order in which they are tried
+PROGRAMS = ("nerfstudio", "opensfm", "odm", "metashape", "pix4d", "colmap")
 MODULES = {"odm": "opensfm"}
 
 
@@ -25,12 +26,15 @@ MODULES = {"odm": "opensfm"}
 class Project:
     """A reconstruction of another program, in one frame.
 
-    program: one of PROGRAMS; views: named as the project names its photos, which may be without folder or suffix
+    program: one of PROGRAMS; views: named as the project names its photos, which may be without folder or
+        suffix
     points, colors: (P, 3) float64 world; (P, 3) uint8
-    observations: per view, rows of `points` that it sees (K,) and where (K, 2) px; None = the project does not say
+    observations: per view, rows of `points` that it sees (K,) and where (K, 2) px; None = the project does
+        not say
     photos: folder that the names are relative to; None = unknown
     georeference: of the frame; notes: for the summary
-    model: the COLMAP model that all this was read from, whose further contents are kept; None = another program's
+    model: the COLMAP model that all this was read from, whose further contents are kept; None = another
+        program's
     offset: (3,) what was subtracted from the coordinates of `model`
     """
 
@@ -47,15 +51,30 @@ class Project:
 
 
 def read_project(path: Path, settings: Import) -> Project:
-    """Read a project with the importer that `settings.source` names, or the first that knows the path. InputError if none does."""
+    """Read a project with the importer that `settings.source` names, or the first that knows the path.
+    InputError if none does.
+    """
     try:
         project = find_importer(path, settings.source).read(path, settings)
-    except (AttributeError, TypeError, LookupError, ValueError, ArithmeticError, np.linalg.LinAlgError) as error:  # other values than the importer looks for
-        raise InputError(f"{path} is damaged or of another layout: {type(error).__name__}, {str(error)[:200]}") from error
+    # other values than the importer looks for
+    except (
+        AttributeError,
+        TypeError,
+        LookupError,
+        ValueError,
+        ArithmeticError,
+        np.linalg.LinAlgError,
+    ) as error:
+        raise InputError(
+            f"{path} is damaged or of another layout: {type(error).__name__}, {str(error)[:200]}"
+        ) from error
     if not project.views:
         raise InputError(f"{path} has no photo with a position: orient the photos first")
     folder = path if path.is_dir() else path.parent
-    return project if project.georeference else replace(project, georeference=read_georeference(Scene(folder)))  # as our own exports have it beside them
+    # as our own exports have it beside them
+    return (
+        project if project.georeference else replace(project, georeference=read_georeference(Scene(folder)))
+    )
 
 
 def project_files(path: Path, settings: Import) -> list[Path]:
@@ -64,22 +83,30 @@ def project_files(path: Path, settings: Import) -> list[Path]:
 
 
 def find_importer(path: Path, source: str) -> ModuleType:
-    """The module of sc3d.importers that reads a path: that of `source`, or for "auto" the first that knows the path. InputError if none does."""
+    """The module of sc3d.importers that reads a path: that of `source`, or for "auto" the first that knows
+    the path. InputError if none does.
+    """
     names = PROGRAMS if source == "auto" else (source,)
     modules = [importlib.import_module(f"sc3d.importers.{MODULES.get(name, name)}") for name in names]
     for module in modules:
         if module.matches(path):
             return module
     if source == "auto":
-        raise InputError(f"{path} is no project that is known here: transforms.json (nerfstudio), an OpenSfM or ODM folder, cameras as XML (Metashape), "
-                         "*_calibrated_camera_parameters.txt (Pix4D) or a COLMAP model is expected")
+        raise InputError(
+            f"{path} is no project that is known here: transforms.json (nerfstudio), an OpenSfM or ODM folder, cameras as XML (Metashape), "
+            "*_calibrated_camera_parameters.txt (Pix4D) or a COLMAP model is expected"
+        )
     raise InputError(f"{path} is no {source} project: {modules[0].EXPECTED}")
 
 
 def rigid(rotation: np.ndarray, centre: np.ndarray, where: str) -> np.ndarray:
-    """(4, 4) cam_from_world of a camera at `centre` (3,); `rotation` (3, 3) cam from world up to rounding. InputError if it is none."""
+    """(4, 4) cam_from_world of a camera at `centre` (3,); `rotation` (3, 3) cam from world up to rounding.
+    InputError if it is none.
+    """
     if not np.isfinite(rotation).all() or not (np.abs(centre) < FARTHEST).all():
-        raise InputError(f"{where}: orientation or position is not made of finite numbers, or is more than {FARTHEST:g} from the origin")
+        raise InputError(
+            f"{where}: orientation or position is not made of finite numbers, or is more than {FARTHEST:g} from the origin"
+        )
     left, stretch, right = np.linalg.svd(np.asarray(rotation, np.float64))
     if not np.isfinite(stretch).all() or abs(stretch - 1).max() > 0.01 or np.linalg.det(rotation) < 0:
         raise InputError(f"{where}: the orientation is no rotation")

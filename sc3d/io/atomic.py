@@ -1,4 +1,6 @@
-"""Files that are whole or not there: written under a temporary name, brought to the disk, renamed; what killed runs leave behind is found and removed."""
+"""Files that are whole or not there: written under a temporary name, brought to the disk, renamed; what
+killed runs leave behind is found and removed.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,17 @@ LEFTOVER = re.compile(r"\..*\.(?P<host>\w+)-(?P<process>\d+)\.tmp")
 STARTED = time.time()
 OLD = 24 * 3600  # s: temporary files of other machines are dead after that
 MARGIN = 60  # s: what is this much older than this process was made by another one of the same number
-ROOM = 1 << 16  # bytes; with less left on the disk, what was written may not be whole, which not every library notices
+# bytes; with less left on the disk, what was written may not be whole, which not every library notices
+ROOM = 1 << 16
 
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` with the same suffix (file or folder); it replaces `path` only if the block succeeds.
+    """Yield a temporary path beside `path` with the same suffix (file or folder); it replaces `path` only if
+    the block succeeds.
 
-    Then all of it is on the disk: a crash of the machine leaves the old or the new, not a part. OSError if the disk is full.
+    Then all of it is on the disk: a crash of the machine leaves the old or the new, not a part. OSError if
+    the disk is full.
     """
     path = Path(path)
     temporary = path.with_name(temporary_name(path.stem) + path.suffix)
@@ -35,7 +40,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
         if not os.access(path.parent, os.W_OK, effective_ids=True):
             raise PermissionError
     except (PermissionError, NotADirectoryError, FileExistsError):
-        raise InputError(f"cannot write to {path.parent}: check its permissions or choose another folder") from None
+        raise InputError(
+            f"cannot write to {path.parent}: check its permissions or choose another folder"
+        ) from None
     try:
         remove(temporary)  # of a killed process that had the same number, as all have in containers
         try:
@@ -64,7 +71,9 @@ def remove(path: Path) -> None:
 
 
 def discard(folder: Path) -> None:
-    """Remove a folder in one step, so that no part of it can be taken for the whole; of a link, not what it leads to."""
+    """Remove a folder in one step, so that no part of it can be taken for the whole; of a link, not what it
+    leads to.
+    """
     if folder.is_symlink():
         folder.unlink()
     elif folder.is_dir():
@@ -75,7 +84,9 @@ def discard(folder: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what killed processes of this machine, or of others more than a day ago, left unfinished in a folder. Linked folders are let alone."""
+    """Remove what killed processes of this machine, or of others more than a day ago, left unfinished in a
+    folder. Linked folders are let alone.
+    """
     if folder.is_symlink() or not folder.is_dir():
         return
     for entry in folder.iterdir():
@@ -85,7 +96,9 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def require_room(path: Path, num_bytes: int = 0) -> None:
-    """OSError if there is no room for so many bytes, or none at all: some libraries then fail in other words, do not notice, or end the process."""
+    """OSError if there is no room for so many bytes, or none at all: some libraries then fail in other words,
+    do not notice, or end the process.
+    """
     try:
         found = os.statvfs(path.parent)
     except OSError:
@@ -97,7 +110,9 @@ def require_room(path: Path, num_bytes: int = 0) -> None:
 
 @contextmanager
 def telling_of_full_disk(path: Path) -> Iterator[None]:
-    """Errors in the block become `OSError` (ENOSPC) if there is no room beside `path`, in whatever words a library puts them."""
+    """Errors in the block become `OSError` (ENOSPC) if there is no room beside `path`, in whatever words a
+    library puts them.
+    """
     try:
         yield
     except Exception:
@@ -113,7 +128,9 @@ def require_inside(folder: Path, path: Path) -> None:
         raise InputError(f"{path} is a link to {path.resolve()}, which would be overwritten: remove the link")
     outer = next((parent for parent in path.parents if parent.exists()), folder)
     if folder in (outer, *outer.parents) and not outer.resolve().is_relative_to(folder.resolve()):
-        raise InputError(f"{outer} is a link that leads out of {folder}: what lies there is not overwritten, remove the link")
+        raise InputError(
+            f"{outer} is a link that leads out of {folder}: what lies there is not overwritten, remove the link"
+        )
 
 
 def _is_dead(host: str, process: int, entry: Path) -> bool:

@@ -14,14 +14,25 @@ from sc3d.io.limits import FARTHEST
 from sc3d.io.ply import Header, check_ply
 
 CHUNK = 1_000_000  # rows held at a time
-TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
+TYPES = {
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "short",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint",
+    "f4": "float",
+    "f8": "double",
+}
 LAS_FIELDS = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
 LAS_COLORS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 
 
 @dataclass(frozen=True)
 class CloudFile:
-    """A cloud on disk. dtype: of a record, fields x, y, z and whatever else the file has; offset: bytes before the first one (PLY)."""
+    """A cloud on disk. dtype: of a record, fields x, y, z and whatever else the file has; offset: bytes
+    before the first one (PLY).
+    """
 
     path: Path
     dtype: np.dtype
@@ -35,11 +46,15 @@ class CloudFile:
         if kind in (".las", ".laz"):
             return _open_las(path)
         if kind != ".ply":
-            raise InputError(f"{path} does not fit into --max-memory, and can be read in parts as PLY, LAS or LAZ only: convert it, or allow more memory")
+            raise InputError(
+                f"{path} does not fit into --max-memory, and can be read in parts as PLY, LAS or LAZ only: convert it, or allow more memory"
+            )
         header = check_ply(path)
         vertex = header.element("vertex")
         if not header.order or vertex is None or vertex.has_lists or header.elements[0] is not vertex:
-            raise InputError(f"{path} does not fit into --max-memory, and can be read in parts as binary PLY with the vertices first only: write it anew")
+            raise InputError(
+                f"{path} does not fit into --max-memory, and can be read in parts as binary PLY with the vertices first only: write it anew"
+            )
         if not vertex.rows or not {"x", "y", "z"} <= {entry.name for entry in vertex.properties}:
             raise InputError(f"{path} holds no points")
         return cls(path, _record(header), vertex.rows, header.size)
@@ -49,7 +64,9 @@ class CloudFile:
         for start, records in self._read():
             for axis in "xyz":
                 if not (np.abs(records[axis]) <= FARTHEST).all():
-                    raise InputError(f"{self.path} has positions that are not finite, or more than {FARTHEST:g} from the origin: remove those points first")
+                    raise InputError(
+                        f"{self.path} has positions that are not finite, or more than {FARTHEST:g} from the origin: remove those points first"
+                    )
             yield start, records
 
     def _read(self) -> Iterator[tuple[int, np.ndarray]]:
@@ -72,7 +89,9 @@ def _open_las(path: Path) -> CloudFile:
     try:
         with laspy.open(path) as file:
             colored = {"red", "green", "blue"} <= set(file.header.point_format.dimension_names)
-            return CloudFile(path, np.dtype(LAS_FIELDS + (LAS_COLORS if colored else [])), file.header.point_count)
+            return CloudFile(
+                path, np.dtype(LAS_FIELDS + (LAS_COLORS if colored else [])), file.header.point_count
+            )
     except (OSError, ValueError, laspy.errors.LaspyException) as error:
         raise InputError(f"cannot read {path}: {error}") from None
 
@@ -108,7 +127,17 @@ def columns(records: np.ndarray, names: Iterable[str]) -> np.ndarray | None:
 def write_ply(path: Path, dtype: np.dtype, num_points: int, chunks: Iterable[np.ndarray]) -> None:
     """Write records of `dtype` (native fields without byte order) as a binary PLY, atomically."""
     lines = [f"property {TYPES[dtype[name].str[1:]]} {name}" for name in dtype.names]
-    header = "\n".join(["ply", "format binary_little_endian 1.0", "comment sc3d", f"element vertex {num_points}", *lines, "end_header", ""])
+    header = "\n".join(
+        [
+            "ply",
+            "format binary_little_endian 1.0",
+            "comment sc3d",
+            f"element vertex {num_points}",
+            *lines,
+            "end_header",
+            "",
+        ]
+    )
     written = 0
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(header.encode("ascii"))

@@ -19,7 +19,9 @@ CHECKS = {".ply": check_ply, ".pcd": check_pcd}
 
 
 def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported late
-    """Read a point cloud with all its attributes (PLY, PCD, XYZ); InputError if it is damaged, empty or has positions that are not finite or too far away."""
+    """Read a point cloud with all its attributes (PLY, PCD, XYZ); InputError if it is damaged, empty or has
+    positions that are not finite or too far away.
+    """
     cloud = _read_geometry(path, "read_point_cloud", {".ply", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts"})
     if "positions" not in cloud.point or not len(cloud.point.positions):
         raise InputError(f"{path} holds no points")
@@ -28,7 +30,9 @@ def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported 
 
 
 def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
-    """Read a triangle mesh; InputError if it is damaged, empty or has vertices that are not finite or too far away, or triangles of other vertices."""
+    """Read a triangle mesh; InputError if it is damaged, empty or has vertices that are not finite or too far
+    away, or triangles of other vertices.
+    """
     mesh = _read_geometry(path, "read_triangle_mesh", {".ply"})
     if "positions" not in mesh.vertex or "indices" not in mesh.triangle or not len(mesh.triangle.indices):
         raise InputError(f"{path} holds no triangles")
@@ -58,12 +62,17 @@ def _read_geometry(path: Path, reader: str, suffixes: set[str]):
     try:
         with redirect_stdout(told):
             geometry = getattr(o3d.t.io, reader)(str(path))
-            list(geometry.point if hasattr(geometry, "point") else geometry.vertex)  # fails for names that are no text
+            # fails for names that are no text
+            list(geometry.point if hasattr(geometry, "point") else geometry.vertex)
     except (RuntimeError, ValueError, IndexError) as error:
         told.write(f"failed: {error}")
-    failure = re.search(r"\b(?:failed|unable to)\b[^\n\x1b]*", told.getvalue().replace(str(path), "the file"), re.IGNORECASE)
+    failure = re.search(
+        r"\b(?:failed|unable to)\b[^\n\x1b]*", told.getvalue().replace(str(path), "the file"), re.IGNORECASE
+    )
     if failure:
-        raise InputError(f"cannot read {path}: Open3D says {failure[0].rstrip('. ')!r}; write or copy it again")
+        raise InputError(
+            f"cannot read {path}: Open3D says {failure[0].rstrip('. ')!r}; write or copy it again"
+        )
     return geometry
 
 
@@ -78,7 +87,11 @@ def write_geometry(path: Path, geometry) -> None:
     """Write a tensor point cloud or mesh, atomically."""
     import open3d as o3d
 
-    write = o3d.t.io.write_point_cloud if isinstance(geometry, o3d.t.geometry.PointCloud) else o3d.t.io.write_triangle_mesh
+    write = (
+        o3d.t.io.write_point_cloud
+        if isinstance(geometry, o3d.t.geometry.PointCloud)
+        else o3d.t.io.write_triangle_mesh
+    )
     with atomic_path(path) as temporary:
         if not write(str(temporary), geometry):
             raise OSError(f"could not write {path}: is the disk full?")

@@ -1,8 +1,10 @@
 """COLMAP models, read by pycolmap after a look at them.
 
-pycolmap believes the counts in binary files: one that is too large makes it fill the memory, or read on behind the end for ever. In text files a
+pycolmap believes the counts in binary files: one that is too large makes it fill the memory, or read on
+behind the end for ever. In text files a
 count never leads beyond its line. Cameras and poses are not checked by pycolmap at all.
-Layout: https://colmap.github.io/format.html; rigs.bin and frames.bin as COLMAP 3.12 and later write them. Little endian throughout.
+Layout: https://colmap.github.io/format.html; rigs.bin and frames.bin as COLMAP 3.12 and later write them.
+    Little endian throughout.
 """
 
 from __future__ import annotations
@@ -21,8 +23,10 @@ from sc3d.io.limits import FARTHEST, MAX_PIXELS, MAX_SIDE
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")  # rigs and frames only in newer models
 LARGEST = 1 << 62  # count of a list: bounded by the size of the file alone
-POINT = np.array([[0, 43, 0, 0, 0], [8, 8, 0, LARGEST, 0]])  # id, position, colour, error; track of photo and keypoint
-FRAME = np.array([[0, 64, 0, 0, 0], [4, 16, 0, LARGEST, 0]])  # id, rig, rotation, translation; sensor and photo
+# id, position, colour, error; track of photo and keypoint
+POINT = np.array([[0, 43, 0, 0, 0], [8, 8, 0, LARGEST, 0]])
+# id, rig, rotation, translation; sensor and photo
+FRAME = np.array([[0, 64, 0, 0, 0], [4, 16, 0, LARGEST, 0]])
 MAX_NAME = 4096  # bytes of a photo name
 NOT_RIGID = 0.01  # largest error of R R^T: text models are rounded
 
@@ -32,17 +36,25 @@ class _Damage(ValueError):
 
 
 def load_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a model, binary or text; InputError if it is missing, damaged, without photos, or has cameras or poses that are none."""
+    """Read a model, binary or text; InputError if it is missing, damaged, without photos, or has cameras or
+    poses that are none.
+    """
     if not any((folder / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
-        raise InputError(f"no cameras in {folder}: run `sc3d reconstruct PHOTOS SCENE`, or put a COLMAP model there")
+        raise InputError(
+            f"no cameras in {folder}: run `sc3d reconstruct PHOTOS SCENE`, or put a COLMAP model there"
+        )
     check_counts(folder)
     try:
         model = pycolmap.Reconstruction(str(folder))
         images = [model.image(image_id) for image_id in model.reg_image_ids()]
         names = [image.name for image in images]
         poses = [image.cam_from_world() for image in images]
-    except Exception as error:  # pycolmap raises bare RuntimeError, ValueError, IndexError, MemoryError and UnicodeDecodeError for broken files
-        raise InputError(f"cannot read the COLMAP model in {folder}: {(str(error).splitlines() or [type(error).__name__])[0]}") from None
+    # pycolmap raises bare RuntimeError, ValueError, IndexError, MemoryError and UnicodeDecodeError for broken
+    # files
+    except Exception as error:
+        raise InputError(
+            f"cannot read the COLMAP model in {folder}: {(str(error).splitlines() or [type(error).__name__])[0]}"
+        ) from None
     if not images:
         raise InputError(f"the COLMAP model in {folder} has no registered photos")
     for camera_id in sorted({image.camera_id for image in images}):
@@ -53,11 +65,19 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
 
 def _check_camera(camera: pycolmap.Camera, folder: Path) -> None:
     where = f"{folder}: camera {camera.camera_id}"
-    if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE and camera.width * camera.height <= MAX_PIXELS):
-        raise InputError(f"{where} is {camera.width}x{camera.height}: sizes from 1 px to {MAX_PIXELS // 10**6} megapixels are possible")
+    if not (
+        0 < camera.width <= MAX_SIDE
+        and 0 < camera.height <= MAX_SIDE
+        and camera.width * camera.height <= MAX_PIXELS
+    ):
+        raise InputError(
+            f"{where} is {camera.width}x{camera.height}: sizes from 1 px to {MAX_PIXELS // 10**6} megapixels are possible"
+        )
     params = np.array(camera.params)
     if not np.isfinite(params).all() or not (params[list(camera.focal_length_idxs())] > 0).all():
-        raise InputError(f"{where} has parameters that are not finite numbers, or a focal length that is not positive")
+        raise InputError(
+            f"{where} has parameters that are not finite numbers, or a focal length that is not positive"
+        )
 
 
 def _check_poses(poses: list[pycolmap.Rigid3d], names: list[str], folder: Path) -> None:
@@ -65,17 +85,29 @@ def _check_poses(poses: list[pycolmap.Rigid3d], names: list[str], folder: Path) 
     matrices = np.array([pose.matrix() for pose in poses])
     with np.errstate(all="ignore"):
         length = np.linalg.norm([pose.rotation.quat for pose in poses], axis=1)
-        error = np.abs(matrices[:, :, :3] @ matrices[:, :, :3].transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        error = np.abs(matrices[:, :, :3] @ matrices[:, :, :3].transpose(0, 2, 1) - np.eye(3)).max(
+            axis=(1, 2)
+        )
         right = (error < NOT_RIGID) & (length > 0.5) & (np.abs(matrices[:, :, 3]) < FARTHEST).all(axis=1)
     if not right.all():
-        raise InputError(f"{folder}: the pose of photo {names[int(np.argmin(right))]!r} is not a rotation and a finite position")
+        raise InputError(
+            f"{folder}: the pose of photo {names[int(np.argmin(right))]!r} is not a rotation and a finite position"
+        )
 
 
 def check_counts(folder: Path) -> None:
-    """InputError if a file of a binary model is not as long as its counts say, or an id is used twice; a text model is left to pycolmap."""
+    """InputError if a file of a binary model is not as long as its counts say, or an id is used twice; a text
+    model is left to pycolmap.
+    """
     if not all((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D")):
         return
-    walks = {"cameras": _walk_cameras, "rigs": _walk_rigs, "frames": _walk_frames, "images": _walk_images, "points3D": _walk_points}
+    walks = {
+        "cameras": _walk_cameras,
+        "rigs": _walk_rigs,
+        "frames": _walk_frames,
+        "images": _walk_images,
+        "points3D": _walk_points,
+    }
     for name in FILES:
         file = folder / f"{name}.bin"
         if not file.exists():
@@ -84,7 +116,9 @@ def check_counts(folder: Path) -> None:
             _check_file(file, walks[name])
         except (_Damage, struct.error) as error:
             what = str(error) if isinstance(error, _Damage) else "is cut off"
-            raise InputError(f"{file.name} of the COLMAP model in {folder} {what}: it is damaged, write or copy it again") from None
+            raise InputError(
+                f"{file.name} of the COLMAP model in {folder} {what}: it is damaged, write or copy it again"
+            ) from None
 
 
 def _check_file(file: Path, walk: Callable[[mmap.mmap, int], int]) -> None:
@@ -98,7 +132,9 @@ def _check_file(file: Path, walk: Callable[[mmap.mmap, int], int]) -> None:
             raise _Damage(f"announces {count} entries in {len(data)} bytes")
         end = walk(data, count)
         if end != len(data):
-            raise _Damage("is cut off" if end > len(data) else f"has {len(data) - end} bytes more than it announces")
+            raise _Damage(
+                "is cut off" if end > len(data) else f"has {len(data) - end} bytes more than it announces"
+            )
 
 
 def _read(form: str, data: mmap.mmap, position: int) -> tuple:

@@ -22,13 +22,16 @@ if TYPE_CHECKING:
 
     from PIL import Image
 
-FORMATS = ("JPEG", "PNG", "TIFF")  # JPEG holds MPO as well; Pillow knows many more, of which one runs a program
+# JPEG holds MPO as well; Pillow knows many more, of which one runs a program
+FORMATS = ("JPEG", "PNG", "TIFF")
 END_OF_IMAGE, START_OF_SCAN = b"\xff\xd9", 0xDA
 
 
 @contextmanager
 def open_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
-    """A Pillow image of which only the header is read so far. InputError, which calls it `what`, if it is too large or damaged, also inside the block."""
+    """A Pillow image of which only the header is read so far. InputError, which calls it `what`, if it is too
+    large or damaged, also inside the block.
+    """
     pillow = _pillow()
     try:
         if not path.is_file():  # a pipe or a device could be opened, and waited for
@@ -41,21 +44,30 @@ def open_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
     except MemoryError:
         raise InputError(f"the {what} {path} does not fit into the memory: scale it down") from None
     except pillow.DecompressionBombError:
-        raise InputError(f"the {what} {path} has more than {MAX_PIXELS // 10**6} megapixels, which is refused: scale it down") from None
-    except Exception:  # Pillow raises OSError, ValueError, SyntaxError, struct.error, KeyError, TypeError and more for damaged files
-        raise InputError(f"cannot read the {what} {path}: it is missing, damaged or not a JPEG, PNG or TIFF image") from None
+        raise InputError(
+            f"the {what} {path} has more than {MAX_PIXELS // 10**6} megapixels, which is refused: scale it down"
+        ) from None
+    # Pillow raises OSError, ValueError, SyntaxError, struct.error, KeyError, TypeError and more for damaged
+    # files
+    except Exception:
+        raise InputError(
+            f"cannot read the {what} {path}: it is missing, damaged or not a JPEG, PNG or TIFF image"
+        ) from None
 
 
 def _check_size(path: Path, size: tuple[int, int], what: str) -> None:
     if min(size) < 1 or max(size) > MAX_SIDE or size[0] * size[1] > MAX_PIXELS:
-        raise InputError(f"the {what} {path} is {size[0]}x{size[1]}: sizes from 1 px to {MAX_PIXELS // 10**6} megapixels are possible, scale it down")
+        raise InputError(
+            f"the {what} {path} is {size[0]}x{size[1]}: sizes from 1 px to {MAX_PIXELS // 10**6} megapixels are possible, scale it down"
+        )
 
 
 @cache
 def _pillow() -> ModuleType:
     from PIL import Image
 
-    warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # MAX_PIXELS decides, not half of Pillow's own limit
+    # MAX_PIXELS decides, not half of Pillow's own limit
+    warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
     return Image
 
 
@@ -71,7 +83,9 @@ def check_end(path: Path) -> None:
 
 
 def _find_scan(data: mmap.mmap) -> int:
-    """Position of the first coded picture behind all segments, thumbnails among them; -1 if there is none. Coded data never holds the end marker."""
+    """Position of the first coded picture behind all segments, thumbnails among them; -1 if there is none.
+    Coded data never holds the end marker.
+    """
     position = 2
     while position + 4 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
@@ -82,21 +96,31 @@ def _find_scan(data: mmap.mmap) -> int:
             continue
         position += 2 + struct.unpack_from(">H", data, position + 2)[0]
     return -1
+
+
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
 
 def find_photos(folder: Path) -> list[Path]:
-    """Photos of a folder and its subfolders, by name; InputError if there are none, two share a stem, or one is a link that leads elsewhere."""
+    """Photos of a folder and its subfolders, by name; InputError if there are none, two share a stem, or one
+    is a link that leads elsewhere.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: give the folder that holds the photos")
-    photos = sorted(file for file in folder.rglob("*") if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".") and file.is_file())
+    photos = sorted(
+        file
+        for file in folder.rglob("*")
+        if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".") and file.is_file()
+    )
     if not photos:
         raise InputError(f"no photos in {folder}: JPEG, PNG or TIFF files are expected")
     by_stem: dict[str, Path] = {}
     for photo in photos:
         other = by_stem.setdefault(photo.stem, photo)
         if other is not photo:
-            raise InputError(f"{other} and {photo} share the name {photo.stem!r}, by which masks are found: rename one")
+            raise InputError(
+                f"{other} and {photo} share the name {photo.stem!r}, by which masks are found: rename one"
+            )
         require_within(photo, folder)
     return photos
 
@@ -104,11 +128,15 @@ def find_photos(folder: Path) -> list[Path]:
 def require_within(file: Path, folder: Path) -> None:
     """InputError if a file of a folder is a link to a file outside of it; the folder itself may be a link."""
     if not file.resolve().is_relative_to(folder.resolve()):
-        raise InputError(f"{file} is a link that leads out of {folder}: copy the file there, or make the whole folder a link")
+        raise InputError(
+            f"{file} is a link that leads out of {folder}: copy the file there, or make the whole folder a link"
+        )
 
 
 def read_image(path: Path) -> np.ndarray:
-    """(H, W, 3) uint8 RGB, as stored (EXIF orientation is not applied, as in COLMAP); InputError if it is damaged, cut off or too large."""
+    """(H, W, 3) uint8 RGB, as stored (EXIF orientation is not applied, as in COLMAP); InputError if it is
+    damaged, cut off or too large.
+    """
     import cv2
 
     check_photo(path)
@@ -140,7 +168,9 @@ def read_index_image(path: Path) -> np.ndarray:
         if image.mode.startswith("I"):
             raise InputError(f"{path} has 16 bits per pixel: an 8-bit PNG with one id per pixel is expected")
         if image.mode not in ("L", "P", "1"):
-            raise InputError(f"{path} has colours ({image.mode}): an 8-bit PNG with one id per pixel is expected")
+            raise InputError(
+                f"{path} has colours ({image.mode}): an 8-bit PNG with one id per pixel is expected"
+            )
         return np.array(image.convert("L") if image.mode == "1" else image, dtype=np.uint8)
 
 
@@ -148,7 +178,9 @@ def write_image(path: Path, image: np.ndarray) -> None:
     """Write (H, W) or (H, W, 3) uint8 RGB; the suffix chooses the format."""
     import cv2
 
-    done, encoded = cv2.imencode(path.suffix, image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
+    done, encoded = cv2.imencode(
+        path.suffix, image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
+    )
     if not done:
         raise OSError(f"could not encode {path}")
     with atomic_path(path) as temporary:

@@ -22,7 +22,9 @@ def write_json(path: Path, content: object) -> None:
 
 
 def read_json(path: Path, max_bytes: int | None = None) -> object:
-    """Read JSON; InputError if missing, broken or larger than `max_bytes` (decoded, it takes up to 30 times as much)."""
+    """Read JSON; InputError if missing, broken or larger than `max_bytes` (decoded, it takes up to 30 times
+    as much).
+    """
     try:
         if not path.is_file():  # a pipe could be waited for
             raise FileNotFoundError(errno.ENOENT, "No such file")

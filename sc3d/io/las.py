@@ -1,7 +1,9 @@
 """LAS and LAZ files: are header, records and compressed chunks where the counts say?
 
-laspy reads as many records as are announced, whether they are there or not, and lazrs ends the process where a size leads to more memory than there is.
-Layout: ASPRS LAS 1.4 R15; LASzip's VLR and layered chunks as in https://github.com/LASzip/LASzip (laszip_dll, lasreadpoint).
+laspy reads as many records as are announced, whether they are there or not, and lazrs ends the process where
+a size leads to more memory than there is.
+Layout: ASPRS LAS 1.4 R15; LASzip's VLR and layered chunks as in https://github.com/LASzip/LASzip (laszip_dll,
+    lasreadpoint).
 """
 
 from __future__ import annotations
@@ -17,11 +19,13 @@ HEADER, HEADER_14 = 227, 375  # bytes, of versions up to 1.2 and of 1.4
 VLR, EVLR = 54, 60  # bytes of the header of a record
 POINT_SIZES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)  # bytes, smallest possible per point format
 LASZIP = (b"laszip encoded\0\0", 22204)
-ITEM_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}  # bytes per type of item; 0 and 14 are bytes of any number
+# bytes per type of item; 0 and 14 are bytes of any number
+ITEM_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # per type of item; bytes have one each
 POINTWISE, LAYERED = 2, 3  # kinds of compression
 RATIO, SLACK = 300, 1 << 20  # LAZ that claims to expand by more is refused: surveys come to 5 or 20
-VARIABLE, LARGEST_CHUNK = 2**32 - 1, 64 << 20  # points of a chunk that says its number itself; bytes of a chunk larger than its file
+# points of a chunk that says its number itself; bytes of a chunk larger than its file
+VARIABLE, LARGEST_CHUNK = 2**32 - 1, 64 << 20
 STREAMED = -1  # the chunk table's position is at the end of the file
 
 
@@ -97,7 +101,7 @@ def _walk_vlrs(data: mmap.mmap, header: _Header) -> bytes | None:
         if position > header.offset:
             raise _Damage("has a record that reaches into the points")
         if (user, number) == LASZIP:
-            found = data[position - length: position]
+            found = data[position - length : position]
     return found
 
 
@@ -115,7 +119,12 @@ def _check_chunks(data: mmap.mmap, header: _Header, laszip: bytes) -> None:
     num_items = struct.unpack_from("<H", laszip, 32)[0]
     items = [struct.unpack_from("<HHH", laszip, 34 + 6 * row) for row in range(num_items)]
     one_size = chunk != VARIABLE
-    if not one_size and kind != LAYERED or one_size and not 0 < chunk * header.record <= max(LARGEST_CHUNK, header.count * header.record):
+    if (
+        not one_size
+        and kind != LAYERED
+        or one_size
+        and not 0 < chunk * header.record <= max(LARGEST_CHUNK, header.count * header.record)
+    ):
         raise _Damage(f"has compressed chunks of {chunk} points, which cannot be")
     if kind not in (POINTWISE, LAYERED) or sum(size for _, size, _ in items) != header.record:
         raise _Damage("has points that are compressed in an unknown way")
@@ -129,7 +138,9 @@ def _check_chunks(data: mmap.mmap, header: _Header, laszip: bytes) -> None:
     if num_chunks > header.count or (one_size and num_chunks != -(-header.count // chunk)):
         raise _Damage(f"announces {num_chunks} compressed chunks for {header.count} points")
     if kind == LAYERED:
-        _walk_layers(data, header, (table, num_chunks), sum(LAYERS.get(item, size) for item, size, _ in items))
+        _walk_layers(
+            data, header, (table, num_chunks), sum(LAYERS.get(item, size) for item, size, _ in items)
+        )
 
 
 def _walk_layers(data: mmap.mmap, header: _Header, chunks: tuple[int, int], num_layers: int) -> None:

@@ -1,7 +1,9 @@
 """PLY files: the header, and whether the rest is what the header announces.
 
-Open3D reads them with RPly, which writes beyond its buffer for long names, runs for ever over elements without properties, follows vertex numbers that
-do not exist, and leaves what it could not read uninitialised without an error. So everything is checked before.
+Open3D reads them with RPly, which writes beyond its buffer for long names, runs for ever over elements
+without properties, follows vertex numbers that
+do not exist, and leaves what it could not read uninitialised without an error. So everything is checked
+before.
 """
 
 from __future__ import annotations
@@ -15,8 +17,24 @@ import numpy as np
 
 from sc3d.errors import InputError
 
-TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-         "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
+TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 MAX_HEADER = 1 << 16  # bytes
 MAX_WORD, MAX_LINE = 250, 1000  # characters that RPly has room for
@@ -28,7 +46,9 @@ PADDING = 64  # bytes of blanks that may follow
 
 
 class Property(NamedTuple):
-    """A column of an element. dtype: numpy code without byte order, of the items of a list; count: that of the list's length, "" for no list."""
+    """A column of an element. dtype: numpy code without byte order, of the items of a list; count: that of
+    the list's length, "" for no list.
+    """
 
     name: str
     dtype: str
@@ -49,7 +69,9 @@ class Element(NamedTuple):
 
 @dataclass(frozen=True)
 class Header:
-    """order: byte order as in numpy, "" for text; comments: lines without the word; size: bytes of the header."""
+    """order: byte order as in numpy, "" for text; comments: lines without the word; size: bytes of the
+    header.
+    """
 
     order: str
     comments: tuple[str, ...]
@@ -88,13 +110,15 @@ def _parse(lines: list[str], size: int) -> Header:
     for line in lines:
         words = line.split()
         kind = words[0] if words else ""
-        if len(line) > MAX_LINE or (kind not in ("comment", "obj_info") and max(map(len, words), default=0) > MAX_WORD):
+        if len(line) > MAX_LINE or (
+            kind not in ("comment", "obj_info") and max(map(len, words), default=0) > MAX_WORD
+        ):
             raise _LineError(f"{line[:60]!r}... is too long")
         try:
             if kind == "format":
                 orders.append(FORMATS[words[1]])
             elif kind == "comment":
-                comments.append(line[len("comment"):].strip())
+                comments.append(line[len("comment") :].strip())
             elif kind == "element":
                 elements.append((words[1], _count(words[2]), []))
             elif kind == "property":
@@ -141,7 +165,9 @@ def _check_names(tables: tuple[Element, ...]) -> None:
         if found and (len(found) < 3 or len(set(found)) > 1):
             raise _LineError(f"{', '.join(group)} must all be there and of one type")
     if RESERVED & types.keys():
-        raise _LineError(f"a property is called {min(RESERVED & types.keys())!r}, which stands for three others")
+        raise _LineError(
+            f"a property is called {min(RESERVED & types.keys())!r}, which stands for three others"
+        )
     _check_faces(tables, vertex)
 
 
@@ -161,12 +187,19 @@ def _check_once(names: list[str], what: str) -> None:
 
 
 def check_ply(path: Path) -> Header:
-    """Read the header and compare it with the body: counts, lengths of lists, vertex numbers of faces, in text also the words. InputError if anything is wrong."""
+    """Read the header and compare it with the body: counts, lengths of lists, vertex numbers of faces, in
+    text also the words. InputError if anything is wrong.
+    """
     header = read_header(path)
     body = path.stat().st_size - header.size
-    least = sum(element.rows * sum(_least(entry, header.order) for entry in element.properties) for element in header.elements)
+    least = sum(
+        element.rows * sum(_least(entry, header.order) for entry in element.properties)
+        for element in header.elements
+    )
     if body + (0 if header.order else 1) < least:
-        raise InputError(f"{path} is truncated: {least} bytes are announced, {body} are there; write or copy it again")
+        raise InputError(
+            f"{path} is truncated: {least} bytes are announced, {body} are there; write or copy it again"
+        )
     if not header.order:
         _check_text(path, header)
         return header
@@ -176,14 +209,22 @@ def check_ply(path: Path) -> Header:
         end = _skip(path, header, element, data, end)
     rest = len(data) - end
     if rest > PADDING or bytes(data[end:]).strip(b" \t\r\n\0"):
-        raise InputError(f"{path} has {rest} bytes more than its header announces: it is damaged, write or copy it again")
+        raise InputError(
+            f"{path} has {rest} bytes more than its header announces: it is damaged, write or copy it again"
+        )
     return header
 
 
 def read_positions(path: Path, header: Header) -> np.ndarray | None:
-    """(V, 3) float64 x, y, z of the vertices of a checked PLY, which Open3D keeps for clouds only; None unless they are doubles and come first."""
+    """(V, 3) float64 x, y, z of the vertices of a checked PLY, which Open3D keeps for clouds only; None
+    unless they are doubles and come first.
+    """
     vertex = header.elements[0] if header.elements else None
-    names = [] if vertex is None or vertex.name != "vertex" or vertex.has_lists else [entry.name for entry in vertex.properties if entry.dtype == "f8"]
+    names = (
+        []
+        if vertex is None or vertex.name != "vertex" or vertex.has_lists
+        else [entry.name for entry in vertex.properties if entry.dtype == "f8"]
+    )
     if not {"x", "y", "z"} <= set(names):
         return None
     if header.order:
@@ -192,7 +233,9 @@ def read_positions(path: Path, header: Header) -> np.ndarray | None:
         return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     with path.open("rb") as file:
         file.seek(header.size)
-        table = np.fromfile(file, np.float64, vertex.rows * len(vertex.properties), sep=" ").reshape(vertex.rows, -1)
+        table = np.fromfile(file, np.float64, vertex.rows * len(vertex.properties), sep=" ").reshape(
+            vertex.rows, -1
+        )
     columns = [entry.name for entry in vertex.properties]
     return np.stack([table[:, columns.index(axis)] for axis in "xyz"], axis=1)
 
@@ -206,15 +249,28 @@ def _skip(path: Path, header: Header, element: Element, data: np.ndarray, start:
     """Position behind an element's table, in bytes or, for text, in numbers."""
     text = not header.order
     if not element.has_lists:
-        return start + element.rows * (len(element.properties) if text else sum(np.dtype(entry.dtype).itemsize for entry in element.properties))
+        return start + element.rows * (
+            len(element.properties)
+            if text
+            else sum(np.dtype(entry.dtype).itemsize for entry in element.properties)
+        )
     from sc3d.io import record_walk as kernels  # loads numba
 
     vertex = header.element("vertex")
-    fields = np.array([_field(entry, element.name, vertex.rows if vertex else 0) for entry in element.properties], np.int64)
-    found = kernels.walk_numbers(data, start, element.rows, fields) if text else kernels.walk_bytes(data, start, element.rows, fields, header.order == ">")
+    fields = np.array(
+        [_field(entry, element.name, vertex.rows if vertex else 0) for entry in element.properties], np.int64
+    )
+    found = (
+        kernels.walk_numbers(data, start, element.rows, fields)
+        if text
+        else kernels.walk_bytes(data, start, element.rows, fields, header.order == ">")
+    )
     if found[0] < 0:
-        what = {kernels.CUT_OFF: "the file is truncated", kernels.OUT_OF_RANGE: "it names a vertex that does not exist",
-                kernels.WRONG_LENGTH: f"a list has more than {MAX_CORNERS} entries, a negative number of them, or fewer than a face has"}[found[0]]
+        what = {
+            kernels.CUT_OFF: "the file is truncated",
+            kernels.OUT_OF_RANGE: "it names a vertex that does not exist",
+            kernels.WRONG_LENGTH: f"a list has more than {MAX_CORNERS} entries, a negative number of them, or fewer than a face has",
+        }[found[0]]
         raise InputError(f"{path}: in row {found[1]} of {element.name!r} {what}; write or copy it again")
     return found[0]
 
@@ -226,7 +282,13 @@ def _field(entry: Property, element: str, num_vertices: int) -> tuple[int, int, 
         return 0, width, 0, 0, 0
     length, longest = np.dtype(entry.count).itemsize, min(MAX_CORNERS, np.iinfo(entry.count).max)
     if element == "face" and entry.name in CORNERS:
-        return length, width, 3, longest, min(max(num_vertices, 1), np.iinfo(entry.dtype).max + entry.dtype.startswith("u"))
+        return (
+            length,
+            width,
+            3,
+            longest,
+            min(max(num_vertices, 1), np.iinfo(entry.dtype).max + entry.dtype.startswith("u")),
+        )
     return length, width, 0, longest, 0
 
 
@@ -236,7 +298,8 @@ def _check_text(path: Path, header: Header) -> None:
         file.seek(header.size)
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("error", DeprecationWarning)  # how older numpy says that not all could be read
+                # how older numpy says that not all could be read
+                warnings.simplefilter("error", DeprecationWarning)
                 data = np.fromfile(file, np.float64, sep=" ")
         except (ValueError, DeprecationWarning):
             raise InputError(f"{path} has words that are not numbers; write or copy it again") from None
@@ -244,12 +307,16 @@ def _check_text(path: Path, header: Header) -> None:
     for element in header.elements:
         end = _skip(path, header, element, data, position)
         if end > len(data):
-            raise InputError(f"{path} is truncated: {end} numbers are announced, {len(data)} are there; write or copy it again")
+            raise InputError(
+                f"{path} is truncated: {end} numbers are announced, {len(data)} are there; write or copy it again"
+            )
         if not element.has_lists:
             _check_types(path, element, data[position:end].reshape(element.rows, len(element.properties)))
         position = end
     if position < len(data):
-        raise InputError(f"{path} has {len(data) - position} numbers more than its header announces: it is damaged, write or copy it again")
+        raise InputError(
+            f"{path} has {len(data) - position} numbers more than its header announces: it is damaged, write or copy it again"
+        )
 
 
 def _check_types(path: Path, element: Element, table: np.ndarray) -> None:
@@ -260,4 +327,6 @@ def _check_types(path: Path, element: Element, table: np.ndarray) -> None:
             info = np.iinfo(entry.dtype)
             wrong = ~((column >= info.min) & (column <= info.max) & (column == np.floor(column)))
         if wrong.any():
-            raise InputError(f"{path}: {entry.name} of {element.name!r} {int(np.argmax(wrong))} is {column[np.argmax(wrong)]:g}, which its type cannot hold")
+            raise InputError(
+                f"{path}: {entry.name} of {element.name!r} {int(np.argmax(wrong))} is {column[np.argmax(wrong)]:g}, which its type cannot hold"
+            )

@@ -15,7 +15,13 @@ import sc3d
 def digest(path: Path) -> str:
     """Content hash of a file, or of all files of a folder with their names; "" if it does not exist."""
     state = hashlib.blake2b(digest_size=16)
-    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else []
+    files = (
+        [path]
+        if path.is_file()
+        else sorted(file for file in path.rglob("*") if file.is_file())
+        if path.is_dir()
+        else []
+    )
     if not files:
         return ""
     for file in files:
@@ -25,6 +31,8 @@ def digest(path: Path) -> str:
             while chunk := stream.read(1 << 20):
                 state.update(chunk)
     return state.hexdigest()
+
+
 PACKAGES = ("open3d", "numpy", "scipy", "torch", "numba", "pycolmap", "opencv-python-headless")
 
 

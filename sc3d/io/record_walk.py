@@ -1,4 +1,6 @@
-"""Walks along records whose length stands in the file. Nothing is kept, nothing is allocated, and no step leaves the data."""
+"""Walks along records whose length stands in the file. Nothing is kept, nothing is allocated, and no step
+leaves the data.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +12,14 @@ CUT_OFF, WRONG_LENGTH, OUT_OF_RANGE = -1, -2, -3
 
 
 @numba.njit(cache=True)
-def walk_bytes(data: np.ndarray, start: int, count: int, fields: np.ndarray, big_endian: bool) -> tuple[int, int]:
+def walk_bytes(
+    data: np.ndarray, start: int, count: int, fields: np.ndarray, big_endian: bool
+) -> tuple[int, int]:
     """Skip records in binary data.
 
     data: (B,) uint8; start: position of the first record; count: number of records
-    fields: (F, 5) int64 per field of a record: bytes of the count in front of a list, 0 for no list; bytes of the field, or of an item of the list;
+    fields: (F, 5) int64 per field of a record: bytes of the count in front of a list, 0 for no list; bytes of
+        the field, or of an item of the list;
         smallest and largest count that are allowed; items must be smaller than this, 0 = not looked at
     returns: position behind the last record, or a negative code; number of whole records
     """
@@ -42,7 +47,9 @@ def walk_bytes(data: np.ndarray, start: int, count: int, fields: np.ndarray, big
 
 @numba.njit(cache=True)
 def walk_numbers(data: np.ndarray, start: int, count: int, fields: np.ndarray) -> tuple[int, int]:
-    """The same for text whose words were decoded to (W,) float64; of `fields`, widths do not count and a first column > 0 says that it is a list."""
+    """The same for text whose words were decoded to (W,) float64; of `fields`, widths do not count and a
+    first column > 0 says that it is a list.
+    """
     position, size = start, len(data)
     for row in range(count):
         for field in range(len(fields)):

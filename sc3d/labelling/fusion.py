@@ -1,6 +1,7 @@
 """Masks to labels on the cloud: project, vote per voxel, find conflicts, lock (paper sections 3.3 and 4.3).
 
-One vote per view and voxel side; votes are fixed-point integers, so the result does not depend on the order of views or points.
+One vote per view and voxel side; votes are fixed-point integers, so the result does not depend on the order
+of views or points.
 """
 
 from __future__ import annotations
@@ -26,7 +27,13 @@ DISTANCE_STEPS = 16  # of a pixel
 MIDDLE_STEPS = 1 << 16
 
 AS_PRINTED = {  # the paper's own choices, whatever the defaults are
-    "consensus": 1.0, "edge_width": 3.0, "depth_excess": True, "incidence": True, "range": True, "verify": "lock", "reproject": True,
+    "consensus": 1.0,
+    "edge_width": 3.0,
+    "depth_excess": True,
+    "incidence": True,
+    "range": True,
+    "verify": "lock",
+    "reproject": True,
 }
 
 Mask = tuple[np.ndarray, np.ndarray | None]  # (h, w) uint8 labels; (h, w) uint8 confidence or None
@@ -34,7 +41,10 @@ Mask = tuple[np.ndarray, np.ndarray | None]  # (h, w) uint8 labels; (h, w) uint8
 
 @dataclass(frozen=True)
 class Extent:
-    """Of a whole cloud, which decides the voxels and the range at which a vote has full weight. low, high: (3,) world, box around the points; middle: (3,) their median along each axis, to 1 / MIDDLE_STEPS of the box."""
+    """Of a whole cloud, which decides the voxels and the range at which a vote has full weight. low, high:
+    (3,) world, box around the points; middle: (3,) their median along each axis, to 1 / MIDDLE_STEPS of the
+    box.
+    """
 
     low: np.ndarray
     high: np.ndarray
@@ -52,7 +62,8 @@ class Cloud:
     """What is to be labelled.
 
     points: (N, 3) float64 world; normals: (N, 3) float32 unit, towards the outside, or None
-    density: (N,) float32 how much matter there is, for the points' weights inside a voxel, or None = all weigh the same
+    density: (N,) float32 how much matter there is, for the points' weights inside a voxel, or None = all
+        weigh the same
     whole: of the cloud that these points are a part of; None = they are all
     """
 
@@ -68,7 +79,9 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Fusion:
-    """Result of `fuse`: labels per point, the voxel field, and the cell of the field that each point belongs to."""
+    """Result of `fuse`: labels per point, the voxel field, and the cell of the field that each point belongs
+    to.
+    """
 
     labels: Labels
     field: VoxelField
@@ -80,7 +93,14 @@ class Fusion:
         return self.field.votes[self.cells].astype(np.float32) / SCALE
 
 
-def fuse(cloud: Cloud, views: list[View], read_mask: Callable[[View], Mask], surface: RayTarget | None, num_ids: int, settings: Label) -> Fusion:
+def fuse(
+    cloud: Cloud,
+    views: list[View],
+    read_mask: Callable[[View], Mask],
+    surface: RayTarget | None,
+    num_ids: int,
+    settings: Label,
+) -> Fusion:
     """Fuse the masks of all views into labels of the cloud.
 
     read_mask: mask of a view, any size of the photo's aspect; masks are streamed
@@ -90,7 +110,9 @@ def fuse(cloud: Cloud, views: list[View], read_mask: Callable[[View], Mask], sur
     if settings.method == "paper":
         settings = replace(settings, **AS_PRINTED)
     extent = cloud.extent
-    ballot, field = open_ballot(cloud, voxel_origin(extent.low, settings.voxel_size), settings.voxel_size, num_ids)
+    ballot, field = open_ballot(
+        cloud, voxel_origin(extent.low, settings.voxel_size), settings.voxel_size, num_ids
+    )
     rules = _rules(extent.middle, views, settings)
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     views = [view for view in views if may_see(view, low, high)]
@@ -103,12 +125,21 @@ def fuse(cloud: Cloud, views: list[View], read_mask: Callable[[View], Mask], sur
 
 
 def count_steps(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(3, MIDDLE_STEPS) int64 points in each of the steps between low and high (3,) along each axis: counts of parts of a cloud add up to those of the whole."""
+    """(3, MIDDLE_STEPS) int64 points in each of the steps between low and high (3,) along each axis: counts
+    of parts of a cloud add up to those of the whole.
+    """
     size = np.maximum(high - low, 1e-300)
-    return np.stack([
-        np.bincount(np.minimum((points[:, axis] - low[axis]) / size[axis] * MIDDLE_STEPS, MIDDLE_STEPS - 1).astype(np.int32), minlength=MIDDLE_STEPS)
-        for axis in range(3)
-    ])
+    return np.stack(
+        [
+            np.bincount(
+                np.minimum(
+                    (points[:, axis] - low[axis]) / size[axis] * MIDDLE_STEPS, MIDDLE_STEPS - 1
+                ).astype(np.int32),
+                minlength=MIDDLE_STEPS,
+            )
+            for axis in range(3)
+        ]
+    )
 
 
 def middle_of(counts: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -119,22 +150,39 @@ def middle_of(counts: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarr
 
 
 def _rules(middle: np.ndarray, views: list[View], settings: Label) -> Rules:
-    reference_depth = float(np.median([np.linalg.norm(view.centre - middle) for view in views])) if views else 1.0
+    reference_depth = (
+        float(np.median([np.linalg.norm(view.centre - middle) for view in views])) if views else 1.0
+    )
     equal = settings.method in ("direct", "majority")
-    return Rules(settings.voxel_size, reference_depth, settings.depth_excess, settings.incidence, settings.range, equal, settings.reproject)
+    return Rules(
+        settings.voxel_size,
+        reference_depth,
+        settings.depth_excess,
+        settings.incidence,
+        settings.range,
+        equal,
+        settings.reproject,
+    )
 
 
-def _pictures(views: list[View], read_mask: Callable[[View], Mask], surface: RayTarget | None, settings: Label) -> Iterator[tuple[View, Picture]]:
-    """Views in the order of their names, at the size of their masks, with what they say; the next one is prepared meanwhile."""
+def _pictures(
+    views: list[View], read_mask: Callable[[View], Mask], surface: RayTarget | None, settings: Label
+) -> Iterator[tuple[View, Picture]]:
+    """Views in the order of their names, at the size of their masks, with what they say; the next one is
+    prepared meanwhile.
+    """
     ordered = sorted(views, key=lambda view: view.name)
 
     def prepare(view: View) -> tuple[View, Picture]:
         mask, confidence = read_mask(view)
         sized = view.resized(mask.shape[1], mask.shape[0])
         ranges = np.empty((0, 0), np.float32) if surface is None else first_surface(surface, sized).range
-        return sized, picture_of(mask, confidence if settings.use_confidence else None, edge_distance(mask), ranges, settings)
+        return sized, picture_of(
+            mask, confidence if settings.use_confidence else None, edge_distance(mask), ranges, settings
+        )
 
-    with ThreadPoolExecutor(1) as worker:  # what runs on one core only overlaps with the votes of the view before
+    # what runs on one core only overlaps with the votes of the view before
+    with ThreadPoolExecutor(1) as worker:
         pending = [worker.submit(prepare, view) for view in ordered[:1]]
         for following in [*ordered[1:], None]:
             ready = pending.pop().result() if pending else None
@@ -144,10 +192,13 @@ def _pictures(views: list[View], read_mask: Callable[[View], Mask], surface: Ray
                 yield ready
 
 
-def picture_of(mask: np.ndarray, confidence: np.ndarray | None, edge: np.ndarray, ranges: np.ndarray, settings: Label) -> Picture:
+def picture_of(
+    mask: np.ndarray, confidence: np.ndarray | None, edge: np.ndarray, ranges: np.ndarray, settings: Label
+) -> Picture:
     """Weight of each mask pixel: confidence x distance to the mask's edges.
 
-    mask: (H, W) uint8; confidence: (H, W) uint8 or None; edge: (H, W) float32 px; ranges: (H, W) float32 or (0, 0)
+    mask: (H, W) uint8; confidence: (H, W) uint8 or None; edge: (H, W) float32 px; ranges: (H, W) float32 or
+        (0, 0)
     """
     weights = np.ones(mask.shape, np.float32) if confidence is None else confidence * np.float32(1 / 255)
     if settings.edge_width > 0:
@@ -156,23 +207,33 @@ def picture_of(mask: np.ndarray, confidence: np.ndarray | None, edge: np.ndarray
 
 
 def distance_weights(width: float) -> np.ndarray:
-    """(T,) float32 table of 1 - exp(-distance / width), distance in steps of 1 / DISTANCE_STEPS px; the last entry, 1, holds from there on."""
-    table = -np.expm1(-np.arange(int(12 * width * DISTANCE_STEPS) + 2) / (width * DISTANCE_STEPS)).astype(np.float32)
+    """(T,) float32 table of 1 - exp(-distance / width), distance in steps of 1 / DISTANCE_STEPS px; the last
+    entry, 1, holds from there on.
+    """
+    table = -np.expm1(-np.arange(int(12 * width * DISTANCE_STEPS) + 2) / (width * DISTANCE_STEPS)).astype(
+        np.float32
+    )
     table[-1] = 1
     return table
 
 
 @numba.njit(parallel=True, cache=True)
 def weigh_distance(distance, table, weights):
-    """Multiply weights (H, W) float32 by the table's entry for each distance (H, W) float32, px; exponentials of all pixels would cost 5 times as much."""
+    """Multiply weights (H, W) float32 by the table's entry for each distance (H, W) float32, px; exponentials
+    of all pixels would cost 5 times as much.
+    """
     for row in numba.prange(distance.shape[0]):
         for column in range(distance.shape[1]):
-            step = int(min(distance[row, column] * DISTANCE_STEPS + np.float32(0.5), np.float32(len(table) - 1)))
+            step = int(
+                min(distance[row, column] * DISTANCE_STEPS + np.float32(0.5), np.float32(len(table) - 1))
+            )
             weights[row, column] *= table[step]
 
 
 def edge_distance(mask: np.ndarray) -> np.ndarray:
-    """(H, W) float32 distance of each pixel to the nearest pixel of another label, px; large where there is only one label."""
+    """(H, W) float32 distance of each pixel to the nearest pixel of another label, px; large where there is
+    only one label.
+    """
     differs = np.zeros(mask.shape, bool)
     differs[:, 1:] |= mask[:, 1:] != mask[:, :-1]
     differs[:, :-1] |= differs[:, 1:]
@@ -191,7 +252,9 @@ def _decide(ballot: Ballot, settings: Label) -> Labels:
         overlay = np.empty_like(ballot.overlay)
         overlay[ballot.order] = ballot.overlay
         seen = overlay > 0
-        return Labels(overlay, seen.astype(np.float32), np.where(seen, SEED, UNSEEN).astype(np.uint8), num_views)
+        return Labels(
+            overlay, seen.astype(np.float32), np.where(seen, SEED, UNSEEN).astype(np.uint8), num_views
+        )
     winner, share = _winner(ballot.votes)
     doubted = np.zeros(len(winner), bool)
     if settings.verify != "no" and settings.method != "majority":
@@ -213,7 +276,9 @@ def _decide(ballot: Ballot, settings: Label) -> Labels:
 
 
 def _winner(votes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(cells,) uint8 label with most votes (0 = no votes; ties: smallest id) and its float32 share of the votes."""
+    """(cells,) uint8 label with most votes (0 = no votes; ties: smallest id) and its float32 share of the
+    votes.
+    """
     label = votes[:, 1:].argmax(axis=1) + 1
     total = votes[:, 1:].sum(axis=1)
     share = votes[np.arange(len(votes)), label] / np.maximum(total, 1)

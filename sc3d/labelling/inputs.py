@@ -1,4 +1,6 @@
-"""What a scene gives to be labelled: its masks and its cloud, checked, and the rules for what depends on both."""
+"""What a scene gives to be labelled: its masks and its cloud, checked, and the rules for what depends on
+both.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ FOOTPRINT_SAMPLE = 1000
 
 @dataclass(frozen=True)
 class Masks:
-    """The masks of a scene: files by view name, confidence maps where there are any, and the views that have a mask."""
+    """The masks of a scene: files by view name, confidence maps where there are any, and the views that have
+    a mask.
+    """
 
     files: dict[str, Path]
     confidences: dict[str, Path]
@@ -30,20 +34,36 @@ class Masks:
 
     @classmethod
     def of(cls, scene: Scene, confidence: Path | None) -> Masks:
-        """Masks of a scene, and confidence maps in a folder if it exists, all checked; InputError for what does not fit."""
-        scene.require(scene.classes, hint="pass --classes FILE to `sc3d run`, or copy data/classes.json of the sc3d repository there and edit it")
+        """Masks of a scene, and confidence maps in a folder if it exists, all checked; InputError for what
+        does not fit.
+        """
+        scene.require(
+            scene.classes,
+            hint="pass --classes FILE to `sc3d run`, or copy data/classes.json of the sc3d repository there and edit it",
+        )
         scene.require(scene.masks, hint="run `sc3d segment SCENE` first, with --masks if you have some")
         files = scene.mask_files(scene.masks, scene.class_table())
         confidences = scene.mask_files(confidence) if confidence is not None and confidence.is_dir() else {}
-        different = next((name for name, path in confidences.items() if name in files and image_size(path) != image_size(files[name])), None)
+        different = next(
+            (
+                name
+                for name, path in confidences.items()
+                if name in files and image_size(path) != image_size(files[name])
+            ),
+            None,
+        )
         if different:
-            raise InputError(f"{confidences[different]} has another size than its mask: both must be the same")
+            raise InputError(
+                f"{confidences[different]} has another size than its mask: both must be the same"
+            )
         return cls(files, confidences, [view for view in scene.model.views if view.name in files])
 
     def read(self, view: View) -> Mask:
         """As `fuse` wants it."""
         confidence = self.confidences.get(view.name)
-        return read_index_image(self.files[view.name]), None if confidence is None else read_index_image(confidence)
+        return read_index_image(self.files[view.name]), None if confidence is None else read_index_image(
+            confidence
+        )
 
 
 def best_confidence(scene: Scene) -> Path:
@@ -57,7 +77,9 @@ def read_given_cloud(scene: Scene, file: Path | None) -> o3d.t.geometry.PointClo
     if file is None and not source.exists():
         source = scene.mesh
     if not source.exists():
-        raise InputError(f"{scene.path} has neither cloud.ply nor mesh.ply: run `sc3d extract SCENE`, or pass --cloud FILE")
+        raise InputError(
+            f"{scene.path} has neither cloud.ply nor mesh.ply: run `sc3d extract SCENE`, or pass --cloud FILE"
+        )
     return read_cloud(source)
 
 
@@ -67,7 +89,9 @@ def default_voxel_size(points: np.ndarray, masks: Masks) -> float:
 
 
 def voxel_size_for(spacing: float, sample: np.ndarray, masks: Masks) -> float:
-    """2 point spacings, at least 1.5 times the median size of a mask pixel on the cloud, of which `sample` (S, 3) are some points."""
+    """2 point spacings, at least 1.5 times the median size of a mask pixel on the cloud, of which `sample`
+    (S, 3) are some points.
+    """
     footprints = []
     for view in masks.views:
         focal = view.focal * image_size(masks.files[view.name])[0] / view.width
@@ -75,12 +99,22 @@ def voxel_size_for(spacing: float, sample: np.ndarray, masks: Masks) -> float:
     return max(2 * spacing, 1.5 * float(np.median(footprints)))
 
 
-def point_density(scene: Scene, points: np.ndarray, voxel_size: float, origin: np.ndarray | None = None) -> np.ndarray:
-    """(N,) density of the Gaussians at the points, or of the points themselves where there are none; origin: (3,) of the label voxels, None = the points' own."""
+def point_density(
+    scene: Scene, points: np.ndarray, voxel_size: float, origin: np.ndarray | None = None
+) -> np.ndarray:
+    """(N,) density of the Gaussians at the points, or of the points themselves where there are none; origin:
+    (3,) of the label voxels, None = the points' own.
+    """
     if not scene.gaussians.exists():
         return kernel_density(points, voxel_size, origin)
     from sc3d.splatting.dataset import load_gaussians  # loads torch
 
     gaussians, origin = load_gaussians(scene)
-    rotations, scales, opacities = (values.numpy() for values in (gaussians.rotations, gaussians.scales, gaussians.opacities))
-    return gaussian_density(points, GaussianField(gaussians.means.numpy().astype(np.float64) + origin, rotations, scales, opacities), voxel_size)
+    rotations, scales, opacities = (
+        values.numpy() for values in (gaussians.rotations, gaussians.scales, gaussians.opacities)
+    )
+    return gaussian_density(
+        points,
+        GaussianField(gaussians.means.numpy().astype(np.float64) + origin, rotations, scales, opacities),
+        voxel_size,
+    )

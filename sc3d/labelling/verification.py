@@ -1,7 +1,10 @@
-"""Two-way verification: what the fused labels say is held against what each view said, place by place (METHOD 3.8).
+"""Two-way verification: what the fused labels say is held against what each view said, place by place (METHOD
+3.8).
 
-A segmenter errs by whole segments, so a view that contradicts the fused labels around a place is doubted in all it says there.
-The votes of each view and cell wait in a temporary file: memory does not grow with the number of views, and no ray is cast again.
+A segmenter errs by whole segments, so a view that contradicts the fused labels around a place is doubted in
+all it says there.
+The votes of each view and cell wait in a temporary file: memory does not grow with the number of views, and
+no ray is cast again.
 """
 
 from __future__ import annotations
@@ -16,14 +19,17 @@ import numpy as np
 
 from sc3d.geometry.voxels import AXIS_BITS
 
-PRIOR_VIEWS, PRIOR_SHARE = 2.0, 0.8  # belief in a view where it says little: as if so many of its votes had been right at this rate
+# belief in a view where it says little: as if so many of its votes had been right at this rate
+PRIOR_VIEWS, PRIOR_SHARE = 2.0, 0.8
 MIN_RELIABILITY = 0.05
 NEIGHBOR_WEIGHTS = (8, 4, 2, 1)  # of the blocks around a place, by the number of axes along which they differ
 
 
 @dataclass(frozen=True)
 class Places:
-    """Where a view's reliability is judged: B blocks. of_cell: (K,) int64 block of each cell; neighbors: (B, 27) as `neighbor_blocks` gives."""
+    """Where a view's reliability is judged: B blocks. of_cell: (K,) int64 block of each cell; neighbors: (B,
+    27) as `neighbor_blocks` gives.
+    """
 
     of_cell: np.ndarray
     neighbors: np.ndarray
@@ -31,7 +37,9 @@ class Places:
 
 @dataclass
 class VoteLog:
-    """One entry per view: the cells that it voted on, their label with the most weight, and that weight in fixed point."""
+    """One entry per view: the cells that it voted on, their label with the most weight, and that weight in
+    fixed point.
+    """
 
     counts: list[int] = field(default_factory=list)
     file: BinaryIO = field(default_factory=tempfile.TemporaryFile)
@@ -47,15 +55,20 @@ class VoteLog:
         """Cells int32, labels uint8 and weights uint16 of each view, in turn."""
         self.file.seek(0)
         for count in self.counts:
-            yield tuple(np.frombuffer(self.file.read(count * np.dtype(kind).itemsize), kind) for kind in (np.int32, np.uint8, np.uint16))
+            yield tuple(
+                np.frombuffer(self.file.read(count * np.dtype(kind).itemsize), kind)
+                for kind in (np.int32, np.uint8, np.uint16)
+            )
 
 
 def verify(log: VoteLog, winner: np.ndarray, places: Places, full_vote: int, votes: np.ndarray) -> np.ndarray:
-    """Vote again: each view's vote times the square of its reliability there, the share of its votes nearby that agree with the winners.
+    """Vote again: each view's vote times the square of its reliability there, the share of its votes nearby
+    that agree with the winners.
 
     winner: (K,) uint8 fused labels; full_vote: the largest weight
     votes: (K, C) int32, overwritten except for channel 0
-    returns: (K,) bool, at least half of the views that voted for the winner are reliable (above 1/2) around the cell
+    returns: (K,) bool, at least half of the views that voted for the winner are reliable (above 1/2) around
+        the cell
     """
     votes[:, 1:] = 0
     balance = np.zeros(len(winner), np.int32)
@@ -68,7 +81,14 @@ def verify(log: VoteLog, winner: np.ndarray, places: Places, full_vote: int, vot
 
 def neighbor_blocks(keys: np.ndarray) -> np.ndarray:
     """(B, 27) int64 rows of the blocks around each of the packed blocks (B,), rising; -1 where there is none."""
-    steps = np.array([(x << AXIS_BITS << AXIS_BITS) + (y << AXIS_BITS) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
+    steps = np.array(
+        [
+            (x << AXIS_BITS << AXIS_BITS) + (y << AXIS_BITS) + z
+            for x in (-1, 0, 1)
+            for y in (-1, 0, 1)
+            for z in (-1, 0, 1)
+        ]
+    )
     wanted = keys[:, None] + steps
     rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     return np.where(keys[rows] == wanted, rows, -1)
@@ -76,7 +96,9 @@ def neighbor_blocks(keys: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, error_model="numpy")
 def _reliability(cells, labels, weights, winner, block_of_cell, neighbors, prior):
-    """(B,) share of the view's votes in and around each block that agree with the winners; integer sums, so no order matters."""
+    """(B,) share of the view's votes in and around each block that agree with the winners; integer sums, so
+    no order matters.
+    """
     sums = np.zeros((len(neighbors), 2), np.int64)
     for k in range(len(cells)):
         cell = cells[k]
@@ -99,7 +121,9 @@ def _reliability(cells, labels, weights, winner, block_of_cell, neighbors, prior
 
 @numba.njit(cache=True)
 def _add(cells, labels, weights, winner, reliability, votes, balance):
-    """Add a view's votes (channel `label`) and whether it is reliable where it voted for the winner (balance)."""
+    """Add a view's votes (channel `label`) and whether it is reliable where it voted for the winner
+    (balance).
+    """
     for k in range(len(cells)):
         trusted = max(reliability[k], MIN_RELIABILITY)
         votes[cells[k], labels[k]] += np.int32(weights[k] * trusted * trusted + 0.5)

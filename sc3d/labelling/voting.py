@@ -1,6 +1,8 @@
-"""One pass per view over all points: projection, visibility, weights and votes, fused (slow twin: tests/test_voting.py).
+"""One pass per view over all points: projection, visibility, weights and votes, fused (slow twin:
+tests/test_voting.py).
 
-Points are sorted by cell once. A thread owns whole blocks of cells, so votes need no atomics; they are integers, so no order matters.
+Points are sorted by cell once. A thread owns whole blocks of cells, so votes need no atomics; they are
+integers, so no order matters.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ CHUNK = 500_000  # points projected by pycolmap at a time
 
 
 class Said(NamedTuple):
-    """What one view says about each cell: (K,) uint8 label with the most weight, 0 = nothing; (K,) uint16 that weight, fixed point."""
+    """What one view says about each cell: (K,) uint8 label with the most weight, 0 = nothing; (K,) uint16
+    that weight, fixed point.
+    """
 
     labels: np.ndarray
     weights: np.ndarray
@@ -31,7 +35,8 @@ class Said(NamedTuple):
 class Ballot:
     """Votes of all views. Channel 0 of the votes counts views, because label 0 never votes.
 
-    cloud: the points; order: (N,) rows of the sorted points in the given cloud; field_cells: (K,) int64 row of each cell in `VoxelField.votes`
+    cloud: the points; order: (N,) rows of the sorted points in the given cloud; field_cells: (K,) int64 row
+        of each cell in `VoxelField.votes`
     block_keys: (B,) int64 packed positions of the blocks, rising
     votes, strict: (K, num_ids) int32, the second without mask edges, grazing views and doubtful depth
     overlay: (N,) uint8 label of the last view that saw a point, sorted; log: the votes view by view
@@ -49,11 +54,22 @@ class Ballot:
     def cast(self, view: View, picture: Picture, rules: Rules) -> None:
         """Add one view: each cell gets the mean of its sightings."""
         said = Said(np.zeros(len(self.votes), np.uint8), np.zeros(len(self.votes), np.uint16))
-        cast_votes(self.cloud, lens_of(view, self.cloud.points), picture, rules, self.votes, self.strict, self.overlay, *said)
+        cast_votes(
+            self.cloud,
+            lens_of(view, self.cloud.points),
+            picture,
+            rules,
+            self.votes,
+            self.strict,
+            self.overlay,
+            *said,
+        )
         self.log.append(*said)
 
     def verified(self, winner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Votes (K, num_ids) with each view's reliability, and which cells pass (K,) bool, as `verification.verify` has it; winner: (K,) uint8."""
+        """Votes (K, num_ids) with each view's reliability, and which cells pass (K,) bool, as
+        `verification.verify` has it; winner: (K,) uint8.
+        """
         of_cell = np.repeat(np.arange(len(self.cloud.blocks) - 1), np.diff(self.cloud.blocks))
         votes = self.votes.copy()
         passed = verify(self.log, winner, Places(of_cell, neighbor_blocks(self.block_keys)), SCALE, votes)
@@ -74,7 +90,9 @@ class Points(Protocol):
     density: np.ndarray | None
 
 
-def open_ballot(given: Points, origin: np.ndarray, voxel_size: float, num_ids: int) -> tuple[Ballot, VoxelField]:
+def open_ballot(
+    given: Points, origin: np.ndarray, voxel_size: float, num_ids: int
+) -> tuple[Ballot, VoxelField]:
     """Sort the points into cells of a grid with its zero at `origin` (3,) world; no votes yet."""
     points, normals, density = given.points, given.normals, given.density
     sorting = sort_by_voxel(points, voxel_size, origin)
@@ -85,11 +103,22 @@ def open_ballot(given: Points, origin: np.ndarray, voxel_size: float, num_ids: i
     centres, radii = np.empty((len(blocks) - 1, 3)), np.empty(len(blocks) - 1)
     ordered = np.ascontiguousarray(points[order], np.float64)
     _bound(ordered, cells, blocks, centres, radii)
-    turned = np.empty((0, 3), np.float32) if normals is None else np.ascontiguousarray(normals[order], np.float32)
+    turned = (
+        np.empty((0, 3), np.float32) if normals is None else np.ascontiguousarray(normals[order], np.float32)
+    )
     votes = np.zeros((len(field_cells), num_ids), np.int32)
     weights = np.empty(0, np.uint16) if density is None else voxel_shares(density, sorting)[order]
     cloud = SortedCloud(ordered, turned, weights, cells, blocks, facing, centres, radii)
-    return Ballot(cloud, order, field_cells, np.unique(sorting.keys // VOXELS), votes, np.zeros_like(votes), np.zeros(len(points), np.uint8), VoteLog()), field
+    return Ballot(
+        cloud,
+        order,
+        field_cells,
+        np.unique(sorting.keys // VOXELS),
+        votes,
+        np.zeros_like(votes),
+        np.zeros(len(points), np.uint8),
+        VoteLog(),
+    ), field
 
 
 def lens_of(view: View, points: np.ndarray) -> Lens:
@@ -97,12 +126,30 @@ def lens_of(view: View, points: np.ndarray) -> Lens:
     parameters = opencv_parameters(view.camera)
     pixels = np.empty((0, 2))
     if parameters is None:
-        parameters, pixels = np.zeros(8), np.concatenate([project(view, points[start : start + CHUNK])[0] for start in range(0, len(points), CHUNK)])
-    return Lens(view.cam_from_world, view.centre, view.cone_cosine, view.frustum, view.width, view.height, parameters, pixels)
+        parameters, pixels = (
+            np.zeros(8),
+            np.concatenate(
+                [project(view, points[start : start + CHUNK])[0] for start in range(0, len(points), CHUNK)]
+            ),
+        )
+    return Lens(
+        view.cam_from_world,
+        view.centre,
+        view.cone_cosine,
+        view.frustum,
+        view.width,
+        view.height,
+        parameters,
+        pixels,
+    )
 
 
-def _cells(sorting: VoxelOrder, normals: np.ndarray | None, field: VoxelField) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Order of the points by cell, first point of each cell and, per cell, its row in the field's votes and whether its points must face the camera."""
+def _cells(
+    sorting: VoxelOrder, normals: np.ndarray | None, field: VoxelField
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Order of the points by cell, first point of each cell and, per cell, its row in the field's votes and
+    whether its points must face the camera.
+    """
     voxel_cells = field.find_keys(sorting.keys)
     if normals is None:
         return sorting.order, sorting.starts, voxel_cells, np.zeros(len(voxel_cells), bool)
@@ -132,6 +179,7 @@ def _partition(order, starts, sides, result, counts):
 
 @numba.njit(parallel=True, cache=True)
 def _bound(points, cells, blocks, centres, radii):
+    """Arrays as in SortedCloud."""
     for block in numba.prange(len(blocks) - 1):
         first, last = cells[blocks[block]], cells[blocks[block + 1]]
         squared = 0.0

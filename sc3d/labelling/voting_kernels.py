@@ -1,6 +1,7 @@
 """The kernels of `voting`: one pass per view over all sorted points, and the records that they read.
 
-What takes records of arrays is inlined: a call would count references to every array for every point (3 times slower).
+What takes records of arrays is inlined: a call would count references to every array for every point (3 times
+slower).
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ class Lens(NamedTuple):
     """A view for kernels.
 
     cam_from_world: (4, 4); centre: (3,) world; cone, frustum: as in `View`; width, height: px
-    parameters: (8,) as in `opencv_parameters`; unused if pixels: (N, 2) float64 holds the projections of all points, else (0, 2)
+    parameters: (8,) as in `opencv_parameters`; unused if pixels: (N, 2) float64 holds the projections of all
+        points, else (0, 2)
     """
 
     cam_from_world: np.ndarray
@@ -59,7 +61,8 @@ class Lens(NamedTuple):
 class Picture(NamedTuple):
     """What a view says, one value per pixel, (H, W).
 
-    labels: uint8, 0 = does not vote; weights: float32 in [0, 1]; strict: bool, may take part in the second vote
+    labels: uint8, 0 = does not vote; weights: float32 in [0, 1]; strict: bool, may take part in the second
+        vote
     ranges: float32 first surface; (0, 0) = no occlusion test
     """
 
@@ -70,7 +73,8 @@ class Picture(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """How a sighting is weighed: which factors count (the others are 1), and the depth at which the range factor is 1; `equal` = all weigh 1;
+    """How a sighting is weighed: which factors count (the others are 1), and the depth at which the range
+    factor is 1; `equal` = all weigh 1;
     `second` = strict sightings are also voted on apart."""
 
     voxel_size: float
@@ -111,7 +115,9 @@ def _in_frustum(lens, centre, radius):
     x, y, z = to_camera(lens, centre[0], centre[1], centre[2])
     inside = True
     for side in range(4):
-        inside &= lens.frustum[side, 0] * x + lens.frustum[side, 1] * y + lens.frustum[side, 2] * z <= radius + 1e-9 * abs(z)
+        inside &= lens.frustum[side, 0] * x + lens.frustum[side, 1] * y + lens.frustum[
+            side, 2
+        ] * z <= radius + 1e-9 * abs(z)
     return inside
 
 
@@ -127,7 +133,9 @@ def _see(cloud, lens, picture, rules, cell, point):
     occluding, cosine = picture.ranges.size > 0, 1.0
     if cloud.normals.shape[0]:
         nx, ny, nz = cloud.normals[point, 0], cloud.normals[point, 1], cloud.normals[point, 2]
-        cosine = (nx * (lens.centre[0] - x) + ny * (lens.centre[1] - y) + nz * (lens.centre[2] - z)) / distance
+        cosine = (
+            nx * (lens.centre[0] - x) + ny * (lens.centre[1] - y) + nz * (lens.centre[2] - z)
+        ) / distance
         if occluding and cosine <= 0 and cloud.facing[cell]:
             return nothing
         cosine = abs(cosine)
@@ -150,11 +158,17 @@ def _see(cloud, lens, picture, rules, cell, point):
         weight *= cosine if rules.incidence else 1.0
         weight *= min(rules.reference_depth / depth, 1.0) if rules.range else 1.0
         weight = min(max(weight, MIN_WEIGHT), 1.0)
-    return row, column, weight, rules.second and picture.strict[row, column] and excess <= STRICT_EXCESS and cosine >= GRAZING
+    return (
+        row,
+        column,
+        weight,
+        rules.second and picture.strict[row, column] and excess <= STRICT_EXCESS and cosine >= GRAZING,
+    )
 
 
 @numba.njit(parallel=True, cache=True, error_model="numpy")
 def cast_votes(cloud, lens, picture, rules, votes, strict, overlay, said_labels, said_weights):
+    """Arrays as in Ballot."""
     num_ids = votes.shape[1]
     for block in numba.prange(len(cloud.blocks) - 1):
         if not _in_frustum(lens, cloud.centres[block], cloud.radii[block]):
@@ -183,7 +197,9 @@ def cast_votes(cloud, lens, picture, rules, votes, strict, overlay, said_labels,
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _add_mean(sums, which, count, votes, cell):
-    """Add a view's mean sighting, row `which` of the sums, to a cell's votes and clear it; returns the label with the most weight, and that weight."""
+    """Add a view's mean sighting, row `which` of the sums, to a cell's votes and clear it; returns the label
+    with the most weight, and that weight.
+    """
     votes[cell, 0] += 1
     best = most = 0
     for label in range(1, sums.shape[1]):

@@ -1,9 +1,14 @@
-"""Colour and relief as two more raters (METHOD section 6): what agreed points of each class look like, as joint histograms.
+"""Colour and relief as two more raters (METHOD section 6): what agreed points of each class look like, as
+joint histograms.
 
-The masks' errors are shared between views, so no voting removes them. Colour and relief (height above the ground around, roughness, slope) err
-otherwise. Each rater alone is poor; their product is good, because the two hardly depend on one another once the class is known, and because
-neither can learn what only their combination would tell apart: errors of the masks such as "flat, low and dark: tree".
-Counts are integers and bins are quantiles, so nothing depends on the order of points or the unit of length, and parts of a cloud add up to the whole.
+The masks' errors are shared between views, so no voting removes them. Colour and relief (height above the
+ground around, roughness, slope) err
+otherwise. Each rater alone is poor; their product is good, because the two hardly depend on one another once
+the class is known, and because
+neither can learn what only their combination would tell apart: errors of the masks such as "flat, low and
+dark: tree".
+Counts are integers and bins are quantiles, so nothing depends on the order of points or the unit of length,
+and parts of a cloud add up to the whole.
 """
 
 from __future__ import annotations
@@ -23,12 +28,15 @@ UNKNOWN = np.log(0.05)  # their probability of a class they do not know
 MIN_SKILL = 0.5  # share of the errors of "always the commonest class" that they must avoid on points held out
 FOLD_BLOCKS = 8  # blocks along the longest side of the cloud; every other one is held out, as on a chessboard
 
-Lesson = tuple[np.ndarray, ...]  # per group of features, (cells, C) int64 examples of each class; lessons of parts add up
+# per group of features, (cells, C) int64 examples of each class; lessons of parts add up
+Lesson = tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True)
 class Cells:
-    """The histogram cell of each point: cell (N,) int32, of prod(shape) cells; blur: standard deviation in bins."""
+    """The histogram cell of each point: cell (N,) int32, of prod(shape) cells; blur: standard deviation in
+    bins.
+    """
 
     cell: np.ndarray
     shape: tuple[int, ...]
@@ -45,18 +53,30 @@ class Cells:
 
     def count(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> np.ndarray:
         """(cells, C) int64 examples of each class; label: (N,) in 1..C at the examples (N,) bool."""
-        counts = np.bincount(self.cell[examples].astype(np.int64) * num_classes + (label[examples] - 1), minlength=int(np.prod(self.shape)) * num_classes)
+        counts = np.bincount(
+            self.cell[examples].astype(np.int64) * num_classes + (label[examples] - 1),
+            minlength=int(np.prod(self.shape)) * num_classes,
+        )
         return counts.reshape(-1, num_classes)
 
     def table(self, counts: np.ndarray) -> np.ndarray:
         """(cells, C) log of the class shares in each cell, from the counts (cells, C)."""
-        blurred = [gaussian_filter(part.reshape(self.shape).astype(np.float64), self.blur, mode="nearest", truncate=2.0) for part in counts.T]
-        smoothed = np.stack(blurred).reshape(len(blurred), -1).T + PRIOR_WEIGHT * np.maximum(counts.sum(axis=0) / max(counts.sum(), 1), 1e-9)
+        blurred = [
+            gaussian_filter(
+                part.reshape(self.shape).astype(np.float64), self.blur, mode="nearest", truncate=2.0
+            )
+            for part in counts.T
+        ]
+        smoothed = np.stack(blurred).reshape(len(blurred), -1).T + PRIOR_WEIGHT * np.maximum(
+            counts.sum(axis=0) / max(counts.sum(), 1), 1e-9
+        )
         return np.log(smoothed / smoothed.sum(axis=1, keepdims=True))
 
 
 def edges_of(counts: list[Counts], bins: int) -> list[np.ndarray]:
-    """Inner borders of `bins` bins per feature, its quantiles over all points, so that unit and scale do not matter."""
+    """Inner borders of `bins` bins per feature, its quantiles over all points, so that unit and scale do not
+    matter.
+    """
     return [part.quantiles(np.arange(1, bins) / bins) for part in counts]
 
 
@@ -76,16 +96,22 @@ class Raters:
         """The same for a part of a cloud; counts: `feature_counts` of the whole."""
         known = relief.shape[1]
         groups = (Cells.of(relief, edges_of(counts[:known], RELIEF_BINS), RELIEF_BLUR),)
-        return cls(groups if colors is None else (Cells.of(colors, edges_of(counts[known:], COLOR_BINS), COLOR_BLUR), *groups))
+        return cls(
+            groups
+            if colors is None
+            else (Cells.of(colors, edges_of(counts[known:], COLOR_BINS), COLOR_BLUR), *groups)
+        )
 
     def lesson(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> Lesson:
         """What the examples (N,) bool of label (N,) uint8 teach."""
         return tuple(group.count(label, examples, num_classes) for group in self.groups)
 
     def rate(self, lesson: Lesson, label: np.ndarray) -> np.ndarray | None:
-        """(N, C) float32 log-probability of the classes as colour and relief see them; None where there is too little to learn from.
+        """(N, C) float32 log-probability of the classes as colour and relief see them; None where there is
+        too little to learn from.
 
-        label: (N,) uint8. Points of a class without enough examples get zeros: the raters do not contradict what they do not know.
+        label: (N,) uint8. Points of a class without enough examples get zeros: the raters do not contradict
+            what they do not know.
         """
         counts = lesson[0].sum(axis=0)
         known = counts >= MIN_EXAMPLES
@@ -95,7 +121,8 @@ class Raters:
         result = np.zeros((len(label), len(counts)), np.float32)
         for group, examples in zip(self.groups, lesson, strict=True):
             table = group.table(examples * known)
-            for column in range(len(counts)):  # one by one: as a whole it would be copied, with millions of points
+            # one by one: as a whole it would be copied, with millions of points
+            for column in range(len(counts)):
                 result[:, column] += table[:, column].astype(np.float32)[group.cell]
         result -= ((len(self.groups) - 1) * shares).astype(np.float32)
         result[:, ~known] = -np.inf
@@ -109,7 +136,9 @@ class Raters:
         return self.rate(self.lesson(label, examples, num_classes), label)
 
     def errors(self, lesson: Lesson, label: np.ndarray, asked: np.ndarray) -> int | None:
-        """How many of the points asked (N,) bool, whose label is taken for true, the lesson rates wrong; None if it is too short."""
+        """How many of the points asked (N,) bool, whose label is taken for true, the lesson rates wrong; None
+        if it is too short.
+        """
         rating = self.rate(lesson, label)
         return None if rating is None else int((rating[asked].argmax(axis=1) + 1 != label[asked]).sum())
 
@@ -126,7 +155,8 @@ def folds_of(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarra
 
 
 def skill_of(wrong: list[int | None], counts: np.ndarray) -> float:
-    """Share of the errors of the best constant answer that the raters avoid on blocks held out; 0 where they cannot learn.
+    """Share of the errors of the best constant answer that the raters avoid on blocks held out; 0 where they
+    cannot learn.
 
     wrong: errors of each fold, asked about points that it has not seen; counts: (C,) examples of each class
     """

@@ -1,4 +1,6 @@
-"""Potts energy on a neighbour graph, minimised by mean field (METHOD 0.1): one fused pass over the edges per step."""
+"""Potts energy on a neighbour graph, minimised by mean field (METHOD 0.1): one fused pass over the edges per
+step.
+"""
 
 from __future__ import annotations
 
@@ -10,30 +12,51 @@ from sc3d.geometry.graph import Graph
 STEPS = 10
 
 
-def mean_field(graph: Graph, log_likelihood: np.ndarray, smoothness: float, start: np.ndarray | None = None, steps: int = STEPS) -> np.ndarray:
+def mean_field(
+    graph: Graph,
+    log_likelihood: np.ndarray,
+    smoothness: float,
+    start: np.ndarray | None = None,
+    steps: int = STEPS,
+) -> np.ndarray:
     """Minimise sum_i -log p_i(l_i) + smoothness sum_(i,j) w_ij [l_i != l_j], all points at once in each step.
 
     log_likelihood: (N, C) float32, column c = class id c + 1; -inf = class not offered
     start: (N, C) first belief; None = as the likelihood says
-    returns: (N, C) float32 belief, rows sum to 1. Each row is summed in a fixed order: the same for any number of threads.
+    returns: (N, C) float32 belief, rows sum to 1. Each row is summed in a fixed order: the same for any
+        number of threads.
     """
     belief = softmax(log_likelihood) if start is None else np.ascontiguousarray(start, np.float32)
     other = np.empty_like(belief)
     for _ in range(steps):
-        _step(graph.starts, graph.neighbors, graph.weights, log_likelihood, np.float32(smoothness), belief, other)
+        _step(
+            graph.starts,
+            graph.neighbors,
+            graph.weights,
+            log_likelihood,
+            np.float32(smoothness),
+            belief,
+            other,
+        )
         belief, other = other, belief
     return belief
 
 
-def mean_field_sequential(graph: Graph, log_likelihood: np.ndarray, smoothness: float, belief: np.ndarray) -> np.ndarray:
-    """One sweep that updates one point after another in place: slower twin of a step of `mean_field` whose free energy never rises."""
+def mean_field_sequential(
+    graph: Graph, log_likelihood: np.ndarray, smoothness: float, belief: np.ndarray
+) -> np.ndarray:
+    """One sweep that updates one point after another in place: slower twin of a step of `mean_field` whose
+    free energy never rises.
+    """
     belief = np.array(belief, np.float32)
     _sweep(graph.starts, graph.neighbors, graph.weights, log_likelihood, np.float32(smoothness), belief)
     return belief
 
 
 def potts_energy(graph: Graph, log_likelihood: np.ndarray, label: np.ndarray, smoothness: float) -> float:
-    """The energy of a labelling; each undirected edge counts once. label: (N,) class ids from 1, canonical order."""
+    """The energy of a labelling; each undirected edge counts once. label: (N,) class ids from 1, canonical
+    order.
+    """
     belief = np.zeros(log_likelihood.shape, np.float32)
     belief[np.arange(len(label)), label.astype(np.int64) - 1] = 1
     return free_energy(graph, log_likelihood, belief, smoothness)  # without entropy they are the same
@@ -61,6 +84,7 @@ def softmax(values: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True)
 def _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, field):
+    """Fills field (C,)."""
     for c in range(len(field)):
         field[c] = 0
     for edge in range(starts[i], starts[i + 1]):
@@ -81,12 +105,14 @@ def _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, f
 
 @numba.njit(cache=True, parallel=True)
 def _step(starts, neighbors, weights, log_likelihood, smoothness, belief, result):
+    """See mean_field."""
     for i in numba.prange(len(starts) - 1):
         _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, result[i])
 
 
 @numba.njit(cache=True)
 def _sweep(starts, neighbors, weights, log_likelihood, smoothness, belief):
+    """See mean_field_sequential."""
     field = np.empty(belief.shape[1], np.float32)
     for i in range(len(starts) - 1):
         _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, field)

@@ -24,14 +24,16 @@ TRUST = 0.5  # weight of the votes beside the raters, which see what the views' 
 AGREED_VIEWS, AGREED_SHARE = 3, 0.9  # seeds to learn from: seen by so many views, this share of their votes
 SURE = 0.95  # later rounds learn from points of this probability
 IMPLAUSIBLE = np.log(0.5)  # a seed whose class the raters give less is a conflict
-CAUTION, SUPPORT = 0.5, 0.1  # confidence: weight of the evidence and of the neighbours; full weights would be sure everywhere
+# confidence: weight of the evidence and of the neighbours; full weights would be sure everywhere
+CAUTION, SUPPORT = 0.5, 0.1
 
 
 @dataclass(frozen=True)
 class Evidence:
     """What is known of N points, canonical order.
 
-    points: (N, 3) world; seeds: labels of fusion; votes: (N, num_ids) float32 or None, column 0 is ignored; colors: (N, 3) uint8 or None
+    points: (N, 3) world; seeds: labels of fusion; votes: (N, num_ids) float32 or None, column 0 is ignored;
+        colors: (N, 3) uint8 or None
     """
 
     points: np.ndarray
@@ -40,7 +42,11 @@ class Evidence:
     colors: np.ndarray | None
 
     def ordered(self, order: np.ndarray) -> Evidence:
-        return Evidence(self.points[order], reordered(self.seeds, order), *(None if part is None else part[order] for part in (self.votes, self.colors)))
+        return Evidence(
+            self.points[order],
+            reordered(self.seeds, order),
+            *(None if part is None else part[order] for part in (self.votes, self.colors)),
+        )
 
     @property
     def start(self) -> np.ndarray:
@@ -53,9 +59,16 @@ class Evidence:
         return (self.seeds.state == SEED) & (self.start > 0) & (self.seeds.confidence >= AGREED_SHARE)
 
     def agreement(self, core: np.ndarray | None = None) -> np.ndarray:
-        """(AGREED_VIEWS, 256) int64: sure seeds of each class that at least 1, 2, ... views saw; core: (N,) bool points to count, None = all."""
+        """(AGREED_VIEWS, 256) int64: sure seeds of each class that at least 1, 2, ... views saw; core: (N,)
+        bool points to count, None = all.
+        """
         sure, start = self.sure if core is None else self.sure & core, self.start
-        return np.stack([np.bincount(start[sure & (self.seeds.num_views >= least)], minlength=256) for least in range(1, AGREED_VIEWS + 1)])
+        return np.stack(
+            [
+                np.bincount(start[sure & (self.seeds.num_views >= least)], minlength=256)
+                for least in range(1, AGREED_VIEWS + 1)
+            ]
+        )
 
     def agreed_by(self, least: int) -> np.ndarray:
         """(N,) bool sure seeds that at least so many views saw."""
@@ -72,32 +85,51 @@ class Evidence:
 
 
 def views_to_agree(agreement: np.ndarray) -> int:
-    """How many views must have seen an example: AGREED_VIEWS, or fewer, where some class would have too few examples, as to the raters it would not exist.
+    """How many views must have seen an example: AGREED_VIEWS, or fewer, where some class would have too few
+    examples, as to the raters it would not exist.
 
     agreement: (AGREED_VIEWS, 256) of the whole cloud
     """
     wanted = agreement[0] >= MIN_EXAMPLES
-    return next((least for least in range(AGREED_VIEWS, 1, -1) if (agreement[least - 1][wanted] >= MIN_EXAMPLES).all()), 1)
+    return next(
+        (
+            least
+            for least in range(AGREED_VIEWS, 1, -1)
+            if (agreement[least - 1][wanted] >= MIN_EXAMPLES).all()
+        ),
+        1,
+    )
 
 
 def tie_breakers(evidence: Evidence, normals: np.ndarray | None) -> tuple[np.ndarray, ...]:
     """Arrays (N,) that tell points of equal position apart, for `build_graph`."""
     seeds = evidence.seeds
     tables = (part for part in (evidence.votes, evidence.colors, normals) if part is not None)
-    return (seeds.label, seeds.state, seeds.num_views, seeds.confidence, *(column for table in tables for column in table.T))
+    return (
+        seeds.label,
+        seeds.state,
+        seeds.num_views,
+        seeds.confidence,
+        *(column for table in tables for column in table.T),
+    )
 
 
 def complete(evidence: Evidence, normals: np.ndarray | None, settings: Propagate) -> Labels:
-    """Label the points that have none, on their own neighbour graph. normals: (N, 3) unit, oriented, or None = estimated."""
+    """Label the points that have none, on their own neighbour graph. normals: (N, 3) unit, oriented, or None
+    = estimated.
+    """
     colors = evidence.colors if settings.color else None
-    graph = build_graph(evidence.points, normals, settings.num_neighbors, colors, tie_breakers(evidence, normals))
+    graph = build_graph(
+        evidence.points, normals, settings.num_neighbors, colors, tie_breakers(evidence, normals)
+    )
     return propagate(graph, evidence, settings)
 
 
 def propagate(graph: Graph, evidence: Evidence, settings: Propagate) -> Labels:
     """Label the points that have none; all arrays, given and returned, in the order of the cloud.
 
-    geometry, knn: points of state SEED or UNLOCKED keep their label (with verify_seeds: those that look like their class)
+    geometry, knn: points of state SEED or UNLOCKED keep their label (with verify_seeds: those that look like
+        their class)
     map: needs votes
     """
     known = evidence.ordered(graph.order)
@@ -111,7 +143,10 @@ def propagate(graph: Graph, evidence: Evidence, settings: Propagate) -> Labels:
         label, confidence = spread(graph, known.points, start, settings)
     if settings.fill and (label == 0).any() and (label > 0).any():
         filled, filled_confidence = vote_nearest(known.points, label, 1)
-        label, confidence = np.where(label == 0, filled, label), np.where(label == 0, 0.5 * filled_confidence, confidence)
+        label, confidence = (
+            np.where(label == 0, filled, label),
+            np.where(label == 0, 0.5 * filled_confidence, confidence),
+        )
     return reordered(final_labels(known.seeds, start, label, confidence, settings), np.argsort(graph.order))
 
 
@@ -119,22 +154,42 @@ def needs_raters(settings: Propagate) -> bool:
     return settings.appearance and (settings.method == "map" or settings.verify_seeds)
 
 
-def spread(graph: Graph, points: np.ndarray, start: np.ndarray, settings: Propagate) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and confidences by knn or geometry; points: (N, 3), start: (N,) uint8, both in the order of the graph."""
-    return vote_nearest(points, start, settings.num_neighbors) if settings.method == "knn" else grow(graph, start)
+def spread(
+    graph: Graph, points: np.ndarray, start: np.ndarray, settings: Propagate
+) -> tuple[np.ndarray, np.ndarray]:
+    """Labels and confidences by knn or geometry; points: (N, 3), start: (N,) uint8, both in the order of the
+    graph.
+    """
+    return (
+        vote_nearest(points, start, settings.num_neighbors)
+        if settings.method == "knn"
+        else grow(graph, start)
+    )
 
 
-def final_labels(seeds: Labels, start: np.ndarray, label: np.ndarray, confidence: np.ndarray, settings: Propagate) -> Labels:
+def final_labels(
+    seeds: Labels, start: np.ndarray, label: np.ndarray, confidence: np.ndarray, settings: Propagate
+) -> Labels:
     kept = (start > 0) & (label == start)
     doubted = np.where(np.isin(seeds.state, (SEED, UNLOCKED)) & (label == 0), LOCKED, seeds.state)
     state = np.where(kept, seeds.state, np.where(label > 0, PROPAGATED, doubted))
-    confidence = np.where(label == 0, 0, np.where(kept & (settings.method != "map"), seeds.confidence, confidence))
-    return Labels(label.astype(np.uint8), confidence.astype(np.float32), state.astype(np.uint8), seeds.num_views)
+    confidence = np.where(
+        label == 0, 0, np.where(kept & (settings.method != "map"), seeds.confidence, confidence)
+    )
+    return Labels(
+        label.astype(np.uint8), confidence.astype(np.float32), state.astype(np.uint8), seeds.num_views
+    )
 
 
 def _learned(graph: Graph, known: Evidence) -> tuple[Raters, Lesson] | None:
-    """Colour and relief as raters, and what the agreed points teach, if that does well on agreed points that it has not seen."""
-    raters, start, examples = Raters.of(relief_features(graph, known.points), known.colors), known.start, known.agreed
+    """Colour and relief as raters, and what the agreed points teach, if that does well on agreed points that
+    it has not seen.
+    """
+    raters, start, examples = (
+        Raters.of(relief_features(graph, known.points), known.colors),
+        known.start,
+        known.agreed,
+    )
     folds = folds_of(known.points, known.points.min(axis=0), known.points.max(axis=0))
     halves = [raters.lesson(start, examples & (folds == fold), known.num_classes) for fold in (0, 1)]
     wrong = [raters.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1)]
@@ -150,17 +205,25 @@ def added(lessons: list[Lesson]) -> Lesson:
 def is_skilled(wrong: list[int | None], lesson: Lesson) -> bool:
     """Whether the raters do well enough; wrong: their errors on each fold held out."""
     skill = skill_of(wrong, lesson[0].sum(axis=0))
-    logger.info("colour and relief avoid %.0f%% of errors on held-out agreed points%s", 100 * skill, "" if skill >= MIN_SKILL else ": not used")
+    logger.info(
+        "colour and relief avoid %.0f%% of errors on held-out agreed points%s",
+        100 * skill,
+        "" if skill >= MIN_SKILL else ": not used",
+    )
     return skill >= MIN_SKILL
 
 
 def verified(start: np.ndarray, rating: np.ndarray) -> np.ndarray:
-    """The seeds (N,) without those that look like another class: conflicts that all views share. rating: (N, C)"""
+    """The seeds (N,) without those that look like another class: conflicts that all views share. rating: (N,
+    C)
+    """
     given = rating[np.arange(len(start)), np.maximum(start, 1).astype(np.int64) - 1]
     return np.where((start > 0) & (given < IMPLAUSIBLE), 0, start).astype(np.uint8)
 
 
-def _map(graph: Graph, known: Evidence, learned: tuple[Raters, Lesson] | None, settings: Propagate) -> tuple[np.ndarray, np.ndarray]:
+def _map(
+    graph: Graph, known: Evidence, learned: tuple[Raters, Lesson] | None, settings: Propagate
+) -> tuple[np.ndarray, np.ndarray]:
     """Labels and confidences of the smallest Potts energy."""
     offered = np.bincount(known.start, minlength=known.num_classes + 1)[1:] > 0
     if learned is None:
@@ -177,18 +240,25 @@ def _map(graph: Graph, known: Evidence, learned: tuple[Raters, Lesson] | None, s
     return decided(graph, evidence, belief)
 
 
-def unrated_belief(graph: Graph, known: Evidence, offered: np.ndarray, settings: Propagate) -> tuple[np.ndarray, np.ndarray]:
-    """Log-evidence and belief (N, C) from the votes alone; offered: (C,) bool, a class without a single seed is not."""
+def unrated_belief(
+    graph: Graph, known: Evidence, offered: np.ndarray, settings: Propagate
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log-evidence and belief (N, C) from the votes alone; offered: (C,) bool, a class without a single seed
+    is not.
+    """
     likelihood = vote_likelihood(known.votes)
     likelihood[:, ~offered] = -np.inf
-    grown, _ = grow(graph, known.start)  # else the votes would take one edge per step to reach points without any
+    # else the votes would take one edge per step to reach points without any
+    grown, _ = grow(graph, known.start)
     belief = softmax(likelihood)
     silent = np.flatnonzero(~known.votes[:, 1:].any(axis=1) & (grown > 0))
     belief[silent] = np.eye(likelihood.shape[1], dtype=np.float32)[grown[silent] - 1]
     return likelihood, mean_field(graph, likelihood, settings.smoothness, belief)
 
 
-def rated_belief(graph: Graph, known: Evidence, offered: np.ndarray, rating: np.ndarray, settings: Propagate) -> tuple[np.ndarray, np.ndarray]:
+def rated_belief(
+    graph: Graph, known: Evidence, offered: np.ndarray, rating: np.ndarray, settings: Propagate
+) -> tuple[np.ndarray, np.ndarray]:
     """The same from votes and raters; rating: (N, C), overwritten."""
     rating += np.float32(TRUST) * vote_likelihood(known.votes)
     rating[:, ~offered] = -np.inf
@@ -209,7 +279,9 @@ def decided(graph: Graph, evidence: np.ndarray, belief: np.ndarray) -> tuple[np.
 
 
 def vote_likelihood(votes: np.ndarray) -> np.ndarray:
-    """(N, C) float32 log-likelihood of the classes 1..C from the votes (N, C + 1); 0 for points without votes."""
+    """(N, C) float32 log-likelihood of the classes 1..C from the votes (N, C + 1); 0 for points without
+    votes.
+    """
     total = votes[:, 1:].sum(axis=1, keepdims=True)
     result = votes[:, 1:] + np.float32(SMOOTHING)
     result /= total + np.float32(SMOOTHING * (votes.shape[1] - 1))
@@ -226,6 +298,7 @@ def reachable(graph: Graph, start: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True)
 def _flood(starts, neighbors, reached):
+    """See reachable; changes and returns `reached` (N,) bool."""
     stack = np.empty(len(reached), np.int64)
     size = 0
     for i in range(len(reached)):

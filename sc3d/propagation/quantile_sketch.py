@@ -32,5 +32,10 @@ class Counts:
     def quantiles(self, shares: np.ndarray) -> np.ndarray:
         """(Q,) float32 lower ends of the steps below which lies each share of the values."""
         below = np.cumsum(self.counts)
-        steps = self.steps[np.searchsorted(below, np.asarray(shares) * below[-1], side="right").clip(0, len(below) - 1)].astype(np.int32) << DROPPED
+        steps = (
+            self.steps[
+                np.searchsorted(below, np.asarray(shares) * below[-1], side="right").clip(0, len(below) - 1)
+            ].astype(np.int32)
+            << DROPPED
+        )
         return (steps ^ ((steps >> 31) & 0x7FFFFFFF)).view(np.float32)

@@ -14,8 +14,10 @@ MAX_SWEEPS = 20
 def grow(graph: Graph, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Eq. 9 iterated as a front from the seeds until nothing changes; the seeds keep their label.
 
-    Each step labels all points next to the front at once, so the result does not depend on the order of the points.
-    label: (N,) uint8, canonical order; returns: (N,) uint8 labels, 0 where no edge leads to a seed; (N,) float32 share of the winner
+    Each step labels all points next to the front at once, so the result does not depend on the order of the
+    points.
+    label: (N,) uint8, canonical order; returns: (N,) uint8 labels, 0 where no edge leads to a seed; (N,)
+        float32 share of the winner
     """
     result, confidence = label.copy(), (label > 0).astype(np.float32)
     pending = np.flatnonzero(label == 0)
@@ -29,7 +31,8 @@ def grow(graph: Graph, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         confidence[pending[reached]] = share[reached]
         pending = pending[~reached]
     changing = np.flatnonzero((label == 0) & (result > 0))
-    for _ in range(MAX_SWEEPS):  # neighbours that the front reached later have their say; bounded, because parallel steps may oscillate
+    # neighbours that the front reached later have their say; bounded, because parallel steps may oscillate
+    for _ in range(MAX_SWEEPS):
         best, share = vote_rows(graph, changing, result, num_ids)
         moved = best != result[changing]
         result[changing], confidence[changing] = best, share
@@ -38,8 +41,12 @@ def grow(graph: Graph, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return result, confidence
 
 
-def vote_rows(graph: Graph, rows: np.ndarray, label: np.ndarray, num_ids: int) -> tuple[np.ndarray, np.ndarray]:
-    """(R,) uint8 label with the largest sum of weights among the neighbours of each row (0 = none labelled; ties: smallest id), (R,) its share."""
+def vote_rows(
+    graph: Graph, rows: np.ndarray, label: np.ndarray, num_ids: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(R,) uint8 label with the largest sum of weights among the neighbours of each row (0 = none labelled;
+    ties: smallest id), (R,) its share.
+    """
     best, share = np.zeros(len(rows), np.uint8), np.zeros(len(rows), np.float32)
     _vote(graph.starts, graph.neighbors, graph.weights, rows, label, num_ids, best, share)
     return best, share
@@ -47,6 +54,7 @@ def vote_rows(graph: Graph, rows: np.ndarray, label: np.ndarray, num_ids: int) -
 
 @numba.njit(cache=True, parallel=True)
 def _vote(starts, neighbors, weights, rows, label, num_ids, best, share):
+    """See vote_rows."""
     for row in numba.prange(len(rows)):
         votes, total = np.zeros(num_ids, np.float32), np.float32(0)
         for edge in range(starts[rows[row]], starts[rows[row] + 1]):
@@ -60,7 +68,8 @@ def _vote(starts, neighbors, weights, rows, label, num_ids, best, share):
 
 
 def vote_nearest(points: np.ndarray, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """One-shot majority of the `count` nearest labelled points (ties: smallest id); labelled points keep theirs.
+    """One-shot majority of the `count` nearest labelled points (ties: smallest id); labelled points keep
+    theirs.
 
     label: (N,) uint8; returns (N,) uint8 labels, (N,) float32 share of the winner
     """

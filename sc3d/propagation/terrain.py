@@ -1,4 +1,6 @@
-"""Relief of a cloud: height above the ground around, roughness and slope of each point. Parts of a cloud get what the whole would."""
+"""Relief of a cloud: height above the ground around, roughness and slope of each point. Parts of a cloud get
+what the whole would.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ NUM_FEATURES = 2 + len(WINDOWS)
 
 @dataclass(frozen=True)
 class Lean:
-    """Which way the surfaces of a cloud face. products: (3, 3), sums: (3,) int64 of its unit normals, in fixed point; spacings: of its points."""
+    """Which way the surfaces of a cloud face. products: (3, 3), sums: (3,) int64 of its unit normals, in
+    fixed point; spacings: of its points.
+    """
 
     products: np.ndarray
     sums: np.ndarray
@@ -32,14 +36,20 @@ class Lean:
 
     @classmethod
     def total(cls, parts: list[Lean]) -> Lean:
-        return cls(sum(part.products for part in parts), sum(part.sums for part in parts), Counts.total([part.spacings for part in parts]))
+        return cls(
+            sum(part.products for part in parts),
+            sum(part.sums for part in parts),
+            Counts.total([part.spacings for part in parts]),
+        )
 
 
 @dataclass(frozen=True)
 class Terrain:
-    """A frame in which up is the main direction of the normals, so that no gravity has to be known, and a raster over it.
+    """A frame in which up is the main direction of the normals, so that no gravity has to be known, and a
+    raster over it.
 
-    low: (3,) world corner of the cloud; up: (3,); axes: (3, 2); corner: (2,) of the raster, in the frame; cell, spacing: world units; shape: of the raster
+    low: (3,) world corner of the cloud; up: (3,); axes: (3, 2); corner: (2,) of the raster, in the frame;
+        cell, spacing: world units; shape: of the raster
     """
 
     low: np.ndarray
@@ -56,12 +66,24 @@ class Terrain:
         axes = np.linalg.eigh(lean.products.astype(np.float64))[1][:, ::-1]
         up = axes[:, 0]
         leaning = lean.sums @ up
-        up = up * np.sign(leaning if abs(leaning) > 1e-9 * lean.spacings.counts.sum() * 1024 else up[np.abs(up).argmax()])
-        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) @ axes[:, 1:]
+        up = up * np.sign(
+            leaning if abs(leaning) > 1e-9 * lean.spacings.counts.sum() * 1024 else up[np.abs(up).argmax()]
+        )
+        corners = (
+            np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) @ axes[:, 1:]
+        )
         spacing = float(lean.spacings.quantiles(np.array([0.5]))[0])
         extent = corners.max(axis=0) - corners.min(axis=0)
         cell = max(CELL * spacing, float(extent.max()) / MAX_CELLS, 1e-12)
-        return cls(low, up, axes[:, 1:], corners.min(axis=0), cell, spacing, tuple(int(count) for count in extent // cell + 1))
+        return cls(
+            low,
+            up,
+            axes[:, 1:],
+            corners.min(axis=0),
+            cell,
+            spacing,
+            tuple(int(count) for count in extent // cell + 1),
+        )
 
     def place(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(N, 2) position on the raster, cells, and (N,) height, world units, of points (N, 3)."""
@@ -90,11 +112,16 @@ class Terrain:
         return [np.where(np.isfinite(ground), ground, bottom) for ground in filtered]
 
     def features(self, graph: Graph, points: np.ndarray, grounds: list[np.ndarray]) -> np.ndarray:
-        """(N, 4) float32: roughness, cosine of the slope, height above the ground of each window (spacings). points: (N, 3), in the order of the graph."""
+        """(N, 4) float32: roughness, cosine of the slope, height above the ground of each window (spacings).
+        points: (N, 3), in the order of the graph.
+        """
         flat, height = self.place(points)
         flat -= 0.5
         features = np.empty((len(points), NUM_FEATURES), np.float32)
-        features[:, 0], features[:, 1] = graph.roughness, np.einsum("ni,i->n", graph.normals, self.up.astype(np.float32))
+        features[:, 0], features[:, 1] = (
+            graph.roughness,
+            np.einsum("ni,i->n", graph.normals, self.up.astype(np.float32)),
+        )
         for column, ground in enumerate(grounds, 2):
             below = map_coordinates(ground, flat.T, order=1, mode="nearest")  # bilinear: no steps on slopes
             features[:, column] = (height - below) / max(self.spacing, 1e-12)

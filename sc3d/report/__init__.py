@@ -34,7 +34,10 @@ def write_report(scene: Scene, path: Path) -> None:
         summary=summary_line(material),
         headline=headline(material),
         navigation="".join(f'<a href="#{anchor}">{html.escape(title)}</a>' for anchor, title, _ in parts),
-        body="\n".join(f'<section id="{anchor}"><h2>{html.escape(title)}</h2>\n{body}</section>' for anchor, title, body in parts),
+        body="\n".join(
+            f'<section id="{anchor}"><h2>{html.escape(title)}</h2>\n{body}</section>'
+            for anchor, title, body in parts
+        ),
         style=_resource("style.css"),
     )
     with atomic_path(path) as temporary:

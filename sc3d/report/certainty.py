@@ -16,15 +16,22 @@ def certainty_section(material: Material) -> str:
     confidence, states, parts = material.values("confidence"), material.values("state"), []
     if confidence is not None:
         colors = confidence_colors((np.arange(20) + 0.5) / 20)
-        parts.append(f'<div><h3>Confidence</h3><p class="note">Share of the points by confidence; median {np.nanmedian(confidence):.2f}.</p>'
-                     f"{histogram(confidence, colors)}</div>")
+        parts.append(
+            f'<div><h3>Confidence</h3><p class="note">Share of the points by confidence; median {np.nanmedian(confidence):.2f}.</p>'
+            f"{histogram(confidence, colors)}</div>"
+        )
     parts += _reliability(material)
     if states is not None and len(states):
         shares = np.bincount(states.astype(np.uint8), minlength=256)[: len(STATES)] / len(states)
         rows = [(state.name, state.color, float(share)) for state, share in zip(STATES, shares, strict=True)]
-        items = "".join(f'<li><i style="background:{css_color(color)}"></i>{escape(name)} <b>{share:.1%}</b></li>' for name, color, share in rows)
-        parts.append(f'<div><h3>Origin of the labels</h3><p class="note">Seeds come from the photos, propagated labels from their neighbours; '
-                     f'locked points were contradictory.</p>{stacked_bar(rows)}<ul class="legend">{items}</ul></div>')
+        items = "".join(
+            f'<li><i style="background:{css_color(color)}"></i>{escape(name)} <b>{share:.1%}</b></li>'
+            for name, color, share in rows
+        )
+        parts.append(
+            f'<div><h3>Origin of the labels</h3><p class="note">Seeds come from the photos, propagated labels from their neighbours; '
+            f'locked points were contradictory.</p>{stacked_bar(rows)}<ul class="legend">{items}</ul></div>'
+        )
     return f'<div class="columns">{"".join(parts)}</div>' if parts else ""
 
 
@@ -32,7 +39,11 @@ def _reliability(material: Material) -> list[str]:
     """The reliability curve as a list of one block; empty without truth."""
     figures = material.figures("reliability")
     rows = figures.get("bins")
-    if not isinstance(rows, list) or not any(rows) or not all(row is None or isinstance(row, list) and len(row) == 3 for row in rows):
+    if (
+        not isinstance(rows, list)
+        or not any(rows)
+        or not all(row is None or isinstance(row, list) and len(row) == 3 for row in rows)
+    ):
         return []
     bins = [(None, None, None) if row is None else tuple(number(value) for value in row) for row in rows]
     if any(None in row and any(value is not None for value in row) for row in bins):

@@ -24,7 +24,17 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_STAGES = ("synthesize", "reconstruct", "train", "extract", "segment", "label", "propagate", "evaluate", "export")
+_STAGES = (
+    "synthesize",
+    "reconstruct",
+    "train",
+    "extract",
+    "segment",
+    "label",
+    "propagate",
+    "evaluate",
+    "export",
+)
 
 
 @dataclass(frozen=True)
@@ -32,7 +42,8 @@ class Material:
     """Everything a report may show.
 
     cloud: the labelled cloud, else the seeds, else the bare cloud; mesh: the surface
-    views: cameras by name order; metrics: content of metrics.json; records: sidecars in the order of the stages
+    views: cameras by name order; metrics: content of metrics.json; records: sidecars in the order of the
+        stages
     """
 
     scene: Scene
@@ -52,7 +63,9 @@ class Material:
     @cached_property
     def points(self) -> np.ndarray:
         """(N, 3) float64 world."""
-        return np.empty((0, 3)) if self.cloud is None else self.cloud.point.positions.numpy().astype(np.float64)
+        return (
+            np.empty((0, 3)) if self.cloud is None else self.cloud.point.positions.numpy().astype(np.float64)
+        )
 
     @cached_property
     def label_counts(self) -> np.ndarray | None:
@@ -63,7 +76,9 @@ class Material:
     @cached_property
     def truth(self) -> Path:
         """The folder of truth masks that was evaluated against, else the scene's own."""
-        used = next((record.get("settings") for record in self.records if record["stage"] == "evaluate"), None)
+        used = next(
+            (record.get("settings") for record in self.records if record["stage"] == "evaluate"), None
+        )
         folder = used.get("truth") if isinstance(used, dict) else None
         return Path(folder) if isinstance(folder, str) and Path(folder).is_dir() else self.scene.truth
 
@@ -106,6 +121,11 @@ def _read_sidecars(folder: Path) -> list[dict]:
             continue
         if isinstance(record, dict) and isinstance(record.get("stage"), str):
             key = json.dumps([record["stage"], record.get("settings"), record.get("seconds")], sort_keys=True)
-            records.setdefault(key, record | {"outputs": []})["outputs"].append(str(file.relative_to(folder))[: -len(".json")])
+            records.setdefault(key, record | {"outputs": []})["outputs"].append(
+                str(file.relative_to(folder))[: -len(".json")]
+            )
     order = {stage: position for position, stage in enumerate(_STAGES)}
-    return sorted(records.values(), key=lambda record: (order.get(record["stage"], len(order)), record["stage"], record["outputs"]))
+    return sorted(
+        records.values(),
+        key=lambda record: (order.get(record["stage"], len(order)), record["stage"], record["outputs"]),
+    )

@@ -29,11 +29,15 @@ _MAX_POINTS = 1_500_000
 
 
 def cloud_pictures(material: Material) -> dict[tuple[str, str], tuple[str, float]]:
-    """Data URIs and width/height by (colouring or "mesh", "oblique" or "above"), of what the cloud has; empty where no renderer works."""
+    """Data URIs and width/height by (colouring or "mesh", "oblique" or "above"), of what the cloud has; empty
+    where no renderer works.
+    """
     pictures = {}
     try:
         for direction, size in _SIZES.items():
-            style = Style(from_above=direction == "above", legend=False, background=BACKGROUND, max_points=_MAX_POINTS)
+            style = Style(
+                from_above=direction == "above", legend=False, background=BACKGROUND, max_points=_MAX_POINTS
+            )
             if material.cloud is not None:
                 point_image = draw_points(material.points, None, size, style)
                 for by, colors in _colorings(material).items():
@@ -56,17 +60,28 @@ def _colorings(material: Material) -> dict[str, np.ndarray]:
 
 
 def comparison(material: Material, view: View, labelled: LabelledSurface | None) -> list[tuple[str, str]]:
-    """Captions and data URIs of one photo: the photo, the given mask, the fused labels and the truth, as far as they exist."""
+    """Captions and data URIs of one photo: the photo, the given mask, the fused labels and the truth, as far
+    as they exist.
+    """
     scene, stem = material.scene, Path(view.name).stem
     scale = min(1.0, _PHOTO_SIZE / max(view.width, view.height))
     size = max(1, round(view.width * scale)), max(1, round(view.height * scale))
     panels = []
     if scene.photo(view.name).exists():
-        panels.append(("photo", jpeg(cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA))))
+        panels.append(
+            (
+                "photo",
+                jpeg(cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA)),
+            )
+        )
     if material.class_table is None:
         return panels
     palette = material.class_table.palette
-    for caption, file in (("given mask", scene.masks / f"{stem}.png"), ("fused labels", None), ("truth", material.truth / f"{stem}.png")):
+    for caption, file in (
+        ("given mask", scene.masks / f"{stem}.png"),
+        ("fused labels", None),
+        ("truth", material.truth / f"{stem}.png"),
+    ):
         if file is None and labelled is not None:
             labels, _ = labelled.see(view, size)
         elif file is not None and file.exists():
@@ -77,7 +92,9 @@ def comparison(material: Material, view: View, labelled: LabelledSurface | None)
     return panels
 
 
-def ground_picture(points: np.ndarray, colors: np.ndarray, longest: int = 640) -> tuple[str, tuple[float, float, float, float]]:
+def ground_picture(
+    points: np.ndarray, colors: np.ndarray, longest: int = 640
+) -> tuple[str, tuple[float, float, float, float]]:
     """The cloud straight from above, parallel projection, north up: the highest point of each cell.
 
     points: (N, 3) world; colors: (N, 3) uint8 RGB
@@ -89,18 +106,27 @@ def ground_picture(points: np.ndarray, colors: np.ndarray, longest: int = 640) -
     cell = max(float((high - low).max()) / longest, 1e-9)
     width, height = np.maximum(np.ceil((high - low) / cell).astype(int), 1)
     order = np.argsort(points[inside, 2], kind="stable")
-    columns, rows = np.minimum((points[inside, :2] - low) / cell, [width - 1, height - 1]).astype(int)[order].T
+    columns, rows = (
+        np.minimum((points[inside, :2] - low) / cell, [width - 1, height - 1]).astype(int)[order].T
+    )
     picture = np.zeros((height, width, 4), np.uint8)
     picture[height - 1 - rows, columns] = np.column_stack([colors[inside][order], np.full(len(order), 255)])
     for _ in range(2):  # close single holes between the points
         holes = picture[..., 3] == 0
         picture[holes] = cv2.dilate(picture, np.ones((3, 3), np.uint8))[holes]
-    return _png_uri(picture[..., [2, 1, 0, 3]]), (low[0], high[1] - height * cell, low[0] + width * cell, high[1])
+    return _png_uri(picture[..., [2, 1, 0, 3]]), (
+        low[0],
+        high[1] - height * cell,
+        low[0] + width * cell,
+        high[1],
+    )
 
 
 def jpeg(image: np.ndarray, quality: int = 85) -> str:
     """Data URI of (H, W, 3) uint8 RGB."""
-    encoded = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    encoded = cv2.imencode(
+        ".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality]
+    )[1]
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 

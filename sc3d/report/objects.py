@@ -13,16 +13,20 @@ from sc3d.report.charts import css_color, formatted, number
 from sc3d.report.data import Material
 
 _CELL = 2.0  # side of the cells that areas are counted in, point spacings
-_LAYERS = {"buildings": "buildings", "trees": "trees"}  # file names of `sc3d export --format objects`, and what they hold
+# file names of `sc3d export --format objects`, and what they hold
+_LAYERS = {"buildings": "buildings", "trees": "trees"}
 
 
 def found_section(material: Material) -> str:
-    """Area, points and confidence of each class; number and size of the objects, where `export --format objects` counted them."""
+    """Area, points and confidence of each class; number and size of the objects, where `export --format
+    objects` counted them.
+    """
     return _class_table(material) + _object_table(material)
 
 
 def class_areas(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """(256,) float64 area of each class seen from above, squared world units: cells of the ground plane, by the label of their highest point.
+    """(256,) float64 area of each class seen from above, squared world units: cells of the ground plane, by
+    the label of their highest point.
 
     points: (N, 3) world, z up; labels: (N,) uint8
     """
@@ -41,27 +45,64 @@ def _class_table(material: Material) -> str:
     counts = material.label_counts
     if counts is None or material.class_table is None or not len(material.points):
         return ""
-    labels, confidence, iou = material.values("label"), material.values("confidence"), iou_of(material, "labels")
+    labels, confidence, iou = (
+        material.values("label"),
+        material.values("confidence"),
+        iou_of(material, "labels"),
+    )
     areas = class_areas(material.points, labels.astype(np.uint8))
-    sums, rows = None if confidence is None else np.bincount(labels, np.nan_to_num(confidence), minlength=256), []
+    sums, rows = (
+        None if confidence is None else np.bincount(labels, np.nan_to_num(confidence), minlength=256),
+        [],
+    )
     for label in [*(entry.id for entry in material.class_table), *([0] if counts[0] else [])]:
         name = material.class_table.name(label)
         mean = "–" if sums is None or not counts[label] else f"{sums[label] / counts[label]:.2f}"
-        cells = [f"{areas[label]:,.0f}", f"{areas[label] / max(areas.sum(), 1e-12):.1%}", f"{counts[label]:,}"] + ([mean] if sums is not None else [])
+        cells = [
+            f"{areas[label]:,.0f}",
+            f"{areas[label] / max(areas.sum(), 1e-12):.1%}",
+            f"{counts[label]:,}",
+        ] + ([mean] if sums is not None else [])
         cells += [formatted(iou.get(name), ".3f")] if iou else []
         swatch = f'<i style="background:{css_color(material.class_table.palette[label])}"></i>'
         rows.append([f"{swatch}{escape(name)}", *cells])
-    heads = ["Class", "Area, m²", "Share", "Points"] + (["Confidence"] if sums is not None else []) + (["IoU"] if iou else [])
-    return '<p class="note">Areas as seen straight from above; square metres if the model is metric.</p>' + _table(heads, rows)
+    heads = (
+        ["Class", "Area, m²", "Share", "Points"]
+        + (["Confidence"] if sums is not None else [])
+        + (["IoU"] if iou else [])
+    )
+    return (
+        '<p class="note">Areas as seen straight from above; square metres if the model is metric.</p>'
+        + _table(heads, rows)
+    )
 
 
 def _object_table(material: Material) -> str:
     rows = []
     for stem, name in _LAYERS.items():
-        objects = next((found for file in (f"{stem}.geojson", f"{stem}_local.geojson") if (found := _read(material.scene.export / file)) is not None), None)
+        objects = next(
+            (
+                found
+                for file in (f"{stem}.geojson", f"{stem}_local.geojson")
+                if (found := _read(material.scene.export / file)) is not None
+            ),
+            None,
+        )
         if objects is not None:
-            area, height = (np.array([number(item.get(key)) or 0.0 for item in objects]) for key in ("area_m2", "height_m"))
-            sizes = [f"{area.sum():,.0f}", f"{np.median(area):,.0f}", f"{np.median(height):.1f}", f"{height.max():.1f}"] if len(objects) else ["–"] * 4
+            area, height = (
+                np.array([number(item.get(key)) or 0.0 for item in objects])
+                for key in ("area_m2", "height_m")
+            )
+            sizes = (
+                [
+                    f"{area.sum():,.0f}",
+                    f"{np.median(area):,.0f}",
+                    f"{np.median(height):.1f}",
+                    f"{height.max():.1f}",
+                ]
+                if len(objects)
+                else ["–"] * 4
+            )
             rows.append([name, f"{len(objects):,}", *sizes])
     if not rows:
         return ""
@@ -80,5 +121,7 @@ def _read(file: Path) -> list[dict] | None:
 
 def _table(heads: list[str], rows: list[list[str]]) -> str:
     head = "".join(f"<th>{name}</th>" for name in heads)
-    body = "".join(f"<tr><th>{row[0]}</th>{''.join(f'<td>{cell}</td>' for cell in row[1:])}</tr>" for row in rows)
+    body = "".join(
+        f"<tr><th>{row[0]}</th>{''.join(f'<td>{cell}</td>' for cell in row[1:])}</tr>" for row in rows
+    )
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'

@@ -19,7 +19,13 @@ from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.view.colors import color_points, confidence_colors, legend_entries
 
 _NUM_PHOTOS = 4
-_COLOURING_NAMES = {"label": "Classes", "photo": "Photo colours", "confidence": "Confidence", "state": "Origin of the label", "mesh": "Mesh"}
+_COLOURING_NAMES = {
+    "label": "Classes",
+    "photo": "Photo colours",
+    "confidence": "Confidence",
+    "state": "Origin of the label",
+    "mesh": "Mesh",
+}
 
 
 def sections(material: Material) -> Iterator[tuple[str, str, str]]:
@@ -60,7 +66,13 @@ def headline(material: Material) -> str:
     for key, name, pattern in (("oa", "Overall accuracy", "{:.1%}"), ("miou", "Mean IoU", "{:.3f}")):
         value, before = number(labels.get(key)), number(masks.get(key))
         if value is not None:
-            tiles.append((name, pattern.format(value), "" if before is None else f"given masks {pattern.format(before)}"))
+            tiles.append(
+                (
+                    name,
+                    pattern.format(value),
+                    "" if before is None else f"given masks {pattern.format(before)}",
+                )
+            )
     coverage, counts = number(labels.get("coverage")), material.label_counts
     if coverage is not None:
         tiles.append(("Coverage", f"{coverage:.1%}", "of the pixels carry a label"))
@@ -70,8 +82,10 @@ def headline(material: Material) -> str:
         tiles.append(("Points", _short(len(material.points)), ""))
     if material.views:
         tiles.append(("Photos", f"{len(material.views):,}", ""))
-    return "".join(f'<div class="tile"><span>{escape(name)}</span><strong>{escape(value)}</strong><small>{escape(note)}</small></div>'
-                   for name, value, note in tiles)
+    return "".join(
+        f'<div class="tile"><span>{escape(name)}</span><strong>{escape(value)}</strong><small>{escape(note)}</small></div>'
+        for name, value, note in tiles
+    )
 
 
 def cloud_section(material: Material) -> str:
@@ -81,11 +95,18 @@ def cloud_section(material: Material) -> str:
     tabs, panels = [], []
     for position, name in enumerate(names):
         title, selected = _COLOURING_NAMES[name], str(position == 0).lower()
-        tabs.append(f'<button type="button" role="tab" aria-selected="{selected}" data-panel="cloud-{name}">{title}</button>')
-        images = "".join(_zoomable(*pictures[name, direction], f"{title}, {text}")
-                         for direction, text in (("oblique", "from the south"), ("above", "from above")) if (name, direction) in pictures)
-        panels.append(f'<figure id="cloud-{name}" class="panel" {"" if position == 0 else "hidden"}>'
-                      f'<figcaption class="print-only">{title}</figcaption><div class="pair">{images}</div>{_legend(material, name)}</figure>')
+        tabs.append(
+            f'<button type="button" role="tab" aria-selected="{selected}" data-panel="cloud-{name}">{title}</button>'
+        )
+        images = "".join(
+            _zoomable(*pictures[name, direction], f"{title}, {text}")
+            for direction, text in (("oblique", "from the south"), ("above", "from above"))
+            if (name, direction) in pictures
+        )
+        panels.append(
+            f'<figure id="cloud-{name}" class="panel" {"" if position == 0 else "hidden"}>'
+            f'<figcaption class="print-only">{title}</figcaption><div class="pair">{images}</div>{_legend(material, name)}</figure>'
+        )
     return f'<div class="tabs" role="tablist">{"".join(tabs)}</div>{"".join(panels)}' if names else ""
 
 
@@ -99,9 +120,15 @@ def quality_section(material: Material) -> str:
     if not labels:
         return ""
     colors = _class_colors(material)
-    rows = [(name, colors.get(name, (128, 128, 128)), value, masks.get(name)) for name, value in labels.items()]
-    note = "Intersection over union per class against the truth masks. Wide bar: fused labels" + ("; grey bar: the given masks." if masks else ".")
-    near, elsewhere = (number(material.figures(f"labels_{where}").get("oa")) for where in ("near_edges", "elsewhere"))
+    rows = [
+        (name, colors.get(name, (128, 128, 128)), value, masks.get(name)) for name, value in labels.items()
+    ]
+    note = "Intersection over union per class against the truth masks. Wide bar: fused labels" + (
+        "; grey bar: the given masks." if masks else "."
+    )
+    near, elsewhere = (
+        number(material.figures(f"labels_{where}").get("oa")) for where in ("near_edges", "elsewhere")
+    )
     if near is not None and elsewhere is not None:
         note += f" Near depth edges {near:.1%} of the pixels are right, elsewhere {elsewhere:.1%}."
     return f'<p class="note">{note}</p>{paired_bars(rows)}{_confusion(material)}'
@@ -116,9 +143,13 @@ def photo_section(material: Material) -> str:
     for view in chosen:
         panels = comparison(material, view, labelled)
         if len(panels) > 1:
-            images = "".join(f'<figure><img src="{uri}" alt="{caption} of {escape(view.name)}"><figcaption>{caption}</figcaption></figure>'
-                             for caption, uri in panels)
-            rows.append(f'<h3>{escape(view.name)}{_photo_figures(material, view.name)}</h3><div class="row">{images}</div>')
+            images = "".join(
+                f'<figure><img src="{uri}" alt="{caption} of {escape(view.name)}"><figcaption>{caption}</figcaption></figure>'
+                for caption, uri in panels
+            )
+            rows.append(
+                f'<h3>{escape(view.name)}{_photo_figures(material, view.name)}</h3><div class="row">{images}</div>'
+            )
     return "".join(rows) + _legend(material, "label", everything=True) if rows else ""
 
 
@@ -141,17 +172,24 @@ def training_section(material: Material) -> str:
     if not material.training_sheet.exists():
         return ""
     text = "Photos of the flight, and the Gaussians seen by the same cameras: rendering, depth and normals"
-    return (f'<p class="note">{text}. Where a rendering is blurred, or its depth stands out from its surroundings, too few photos overlap.</p>'
-            f'<figure><img src="{jpeg(read_image(material.training_sheet))}" alt="{text}"></figure>')
+    return (
+        f'<p class="note">{text}. Where a rendering is blurred, or its depth stands out from its surroundings, too few photos overlap.</p>'
+        f'<figure><img src="{jpeg(read_image(material.training_sheet))}" alt="{text}"></figure>'
+    )
 
 
 def _choose_views(material: Material) -> list:
     """Photos spread evenly over the flight; those with truth first, then those with a mask."""
+
     def with_file(folder: Path) -> list:
         return [view for view in material.views if (folder / f"{Path(view.name).stem}.png").exists()]
 
     views = with_file(material.truth) or with_file(material.scene.masks) or material.views
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(_NUM_PHOTOS, len(views))).round().astype(int)) if views else []
+    chosen = (
+        np.unique(np.linspace(0, len(views) - 1, min(_NUM_PHOTOS, len(views))).round().astype(int))
+        if views
+        else []
+    )
     return [views[position] for position in chosen]
 
 
@@ -162,7 +200,11 @@ def _photo_figures(material: Material, name: str) -> str:
     if not isinstance(figures, dict):
         return ""
     sources = {"labels": "fused labels", "masks": "given mask"}
-    found = [(text, number(figures[key].get("oa"))) for key, text in sources.items() if isinstance(figures.get(key), dict)]
+    found = [
+        (text, number(figures[key].get("oa")))
+        for key, text in sources.items()
+        if isinstance(figures.get(key), dict)
+    ]
     return " ".join(f"<small>{text} {value:.1%} right</small>" for text, value in found if value is not None)
 
 
@@ -174,27 +216,44 @@ def _legend(material: Material, by: str, everything: bool = False) -> str:
     values = material.values(by) if by in ("label", "state") else None
     present = None if values is None or everything else set(np.unique(values).tolist())
     entries = legend_entries(by, material.class_table, present)
-    items = "".join(f'<li><i style="background:{css_color(color)}"></i>{escape(name)}</li>' for name, color in entries)
+    items = "".join(
+        f'<li><i style="background:{css_color(color)}"></i>{escape(name)}</li>' for name, color in entries
+    )
     return f'<ul class="legend">{items}</ul>' if items else ""
 
 
 def _confusion(material: Material) -> str:
-    """The confusion matrix as shares of the true class; rows 1, 2, ... and columns 0, 1, ... are class ids, column 0 = no label."""
+    """The confusion matrix as shares of the true class; rows 1, 2, ... and columns 0, 1, ... are class ids,
+    column 0 = no label.
+    """
     try:
         counts = np.array(material.figures("labels").get("confusion"), float)
     except (TypeError, ValueError):
         return ""
-    if material.class_table is None or counts.shape != (material.class_table.num_ids - 1, material.class_table.num_ids):
+    if material.class_table is None or counts.shape != (
+        material.class_table.num_ids - 1,
+        material.class_table.num_ids,
+    ):
         return ""
-    ids = [entry.id for entry in material.class_table if counts[entry.id - 1].sum() > 0 or counts[:, entry.id].sum() > 0]
+    ids = [
+        entry.id
+        for entry in material.class_table
+        if counts[entry.id - 1].sum() > 0 or counts[:, entry.id].sum() > 0
+    ]
     rows = []
     for label in ids:
         shares = counts[label - 1] / max(counts[label - 1].sum(), 1)
-        cells = "".join(f'<td style="--share:{shares[column]:.3f}">{shares[column]:.1%}</td>' for column in [*ids, 0])
+        cells = "".join(
+            f'<td style="--share:{shares[column]:.3f}">{shares[column]:.1%}</td>' for column in [*ids, 0]
+        )
         rows.append(f"<tr><th>{escape(material.class_table.name(label))}</th>{cells}</tr>")
-    head = "".join(f"<th>{escape(material.class_table.name(label))}</th>" for label in ids) + "<th>no label</th>"
-    return (f'<h3>Confusion</h3><p class="note">Rows: the true class. Columns: what the fused labels say, as share of the row.</p>'
-            f'<div class="scroll"><table class="confusion"><thead><tr><th></th>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>')
+    head = (
+        "".join(f"<th>{escape(material.class_table.name(label))}</th>" for label in ids) + "<th>no label</th>"
+    )
+    return (
+        f'<h3>Confusion</h3><p class="note">Rows: the true class. Columns: what the fused labels say, as share of the row.</p>'
+        f'<div class="scroll"><table class="confusion"><thead><tr><th></th>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
+    )
 
 
 def _class_colors(material: Material) -> dict[str, tuple[int, int, int]]:

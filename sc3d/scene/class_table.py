@@ -12,13 +12,16 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.json_files import read_json
 
-CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # in names: they would act on terminals, or cannot be written
+# in names: they would act on terminals, or cannot be written
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 MAX_NAME, MAX_BYTES = 200, 1 << 20
 
 
 @dataclass(frozen=True)
 class SemanticClass:
-    """One class. id: 1 to 255 (0 is reserved: unlabelled); color: RGB uint8; prompts: texts for segmenters; asprs: LAS class code."""
+    """One class. id: 1 to 255 (0 is reserved: unlabelled); color: RGB uint8; prompts: texts for segmenters;
+    asprs: LAS class code.
+    """
 
     id: int
     name: str
@@ -55,7 +58,10 @@ class ClassTable:
 
     def name(self, label: int) -> str:
         """Name of an id; "unlabelled" for 0."""
-        return next((entry.name for entry in self.classes if entry.id == label), "unlabelled" if label == 0 else f"class {label}")
+        return next(
+            (entry.name for entry in self.classes if entry.id == label),
+            "unlabelled" if label == 0 else f"class {label}",
+        )
 
     def unknown(self, labels: np.ndarray) -> list[int]:
         """Ids in `labels` (any shape, uint8) that are neither 0 nor in the table."""
@@ -70,7 +76,9 @@ class ClassTable:
 def read_classes(path: Path) -> ClassTable:
     """Read `classes.json`; raises InputError that names the faulty entry."""
     if not path.exists():
-        raise InputError(f"{path} is missing: pass --classes FILE, or copy data/classes.json from the sc3d repository and edit it")
+        raise InputError(
+            f"{path} is missing: pass --classes FILE, or copy data/classes.json from the sc3d repository and edit it"
+        )
     entries = read_json(path, MAX_BYTES)
     return parse_classes(entries, path)
 
@@ -90,19 +98,29 @@ def parse_classes(entries: object, origin: Path | str) -> ClassTable:
 
 def _parse_class(entry: object, origin: Path | str) -> SemanticClass:
     if not isinstance(entry, dict):
-        raise InputError(f"{origin}: every class must be an object like {{\"id\": 1, \"name\": \"building\", \"color\": [214, 60, 60]}}")
+        raise InputError(
+            f'{origin}: every class must be an object like {{"id": 1, "name": "building", "color": [214, 60, 60]}}'
+        )
     label, name, color = entry.get("id"), entry.get("name"), entry.get("color")
     if not _is_int(label, 1, 255):
-        raise InputError(f"{origin}: class id {label!r} must be a whole number from 1 to 255 (0 means unlabelled)")
+        raise InputError(
+            f"{origin}: class id {label!r} must be a whole number from 1 to 255 (0 means unlabelled)"
+        )
     if not isinstance(name, str) or not name.strip():
         raise InputError(f"{origin}: class {label} needs a name")
-    if not isinstance(color, list | tuple) or len(color) != 3 or not all(_is_int(value, 0, 255) for value in color):
+    if (
+        not isinstance(color, list | tuple)
+        or len(color) != 3
+        or not all(_is_int(value, 0, 255) for value in color)
+    ):
         raise InputError(f"{origin}: class {label} needs a color of three numbers from 0 to 255")
     prompts, asprs = entry.get("prompts", [name]), entry.get("asprs", 1)
     if not isinstance(prompts, list | tuple) or not all(isinstance(prompt, str) for prompt in prompts):
         raise InputError(f"{origin}: prompts of class {label} must be a list of texts")
     if any(CONTROL.search(text) for text in (name, *prompts)) or len(name) > MAX_NAME:
-        raise InputError(f"{origin}: name or prompts of class {label} hold control characters, or more than {MAX_NAME} letters")
+        raise InputError(
+            f"{origin}: name or prompts of class {label} hold control characters, or more than {MAX_NAME} letters"
+        )
     if not _is_int(asprs, 0, 255):
         raise InputError(f"{origin}: asprs code of class {label} must be a whole number from 0 to 255")
     return SemanticClass(label, name.strip(), tuple(color), tuple(prompts), asprs)

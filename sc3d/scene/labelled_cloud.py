@@ -20,7 +20,8 @@ from sc3d.scene.labels import STATE_NAMES, Labels
 NORMAL_NEIGHBORS = 30
 SPACING_SAMPLE, SPACING_NEIGHBORS = 100_000, 8
 SURFACE_VOXEL = 2.5  # of the grid that blocks rays where there is no mesh, in point spacings
-REACH = 4.0  # a pixel shows the label of a cloud point at most this many point spacings away from the surface that it sees
+# a pixel shows the label of a cloud point at most this many point spacings away from the surface that it sees
+REACH = 4.0
 VOTES = "votes_"  # + class id; PLY has scalar properties only
 
 
@@ -34,10 +35,14 @@ def point_arrays(cloud: o3d.t.geometry.PointCloud, centres: np.ndarray) -> tuple
     return points, unit_normals(given, points, centres, points.min(axis=0))
 
 
-def unit_normals(given: np.ndarray | None, points: np.ndarray, centres: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 unit normals of points (N, 3) world: those given (N, 3), if they are all usable, else estimated.
+def unit_normals(
+    given: np.ndarray | None, points: np.ndarray, centres: np.ndarray, origin: np.ndarray
+) -> np.ndarray:
+    """(N, 3) float32 unit normals of points (N, 3) world: those given (N, 3), if they are all usable, else
+    estimated.
 
-    centres: (M, 3) camera centres, to the nearest of which estimated normals are turned; origin: as in `NeighborIndex`
+    centres: (M, 3) camera centres, to the nearest of which estimated normals are turned; origin: as in
+        `NeighborIndex`
     """
     if given is not None:
         normals = given.astype(np.float32)
@@ -50,21 +55,35 @@ def unit_normals(given: np.ndarray | None, points: np.ndarray, centres: np.ndarr
     return orient_normals(points, estimate_normals(points, neighbors), centres)
 
 
-def read_surface(mesh: Path, points: np.ndarray, normals: np.ndarray | None, origin: np.ndarray, kind: Literal["auto", "surfels", "voxels"] = "auto") -> RayTarget:
-    """The surface that rays hit, `Label.surface`: the mesh file if there is one and nothing else is wanted, else that of the points.
+def read_surface(
+    mesh: Path,
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    origin: np.ndarray,
+    kind: Literal["auto", "surfels", "voxels"] = "auto",
+) -> RayTarget:
+    """The surface that rays hit, `Label.surface`: the mesh file if there is one and nothing else is wanted,
+    else that of the points.
 
-    points: (N, 3) float64 world; normals: (N, 3) float32 unit or None = estimated; origin: (3,) world, shift of the frame for float32
+    points: (N, 3) float64 world; normals: (N, 3) float32 unit or None = estimated; origin: (3,) world, shift
+        of the frame for float32
     """
     if kind == "auto" and mesh.exists():
         read = read_mesh(mesh)
-        return Surface.from_mesh(read.vertex.positions.numpy().astype(np.float64), read.triangle.indices.numpy(), origin)
+        return Surface.from_mesh(
+            read.vertex.positions.numpy().astype(np.float64), read.triangle.indices.numpy(), origin
+        )
     if kind == "surfels":
         return Surface.from_cloud(points, normals, origin)
     return VoxelSurface.from_cloud(points, normals, SURFACE_VOXEL * spacing_of(points))
 
 
-def with_labels(cloud: o3d.t.geometry.PointCloud, normals: np.ndarray, labels: Labels, votes: np.ndarray | None = None) -> o3d.t.geometry.PointCloud:
-    """The same points, in order, with attributes label, confidence, state, num_views (and votes per class: (N, num_ids) float32)."""
+def with_labels(
+    cloud: o3d.t.geometry.PointCloud, normals: np.ndarray, labels: Labels, votes: np.ndarray | None = None
+) -> o3d.t.geometry.PointCloud:
+    """The same points, in order, with attributes label, confidence, state, num_views (and votes per class:
+    (N, num_ids) float32).
+    """
     result = cloud.clone()
     attributes = {
         "normals": normals.astype(np.float32),
@@ -76,7 +95,9 @@ def with_labels(cloud: o3d.t.geometry.PointCloud, normals: np.ndarray, labels: L
     for name in [name for name in result.point if name.startswith(VOTES)]:
         del result.point[name]
     if votes is not None:
-        attributes |= {f"{VOTES}{label}": votes[:, label, None].astype(np.float32) for label in range(votes.shape[1])}
+        attributes |= {
+            f"{VOTES}{label}": votes[:, label, None].astype(np.float32) for label in range(votes.shape[1])
+        }
     for name, values in attributes.items():
         result.point[name] = o3d.core.Tensor(np.ascontiguousarray(values))
     return result
@@ -92,11 +113,18 @@ def read_labelled(path: Path, made_by: str) -> tuple[o3d.t.geometry.PointCloud, 
 
 def take_labels(cloud: o3d.t.geometry.PointCloud, path: Path, made_by: str) -> Labels:
     """The labels of a cloud that was read from `path`, checked; its attributes get their proper types."""
-    ranges = {"label": (255, np.uint8), "confidence": (1, np.float32), "state": (len(STATE_NAMES) - 1, np.uint8), "num_views": (2**31 - 1, np.int32)}
+    ranges = {
+        "label": (255, np.uint8),
+        "confidence": (1, np.float32),
+        "state": (len(STATE_NAMES) - 1, np.uint8),
+        "num_views": (2**31 - 1, np.int32),
+    }
     missing = [name for name in ranges if name not in cloud.point]
     if missing:
         raise InputError(f"{path} has no attribute {missing[0]!r}: it was not written by `sc3d {made_by}`")
-    labels = Labels(*(_in_range(path, name, cloud.point[name].numpy().ravel(), *ranges[name]) for name in ranges))
+    labels = Labels(
+        *(_in_range(path, name, cloud.point[name].numpy().ravel(), *ranges[name]) for name in ranges)
+    )
     for name in ranges:
         cloud.point[name] = o3d.core.Tensor(getattr(labels, name)[:, None])
     return labels
@@ -104,26 +132,43 @@ def take_labels(cloud: o3d.t.geometry.PointCloud, path: Path, made_by: str) -> L
 
 def _in_range(path: Path, name: str, values: np.ndarray, largest: int, dtype: type) -> np.ndarray:
     """The values as `dtype`; InputError if it cannot hold them, or they are not from 0 to `largest`."""
-    if not ((values >= 0) & (values <= largest)).all() or (np.issubdtype(dtype, np.integer) and (values != np.floor(values)).any()):
-        raise InputError(f"{path} has values of {name!r} that are not from 0 to {largest}: it is damaged, or was not written by sc3d")
+    if not ((values >= 0) & (values <= largest)).all() or (
+        np.issubdtype(dtype, np.integer) and (values != np.floor(values)).any()
+    ):
+        raise InputError(
+            f"{path} has values of {name!r} that are not from 0 to {largest}: it is damaged, or was not written by sc3d"
+        )
     return values.astype(dtype)
 
 
 def read_votes(cloud: o3d.t.geometry.PointCloud) -> np.ndarray | None:
-    """(N, num_ids) float32 votes that `label` left in a cloud; None if there are none. InputError if they are none."""
-    ids = sorted(int(name[len(VOTES) :]) for name in cloud.point if name.startswith(VOTES) and name[len(VOTES) :].isdigit())
+    """(N, num_ids) float32 votes that `label` left in a cloud; None if there are none. InputError if they are
+    none.
+    """
+    ids = sorted(
+        int(name[len(VOTES) :])
+        for name in cloud.point
+        if name.startswith(VOTES) and name[len(VOTES) :].isdigit()
+    )
     if not ids or ids != list(range(len(ids))):
         return None
-    votes = np.concatenate([cloud.point[f"{VOTES}{label}"].numpy().astype(np.float32) for label in ids], axis=1)
+    votes = np.concatenate(
+        [cloud.point[f"{VOTES}{label}"].numpy().astype(np.float32) for label in ids], axis=1
+    )
     if len(ids) > 256 or not (np.isfinite(votes) & (votes >= 0)).all():
-        raise InputError("the votes of the cloud are not finite numbers of up to 255 classes: run `sc3d label` again")
+        raise InputError(
+            "the votes of the cloud are not finite numbers of up to 255 classes: run `sc3d label` again"
+        )
     return votes
 
 
 def spacing_of(points: np.ndarray) -> float:
     """Sampling distance of the (N, 3) points, world units, from at most 100 000 of them; 1 if they coincide."""
     sample = points[:: max(1, len(points) // SPACING_SAMPLE)]
-    return point_spacing(NeighborIndex(points, points.min(axis=0)).nearest(sample, SPACING_NEIGHBORS + 1)[1]) or 1.0
+    return (
+        point_spacing(NeighborIndex(points, points.min(axis=0)).nearest(sample, SPACING_NEIGHBORS + 1)[1])
+        or 1.0
+    )
 
 
 @dataclass(frozen=True)
@@ -140,15 +185,25 @@ class LabelledSurface:
 
     @classmethod
     def build(cls, cloud: o3d.t.geometry.PointCloud, views: list[View], mesh: Path) -> LabelledSurface:
-        """cloud: with `label`; views: of the scene, for the side that normals face; mesh: file of the surface, voxels of the cloud if it does not exist."""
+        """cloud: with `label`; views: of the scene, for the side that normals face; mesh: file of the
+        surface, voxels of the cloud if it does not exist.
+        """
         if "label" not in cloud.point:
             raise InputError("the cloud has no labels: run `sc3d label SCENE` and `sc3d propagate SCENE`")
         points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
         surface = read_surface(mesh, points, normals, local_origin(views))
-        return cls(surface, NeighborIndex(points, points.min(axis=0)), cloud.point["label"].numpy().ravel(), REACH * spacing_of(points))
+        return cls(
+            surface,
+            NeighborIndex(points, points.min(axis=0)),
+            cloud.point["label"].numpy().ravel(),
+            REACH * spacing_of(points),
+        )
 
-    def see(self, view: View, size: tuple[int, int], wanted: np.ndarray | None = None) -> tuple[np.ndarray, FirstSurface]:
-        """The class at each pixel of a photo, distortion included: that of the cloud point nearest to the first surface.
+    def see(
+        self, view: View, size: tuple[int, int], wanted: np.ndarray | None = None
+    ) -> tuple[np.ndarray, FirstSurface]:
+        """The class at each pixel of a photo, distortion included: that of the cloud point nearest to the
+        first surface.
 
         size: (width, height) of the result, px; wanted: (H, W) bool pixels to label, None = all
         returns: (H, W) uint8 ids, 0 = unlabelled or nothing hit; the first surface
@@ -156,7 +211,9 @@ class LabelledSurface:
         rows, first = self.rows(view, size, wanted)
         return np.where(rows >= 0, self.label[rows], 0).astype(np.uint8), first
 
-    def rows(self, view: View, size: tuple[int, int], wanted: np.ndarray | None = None) -> tuple[np.ndarray, FirstSurface]:
+    def rows(
+        self, view: View, size: tuple[int, int], wanted: np.ndarray | None = None
+    ) -> tuple[np.ndarray, FirstSurface]:
         """The same, as rows of the cloud: (H, W) int, -1 = nothing hit."""
         sized = view.resized(*size)
         first = first_surface(self.surface, sized)

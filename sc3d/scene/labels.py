@@ -12,7 +12,9 @@ STATE_NAMES = ("unseen", "seed", "locked", "propagated", "unlocked")
 
 @dataclass(frozen=True)
 class Labels:
-    """One entry per point: label uint8 (0 = none), confidence float32 in [0, 1], state uint8, num_views int32."""
+    """One entry per point: label uint8 (0 = none), confidence float32 in [0, 1], state uint8, num_views
+    int32.
+    """
 
     label: np.ndarray
     confidence: np.ndarray

@@ -122,9 +122,12 @@ class Scene:
     def mask_files(self, folder: Path, class_table: ClassTable | None = None) -> dict[str, Path]:
         """Masks (or truth masks, or confidence maps) of the views, by view name; all checked.
 
-        Raises InputError for an empty folder, a mask without a view, another aspect than the photo, or ids outside the class table.
+        Raises InputError for an empty folder, a mask without a view, another aspect than the photo, or ids
+        outside the class table.
         """
-        return match_masks(folder, {view.name: (view.width, view.height) for view in self.model.views}, class_table)
+        return match_masks(
+            folder, {view.name: (view.width, view.height) for view in self.model.views}, class_table
+        )
 
 
 @dataclass(frozen=True)
@@ -143,14 +146,19 @@ class SparseModel:
 
 
 def read_sparse_model(path: Path) -> SparseModel:
-    """Read a COLMAP model, binary or text; InputError if it is missing, broken or names photos outside the scene."""
+    """Read a COLMAP model, binary or text; InputError if it is missing, broken or names photos outside the
+    scene.
+    """
     import pycolmap
 
     from sc3d.geometry.cameras import View
     from sc3d.io.colmap import load_model
 
     reconstruction = load_model(path)
-    images = sorted((reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()), key=lambda image: image.name)
+    images = sorted(
+        (reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()),
+        key=lambda image: image.name,
+    )
     point_ids = np.array(sorted(reconstruction.point3D_ids()), dtype=np.uint64)
     points = [reconstruction.point3D(int(point_id)) for point_id in point_ids]
     views, tracks = [], []
@@ -158,25 +166,43 @@ def read_sparse_model(path: Path) -> SparseModel:
         _check_name(image.name, path)
         cam_from_world = np.eye(4)
         cam_from_world[:3] = image.cam_from_world().matrix()
-        views.append(View(image.name, pycolmap.Camera(image.camera.todict()), cam_from_world))  # a copy: image.camera dies with the model
+        # a copy: image.camera dies with the model
+        views.append(View(image.name, pycolmap.Camera(image.camera.todict()), cam_from_world))
         seen = np.array([point.point3D_id for point in image.get_observation_points2D()], dtype=np.uint64)
-        tracks.append(np.searchsorted(point_ids, np.intersect1d(seen, point_ids)))  # without points that were filtered out of the model
+        # without points that were filtered out of the model
+        tracks.append(np.searchsorted(point_ids, np.intersect1d(seen, point_ids)))
     stems = [Path(view.name).stem for view in views]
     if len(set(stems)) < len(stems):
-        raise InputError(f"{path}: two photos share a name up to the suffix, by which masks are found; rename one")
+        raise InputError(
+            f"{path}: two photos share a name up to the suffix, by which masks are found; rename one"
+        )
     xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     if not (np.abs(xyz) < FARTHEST).all():
-        raise InputError(f"{path} holds positions that are not finite numbers, or more than {FARTHEST:g} from the origin")
-    return SparseModel(views, xyz, np.array([point.color for point in points], np.uint8).reshape(-1, 3), tracks)
+        raise InputError(
+            f"{path} holds positions that are not finite numbers, or more than {FARTHEST:g} from the origin"
+        )
+    return SparseModel(
+        views, xyz, np.array([point.color for point in points], np.uint8).reshape(-1, 3), tracks
+    )
 
 
-def match_masks(folder: Path, photo_sizes: dict[str, tuple[int, int]], class_table: ClassTable | None) -> dict[str, Path]:
+def match_masks(
+    folder: Path, photo_sizes: dict[str, tuple[int, int]], class_table: ClassTable | None
+) -> dict[str, Path]:
     """Match `<photo stem>.png` files of a folder to photos and check them.
 
     photo_sizes: (width, height) px by photo name
     returns: path of the mask by photo name, for photos that have one
     """
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() == ".png" and not file.name.startswith(".")) if folder.is_dir() else []
+    files = (
+        sorted(
+            file
+            for file in folder.iterdir()
+            if file.suffix.lower() == ".png" and not file.name.startswith(".")
+        )
+        if folder.is_dir()
+        else []
+    )
     if not files:
         raise InputError(f"no masks in {folder}: PNG files named like the photos are expected")
     names = {Path(name).stem: name for name in photo_sizes}
@@ -184,13 +210,17 @@ def match_masks(folder: Path, photo_sizes: dict[str, tuple[int, int]], class_tab
     for file in files:
         name = names.get(file.stem)
         if name is None:
-            raise InputError(f"{file} belongs to no photo: {len(names)} photos are known, such as {next(iter(photo_sizes))}")
+            raise InputError(
+                f"{file} belongs to no photo: {len(names)} photos are known, such as {next(iter(photo_sizes))}"
+            )
         require_within(file, folder)
         check_mask_aspect(file, image_size(file), photo_sizes[name])
         if class_table is not None:
             unknown = class_table.unknown(read_index_image(file))
             if unknown:
-                raise InputError(f"{file} has class id {unknown[0]}, which is not in the class table (ids {[entry.id for entry in class_table]})")
+                raise InputError(
+                    f"{file} has class id {unknown[0]}, which is not in the class table (ids {[entry.id for entry in class_table]})"
+                )
         matched[name] = file
     return matched
 
@@ -199,14 +229,20 @@ def check_mask_aspect(file: Path, mask_size: tuple[int, int], photo_size: tuple[
     """Raise InputError unless a mask has the aspect of its photo within 1 px of the smaller of the two."""
     (width, height), (photo_width, photo_height) = mask_size, photo_size
     if width * height > max(MAX_MASK, photo_width * photo_height):
-        raise InputError(f"{file} is {width}x{height}, but its photo is {photo_width}x{photo_height}: more than {MAX_MASK // 10**6} megapixels are refused")
+        raise InputError(
+            f"{file} is {width}x{height}, but its photo is {photo_width}x{photo_height}: more than {MAX_MASK // 10**6} megapixels are refused"
+        )
     scale = min(1.0, min(photo_width / width, photo_height / height))
     if abs(width * photo_height - height * photo_width) * scale > max(photo_width, photo_height):
-        raise InputError(f"{file} is {width}x{height}, but its photo is {photo_width}x{photo_height}: the aspect must be the same within 1 px")
+        raise InputError(
+            f"{file} is {width}x{height}, but its photo is {photo_width}x{photo_height}: the aspect must be the same within 1 px"
+        )
 
 
 def check_photos(scene: Scene, names: list[str]) -> None:
-    """Raise InputError if a photo of the model is not in `images/`, cannot be read, is cut off, or is a link that leads elsewhere."""
+    """Raise InputError if a photo of the model is not in `images/`, cannot be read, is cut off, or is a link
+    that leads elsewhere.
+    """
     for name in names:
         check_photo(scene.photo(name))
         require_within(scene.photo(name), scene.images)

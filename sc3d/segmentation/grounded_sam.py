@@ -32,15 +32,22 @@ from sc3d.settings.labels import Segment
 if TYPE_CHECKING:
     import torch
 
-# Model types by configuration, and the class that loads them. SAM 2 on the hub is saved as a video model; photos need its image part only.
-_DETECTORS = {"grounding-dino": "GroundingDinoForObjectDetection", "mm-grounding-dino": "MMGroundingDinoForObjectDetection"}
+# Model types by configuration, and the class that loads them. SAM 2 on the hub is saved as a video model;
+# photos need its image part only.
+_DETECTORS = {
+    "grounding-dino": "GroundingDinoForObjectDetection",
+    "mm-grounding-dino": "MMGroundingDinoForObjectDetection",
+}
 _SEGMENTERS = {"sam": "SamModel", "sam2": "Sam2Model", "sam2_video": "Sam2Model"}
 _BOXES_AT_ONCE = 16  # SAM's mask decoder takes about 30 MB per box
-_SIDES = 800, 1333  # shorter side of the photo that Grounding DINO was trained on, and what the longer one may reach, px
+# shorter side of the photo that Grounding DINO was trained on, and what the longer one may reach, px
+_SIDES = 800, 1333
 
 
 class Detections(NamedTuple):
-    """Boxes in an image: (N, 4) float32 left, top, right, bottom, px; the N prompts that found them; (N,) float64 scores, 0 to 1."""
+    """Boxes in an image: (N, 4) float32 left, top, right, bottom, px; the N prompts that found them; (N,)
+    float64 scores, 0 to 1.
+    """
 
     boxes: np.ndarray
     prompts: list[Prompt]
@@ -51,7 +58,9 @@ class GroundedSam:
     """Segmenter for the classes of a table, by their prompts; models are loaded for the first photo."""
 
     def __init__(self, settings: Segment, class_table: ClassTable) -> None:
-        """Find packages and weights; raises MissingPackageError or InputError at once if something is missing."""
+        """Find packages and weights; raises MissingPackageError or InputError at once if something is
+        missing.
+        """
         check_packages("grounded-sam")
         check_settings(settings)
         self._settings = settings
@@ -62,7 +71,9 @@ class GroundedSam:
         self._segmenter_type = model_type(self.segmenter_path)
         for path, known in ((self.detector_path, _DETECTORS), (self.segmenter_path, _SEGMENTERS)):
             if model_type(path) not in known:
-                raise InputError(f"{path} holds a model of type {model_type(path)!r}; possible here: {', '.join(known)}")
+                raise InputError(
+                    f"{path} holds a model of type {model_type(path)!r}; possible here: {', '.join(known)}"
+                )
         self._sides = _detector_sides(self.detector_path)
 
     def segment(self, image: np.ndarray) -> Segmentation:
@@ -74,14 +85,22 @@ class GroundedSam:
         return Findings(self._outline(image, self.detect(image)))
 
     def detect(self, image: np.ndarray) -> Detections:
-        """Boxes of all classes in an (H, W, 3) uint8 RGB image, at least 1 px wide and high, within the image."""
+        """Boxes of all classes in an (H, W, 3) uint8 RGB image, at least 1 px wide and high, within the
+        image.
+        """
         pixels = self._detector_pixels(image)
         found = [self._detect_caption(pixels, caption) for caption in self._captions]
         prompts = [prompt for part in found for prompt in part.prompts]
         height, width = image.shape[:2]
-        boxes = np.clip(np.concatenate([part.boxes for part in found]), 0, 1) * np.array([width, height, width, height], np.float32)
+        boxes = np.clip(np.concatenate([part.boxes for part in found]), 0, 1) * np.array(
+            [width, height, width, height], np.float32
+        )
         kept = (boxes[:, 2:] - boxes[:, :2] >= 1).all(axis=1)
-        return Detections(boxes[kept], [prompts[number] for number in np.flatnonzero(kept)], np.concatenate([part.scores for part in found])[kept])
+        return Detections(
+            boxes[kept],
+            [prompts[number] for number in np.flatnonzero(kept)],
+            np.concatenate([part.scores for part in found])[kept],
+        )
 
     @cached_property
     def _detector(self) -> torch.nn.Module:
@@ -94,16 +113,29 @@ class GroundedSam:
     @cached_property
     def _captions(self) -> list[Caption]:
         tokenizer = load_tokenizer(self.detector_path, "AutoTokenizer")
-        # Prompts are tokenized one by one, so that it is known which tokens belong to which; a caption gives the same tokens.
-        tokens = [(prompt, tokenizer(prompt.text, add_special_tokens=False)["input_ids"]) for prompt in self._prompts]
+        # Prompts are tokenized one by one, so that it is known which tokens belong to which; a caption gives
+        # the same tokens.
+        tokens = [
+            (prompt, tokenizer(prompt.text, add_special_tokens=False)["input_ids"])
+            for prompt in self._prompts
+        ]
         stop = tokenizer.convert_tokens_to_ids(".")
-        return build_captions(tokens, tokenizer.cls_token_id, stop, tokenizer.sep_token_id, self._detector.config.max_text_len)
+        return build_captions(
+            tokens, tokenizer.cls_token_id, stop, tokenizer.sep_token_id, self._detector.config.max_text_len
+        )
 
     def _detector_pixels(self, image: np.ndarray) -> torch.Tensor:
-        """The image as Grounding DINO was trained: its shorter side 800 px, unless the longer one then passes 1333 px."""
+        """The image as Grounding DINO was trained: its shorter side 800 px, unless the longer one then passes
+        1333 px.
+        """
         height, width = image.shape[:2]
         scale = min(self._sides[0] / min(height, width), self._sides[1] / max(height, width))
-        return to_pixels(image, (max(1, int(width * scale + 1e-6)), max(1, int(height * scale + 1e-6))), IMAGENET, self._device)
+        return to_pixels(
+            image,
+            (max(1, int(width * scale + 1e-6)), max(1, int(height * scale + 1e-6))),
+            IMAGENET,
+            self._device,
+        )
 
     def _detect_caption(self, pixels: torch.Tensor, caption: Caption) -> Detections:
         """Boxes that match a prompt of one caption, in 0 to 1 of the image."""
@@ -111,9 +143,16 @@ class GroundedSam:
 
         ids = torch.tensor([caption.token_ids], device=self._device)
         with inference(self._device, self._settings.half):
-            output = self._detector(pixel_values=pixels, input_ids=ids, token_type_ids=torch.zeros_like(ids), attention_mask=torch.ones_like(ids))
+            output = self._detector(
+                pixel_values=pixels,
+                input_ids=ids,
+                token_type_ids=torch.zeros_like(ids),
+                attention_mask=torch.ones_like(ids),
+            )
         token_scores = output.logits[0].float().sigmoid().cpu().numpy()
-        numbers, scores = match_prompts(token_scores, caption, self._settings.box_threshold, self._settings.text_threshold)
+        numbers, scores = match_prompts(
+            token_scores, caption, self._settings.box_threshold, self._settings.text_threshold
+        )
         centres, sizes = output.pred_boxes[0].float().cpu().numpy().reshape(-1, 2, 2).transpose(1, 0, 2)
         found = numbers >= 0
         boxes = np.concatenate([centres - sizes / 2, centres + sizes / 2], axis=1)[found]
@@ -129,18 +168,26 @@ class GroundedSam:
         side = _image_side(self._segmenter)
         inner = _inner_size(width, height, side, keep_aspect=self._segmenter_type == "sam")
         scaled = found.boxes * (np.array(inner * 2, np.float32) / np.array([width, height] * 2, np.float32))
-        pixels = torch.nn.functional.pad(to_pixels(image, inner, IMAGENET, self._device), (0, side - inner[0], 0, side - inner[1]))
+        pixels = torch.nn.functional.pad(
+            to_pixels(image, inner, IMAGENET, self._device), (0, side - inner[0], 0, side - inner[1])
+        )
         instances = []
         with inference(self._device, self._settings.half):
             embeddings = self._segmenter.get_image_embeddings(pixels)
             for start in range(0, len(scaled), _BOXES_AT_ONCE):
                 part = slice(start, start + _BOXES_AT_ONCE)
                 boxes = torch.from_numpy(scaled[None, part]).to(self._device)
-                output = self._segmenter(image_embeddings=embeddings, input_boxes=boxes, multimask_output=False)
+                output = self._segmenter(
+                    image_embeddings=embeddings, input_boxes=boxes, multimask_output=False
+                )
                 scores = output.iou_scores[0, :, 0].float().tolist()
-                for logits, prompt, box_score, score in zip(output.pred_masks[0, :, 0], found.prompts[part], found.scores[part], scores, strict=True):
+                for logits, prompt, box_score, score in zip(
+                    output.pred_masks[0, :, 0], found.prompts[part], found.scores[part], scores, strict=True
+                ):
                     runs = outline(_without_padding(logits.float(), side, inner), 0.0, (height, width))
-                    instances.append(Instance(runs, (height, width), prompt.class_id, float(box_score), score, prompt.text))
+                    instances.append(
+                        Instance(runs, (height, width), prompt.class_id, float(box_score), score, prompt.text)
+                    )
         return instances
 
 
@@ -149,7 +196,9 @@ def _detector_sides(path: Path) -> tuple[int, int]:
     for file, part in (("preprocessor_config.json", None), ("processor_config.json", "image_processor")):
         if (path / file).is_file():
             config = read_json(path / file)
-            size = (config.get(part, {}) if part else config).get("size") if isinstance(config, dict) else None
+            size = (
+                (config.get(part, {}) if part else config).get("size") if isinstance(config, dict) else None
+            )
             if isinstance(size, dict) and {"shortest_edge", "longest_edge"} <= size.keys():
                 return int(size["shortest_edge"]), int(size["longest_edge"])
     return _SIDES
@@ -162,7 +211,9 @@ def _image_side(segmenter: torch.nn.Module) -> int:
 
 
 def _inner_size(width: int, height: int, side: int, keep_aspect: bool) -> tuple[int, int]:
-    """(width, height) px of the photo within the square of a SAM model: SAM 1 pads it right and below, SAM 2 stretches it."""
+    """(width, height) px of the photo within the square of a SAM model: SAM 1 pads it right and below, SAM 2
+    stretches it.
+    """
     if not keep_aspect:
         return side, side
     scale = side / max(width, height)
@@ -175,4 +226,6 @@ def _without_padding(logits: torch.Tensor, side: int, inner: tuple[int, int]) ->
 
     if inner == (side, side):
         return logits
-    return interpolate(logits[None, None], (side, side), mode="bilinear", align_corners=False)[0, 0, : inner[1], : inner[0]]
+    return interpolate(logits[None, None], (side, side), mode="bilinear", align_corners=False)[
+        0, 0, : inner[1], : inner[0]
+    ]

@@ -34,13 +34,17 @@ class Instance:
     prompt: str = ""
 
     @classmethod
-    def from_mask(cls, mask: np.ndarray, class_id: int, box_score: float, mask_score: float, prompt: str = "") -> Instance:
+    def from_mask(
+        cls, mask: np.ndarray, class_id: int, box_score: float, mask_score: float, prompt: str = ""
+    ) -> Instance:
         """From an (H, W) bool mask of the whole photo."""
         return cls(find_runs(mask, mask.shape[0]), mask.shape, class_id, box_score, mask_score, prompt)
 
     @cached_property
     def score(self) -> float:
-        """Box score x mask score; mask scores are regressed and may leave 0 to 1 a little, so both are clipped."""
+        """Box score x mask score; mask scores are regressed and may leave 0 to 1 a little, so both are
+        clipped.
+        """
         return float(np.clip(self.box_score, 0, 1) * np.clip(self.mask_score, 0, 1))
 
     @cached_property
@@ -62,11 +66,16 @@ class Instance:
 def useful(instances: list[Instance]) -> list[Instance]:
     """Those with a pixel and a score above 0 (not NaN), the best first."""
     kept = [instance for instance in instances if instance.score > 0 and len(instance.runs)]
-    return sorted(kept, key=lambda instance: (*(-value for value in instance.rank), instance.prompt, instance.runs[0, 0]))
+    return sorted(
+        kept,
+        key=lambda instance: (*(-value for value in instance.rank), instance.prompt, instance.runs[0, 0]),
+    )
 
 
 def drop_duplicates(instances: list[Instance]) -> list[Instance]:
-    """One instance per object, the best first: an instance goes if a better one of its class has more than half of their union in common with it."""
+    """One instance per object, the best first: an instance goes if a better one of its class has more than
+    half of their union in common with it.
+    """
     ranked = useful(instances)
     better: dict[int, list[int]] = {}
     for first, second in candidates(ranked, ranked):
@@ -82,30 +91,46 @@ def drop_duplicates(instances: list[Instance]) -> list[Instance]:
 
 def candidates(first: list[Instance], second: list[Instance]) -> list[tuple[int, int]]:
     """Numbers of the pairs of instances that are of one class and whose windows overlap, in order."""
-    one, other = (np.array([(*instance.window, instance.class_id) for instance in part], np.int64).reshape(-1, 5) for part in (first, second))
+    one, other = (
+        np.array([(*instance.window, instance.class_id) for instance in part], np.int64).reshape(-1, 5)
+        for part in (first, second)
+    )
     one, other = one[:, None], other[None]
-    pairs = (np.maximum(one[..., :2], other[..., :2]) < np.minimum(one[..., 2:4], other[..., 2:4])).all(axis=-1) & (one[..., 4] == other[..., 4])
+    pairs = (np.maximum(one[..., :2], other[..., :2]) < np.minimum(one[..., 2:4], other[..., 2:4])).all(
+        axis=-1
+    ) & (one[..., 4] == other[..., 4])
     return [(int(row), int(column)) for row, column in np.argwhere(pairs)]
 
 
 def move(instance: Instance, window: Window, size: tuple[int, int]) -> Instance:
     """An instance of a window of a photo as an instance of the photo, of `size` (height, width)."""
-    return replace(instance, runs=move_runs(instance.runs, instance.size[0], size[0], window.top, window.left), size=size)
+    return replace(
+        instance, runs=move_runs(instance.runs, instance.size[0], size[0], window.top, window.left), size=size
+    )
 
 
-def write_instances(path: Path, photo: str, size: tuple[int, int], instances: tuple[Instance, ...], class_table: ClassTable) -> None:
-    """Write the instances of one photo as a COCO data set of one image, readable by pycocotools, CVAT, FiftyOne and others.
+def write_instances(
+    path: Path, photo: str, size: tuple[int, int], instances: tuple[Instance, ...], class_table: ClassTable
+) -> None:
+    """Write the instances of one photo as a COCO data set of one image, readable by pycocotools, CVAT,
+    FiftyOne and others.
 
     photo: name of the photo; size: (height, width) px
-    Each annotation holds category_id (class id), segmentation (compressed RLE), bbox (left, top, width, height of the mask, px), area (px),
+    Each annotation holds category_id (class id), segmentation (compressed RLE), bbox (left, top, width,
+    height of the mask, px), area (px),
     score = box_score x mask_score, and the class name and prompt, which COCO does not ask for.
     """
-    annotations = [_annotation(number, instance, class_table) for number, instance in enumerate(instances, start=1)]
-    write_json(path, {
-        "images": [{"id": 1, "file_name": photo, "width": size[1], "height": size[0]}],
-        "categories": [{"id": entry.id, "name": entry.name} for entry in class_table],
-        "annotations": annotations,
-    })
+    annotations = [
+        _annotation(number, instance, class_table) for number, instance in enumerate(instances, start=1)
+    ]
+    write_json(
+        path,
+        {
+            "images": [{"id": 1, "file_name": photo, "width": size[1], "height": size[0]}],
+            "categories": [{"id": entry.id, "name": entry.name} for entry in class_table],
+            "annotations": annotations,
+        },
+    )
 
 
 def _annotation(number: int, instance: Instance, class_table: ClassTable) -> dict[str, object]:

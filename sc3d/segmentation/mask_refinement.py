@@ -1,4 +1,6 @@
-"""A second round for the masks: what contradicts the fused labels loses confidence, if photos that were left out say that this helps."""
+"""A second round for the masks: what contradicts the fused labels loses confidence, if photos that were left
+out say that this helps.
+"""
 
 from __future__ import annotations
 
@@ -46,12 +48,20 @@ class Material:
     def labels(self, views: list[View], read: ReadMask) -> Labels:
         """Labels of all points from the masks of some views."""
         fusion = fuse(self.cloud, views, read, self.seen.surface, self.num_ids, self.label)
-        return complete(Evidence(self.cloud.points, fusion.labels, fusion.votes, self.colors), self.cloud.normals, self.propagate)
+        return complete(
+            Evidence(self.cloud.points, fusion.labels, fusion.votes, self.colors),
+            self.cloud.normals,
+            self.propagate,
+        )
 
     def render(self, labels: Labels, view: View, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W) uint8 labels and (H, W) float32 confidences, 0 to 1, as a photo of (width, height) sees them."""
+        """(H, W) uint8 labels and (H, W) float32 confidences, 0 to 1, as a photo of (width, height) sees
+        them.
+        """
         rows, _ = self.seen.rows(view, size)
-        return np.where(rows >= 0, labels.label[rows], 0).astype(np.uint8), np.where(rows >= 0, labels.confidence[rows], 0).astype(np.float32)
+        return np.where(rows >= 0, labels.label[rows], 0).astype(np.uint8), np.where(
+            rows >= 0, labels.confidence[rows], 0
+        ).astype(np.float32)
 
 
 def material_of(scene: Scene, masks: Masks) -> Material:
@@ -59,14 +69,27 @@ def material_of(scene: Scene, masks: Masks) -> Material:
     cloud = read_given_cloud(scene, None)
     points, normals = point_arrays(cloud, np.array([view.centre for view in masks.views]))
     surface = read_surface(scene.mesh, points, normals, local_origin(masks.views))
-    seen = LabelledSurface(surface, NeighborIndex(points, points.min(axis=0)), np.zeros(len(points), np.uint8), REACH * spacing_of(points))
+    seen = LabelledSurface(
+        surface,
+        NeighborIndex(points, points.min(axis=0)),
+        np.zeros(len(points), np.uint8),
+        REACH * spacing_of(points),
+    )
     colors = cloud.point.colors.numpy() if "colors" in cloud.point else None
-    return Material(Cloud(points, normals), colors, seen, scene.class_table().num_ids, Label(voxel_size=default_voxel_size(points, masks)))
+    return Material(
+        Cloud(points, normals),
+        colors,
+        seen,
+        scene.class_table().num_ids,
+        Label(voxel_size=default_voxel_size(points, masks)),
+    )
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """before, after: mIoU of fused labels against the masks of the photos left out, without and with one more round; labels: of all photos."""
+    """before, after: mIoU of fused labels against the masks of the photos left out, without and with one more
+    round; labels: of all photos.
+    """
 
     before: float
     after: float
@@ -83,21 +106,28 @@ class Refinement:
 
 
 def refine(material: Material, views: list[View], read: ReadMask) -> Refinement:
-    """Fuse, lower the confidence of what contradicts, fuse again: once without every 4th photo, to see whether it helps there, and once with all."""
+    """Fuse, lower the confidence of what contradicts, fuse again: once without every 4th photo, to see
+    whether it helps there, and once with all.
+    """
     ordered = sorted(views, key=lambda view: view.name)
     asked = ordered[EVERY // 2 :: EVERY]
     kept = [view for view in ordered if view not in asked]
     first = material.labels(kept, read)
     second = material.labels(kept, lambda view: _doubted(material, first, view, read))
     before, after = (_agreement(material, labels, asked, read) for labels in (first, second))
-    logger.info("photos left out: mIoU of their masks with the fused labels %.2f %%, with doubted masks %.2f %%", 100 * before, 100 * after)
+    logger.info(
+        "photos left out: mIoU of their masks with the fused labels %.2f %%, with doubted masks %.2f %%",
+        100 * before,
+        100 * after,
+    )
     return Refinement(before, after, material, material.labels(ordered, read) if after > before else first)
 
 
 def doubt(mask: np.ndarray, confidence: np.ndarray | None, fused: np.ndarray, sure: np.ndarray) -> np.ndarray:
     """(H, W) uint8 confidence c (1 - p) where the fused label is another than the mask's, c elsewhere.
 
-    mask, fused: (H, W) uint8 ids, 0 = no label; confidence c: (H, W) uint8, None = full; sure: (H, W) probability p of the fused label, 0 to 1
+    mask, fused: (H, W) uint8 ids, 0 = no label; confidence c: (H, W) uint8, None = full; sure: (H, W)
+        probability p of the fused label, 0 to 1
     """
     given = np.full(mask.shape, FULL, np.uint8) if confidence is None else confidence
     contradicted = (mask > 0) & (fused > 0) & (mask != fused)

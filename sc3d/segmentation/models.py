@@ -17,7 +17,8 @@ from sc3d.settings.labels import Segment
 if TYPE_CHECKING:
     import torch
 
-IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # mean and standard deviation of RGB that Grounding DINO, SAM 1 and SAM 2 were trained with
+# mean and standard deviation of RGB that Grounding DINO, SAM 1 and SAM 2 were trained with
+IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 HALVES = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)  # the same of SAM 3
 
 
@@ -29,9 +30,13 @@ def check_packages(backend: str) -> None:
         try:
             found = version(package)
         except PackageNotFoundError:
-            raise MissingPackageError(f"the {backend} backend needs {package}: pip install 'sc3d[masks]'") from None
+            raise MissingPackageError(
+                f"the {backend} backend needs {package}: pip install 'sc3d[masks]'"
+            ) from None
         if int(found.split(".")[0]) < oldest:
-            raise MissingPackageError(f"the {backend} backend needs {package} {oldest} or newer, not {found}: pip install -U 'sc3d[masks]'")
+            raise MissingPackageError(
+                f"the {backend} backend needs {package} {oldest} or newer, not {found}: pip install -U 'sc3d[masks]'"
+            )
 
 
 def check_settings(settings: Segment) -> None:
@@ -42,11 +47,15 @@ def check_settings(settings: Segment) -> None:
     if settings.tile and settings.tile < 64:
         raise InputError(f"tile is {settings.tile} px, but must be at least 64, or 0 for no tiles")
     if not 0 < settings.overlap <= 0.75:
-        raise InputError(f"overlap is {settings.overlap}, but must be above 0 (tiles are joined where they overlap) and at most 0.75")
+        raise InputError(
+            f"overlap is {settings.overlap}, but must be above 0 (tiles are joined where they overlap) and at most 0.75"
+        )
 
 
 def choose_device(settings: Segment) -> str:
-    """Name of a torch device that works; InputError if there is none of that name, or half precision is wanted without a GPU."""
+    """Name of a torch device that works; InputError if there is none of that name, or half precision is
+    wanted without a GPU.
+    """
     import torch
 
     name = settings.device
@@ -55,15 +64,21 @@ def choose_device(settings: Segment) -> str:
     try:
         torch.empty(1, device=name)
     except (RuntimeError, AssertionError) as error:
-        raise InputError(f"the device {name!r} cannot be used ({first_line(error)}): choose cpu, or leave it at auto") from None
+        raise InputError(
+            f"the device {name!r} cannot be used ({first_line(error)}): choose cpu, or leave it at auto"
+        ) from None
     if settings.half and torch.device(name).type != "cuda":
-        raise InputError(f"half precision is for CUDA GPUs, but the device is {name}, where it is slower and less exact: leave --half away")
+        raise InputError(
+            f"half precision is for CUDA GPUs, but the device is {name}, where it is slower and less exact: leave --half away"
+        )
     return name
 
 
 @contextmanager
 def inference(device: str, half: bool) -> Iterator[None]:
-    """No gradients; with `half`, matrix products in bfloat16 (float16 on GPUs older than Ampere), what needs range in float32."""
+    """No gradients; with `half`, matrix products in bfloat16 (float16 on GPUs older than Ampere), what needs
+    range in float32.
+    """
     import torch
 
     with ExitStack() as stack:
@@ -76,7 +91,8 @@ def inference(device: str, half: bool) -> Iterator[None]:
 
 
 def load_model(path: Path, classes: dict[str, str], device: str) -> torch.nn.Module:
-    """Load a model for inference: safetensors only, from this machine only; InputError if the weights are damaged or incomplete.
+    """Load a model for inference: safetensors only, from this machine only; InputError if the weights are
+    damaged or incomplete.
 
     classes: name of the class in transformers by model type
     """
@@ -89,33 +105,49 @@ def load_model(path: Path, classes: dict[str, str], device: str) -> torch.nn.Mod
     logging.disable_progress_bar()
     try:
         model, report = model_class.from_pretrained(
-            path, local_files_only=True, use_safetensors=True, trust_remote_code=False, output_loading_info=True, dtype="float32",
+            path,
+            local_files_only=True,
+            use_safetensors=True,
+            trust_remote_code=False,
+            output_loading_info=True,
+            dtype="float32",
         )
-    except Exception as error:  # OSError, ValueError, RuntimeError, SafetensorError, TypeError: whatever a damaged file brings about
+    # OSError, ValueError, RuntimeError, SafetensorError, TypeError: whatever a damaged file brings about
+    except Exception as error:
         raise InputError(f"cannot load the model in {path}: {first_line(error)}; download it again") from None
     finally:
         logging.set_verbosity(verbosity)
         if progress:
             logging.enable_progress_bar()
     if report["missing_keys"]:  # those would silently be random
-        raise InputError(f"the weights in {path} are incomplete ({sorted(report['missing_keys'])[0]} is missing): download the model again")
+        raise InputError(
+            f"the weights in {path} are incomplete ({sorted(report['missing_keys'])[0]} is missing): download the model again"
+        )
     return model.to(device).eval()
 
 
 def load_tokenizer(path: Path, name: str):
-    """Load the tokenizer in a model's folder by the name of its class in transformers; InputError if it is missing or damaged."""
+    """Load the tokenizer in a model's folder by the name of its class in transformers; InputError if it is
+    missing or damaged.
+    """
     import transformers
 
     try:
-        return getattr(transformers, name).from_pretrained(path, local_files_only=True, trust_remote_code=False)
+        return getattr(transformers, name).from_pretrained(
+            path, local_files_only=True, trust_remote_code=False
+        )
     except Exception as error:
-        raise InputError(f"cannot load the tokenizer in {path}: {first_line(error)}; download the model again") from None
+        raise InputError(
+            f"cannot load the tokenizer in {path}: {first_line(error)}; download the model again"
+        ) from None
 
 
 def to_pixels(image: np.ndarray, size: tuple[int, int], statistics: tuple, device: str) -> torch.Tensor:
-    """(1, 3, height, width) float32 of an (H, W, 3) uint8 photo, resized with antialiasing to `size` (width, height) and normalised.
+    """(1, 3, height, width) float32 of an (H, W, 3) uint8 photo, resized with antialiasing to `size` (width,
+    height) and normalised.
 
-    Done here rather than by the models' own processors: those of SAM 2 and 3 need torchvision, and results would differ with and without it.
+    Done here rather than by the models' own processors: those of SAM 2 and 3 need torchvision, and results
+    would differ with and without it.
     """
     import torch
     from PIL import Image
@@ -134,11 +166,13 @@ class Patch(NamedTuple):
 
 
 def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> Patch:
-    """Enlarge a map to the size of the photo, bilinearly (pixel centres at +0.5), but only where the result may exceed a threshold.
+    """Enlarge a map to the size of the photo, bilinearly (pixel centres at +0.5), but only where the result
+    may exceed a threshold.
 
     values: (h, w) float32
     shape: (H, W) px
-    returns: a rectangle of the enlarged map that holds all pixels above `threshold`, and few others; empty if there are none
+    returns: a rectangle of the enlarged map that holds all pixels above `threshold`, and few others; empty if
+        there are none
     """
     import torch
 
@@ -150,11 +184,15 @@ def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> P
 
 
 def _sources(present: torch.Tensor, length: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, int]:
-    """For each of the `length` output places that touch a present one: the two input places, the weight of the second; and the first such place."""
+    """For each of the `length` output places that touch a present one: the two input places, the weight of
+    the second; and the first such place.
+    """
     import torch
 
     number, there = len(present), present.cpu()  # few numbers, and not every device has float64
-    places = ((torch.arange(length, dtype=torch.float64) + 0.5) * (number / length) - 0.5).clamp(0, number - 1)
+    places = ((torch.arange(length, dtype=torch.float64) + 0.5) * (number / length) - 0.5).clamp(
+        0, number - 1
+    )
     low = places.floor().long()
     high = (low + 1).clamp(max=number - 1)
     touched = torch.nonzero(there[low] | there[high])[:, 0]

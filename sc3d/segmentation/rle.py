@@ -1,7 +1,10 @@
-"""Masks as runs: a few kilobytes for an object in a 20-megapixel photo, and set operations that never unpack it.
+"""Masks as runs: a few kilobytes for an object in a 20-megapixel photo, and set operations that never unpack
+it.
 
-A mask of a photo of `height` rows is (K, 2) int64: for each vertical run of pixels its first pixel and its last + 1, counted as
-column * height + row. Runs are sorted, do not touch within a column and never cross from one column to the next; so a mask has one form only.
+A mask of a photo of `height` rows is (K, 2) int64: for each vertical run of pixels its first pixel and its
+last + 1, counted as
+column * height + row. Runs are sorted, do not touch within a column and never cross from one column to the
+next; so a mask has one form only.
 """
 
 from __future__ import annotations
@@ -21,11 +24,21 @@ class Window(NamedTuple):
 
     def common(self, other: Window) -> Window:
         """The rectangle that both cover; empty if right <= left or bottom <= top."""
-        return Window(max(self.left, other.left), max(self.top, other.top), min(self.right, other.right), min(self.bottom, other.bottom))
+        return Window(
+            max(self.left, other.left),
+            max(self.top, other.top),
+            min(self.right, other.right),
+            min(self.bottom, other.bottom),
+        )
 
     def holds(self, other: Window) -> bool:
         """Whether all of `other` lies inside."""
-        return self.left <= other.left and self.top <= other.top and self.right >= other.right and self.bottom >= other.bottom
+        return (
+            self.left <= other.left
+            and self.top <= other.top
+            and self.right >= other.right
+            and self.bottom >= other.bottom
+        )
 
     @property
     def empty(self) -> bool:
@@ -33,7 +46,9 @@ class Window(NamedTuple):
 
 
 def find_runs(mask: np.ndarray, height: int, top: int = 0, left: int = 0) -> np.ndarray:
-    """Runs of an (h, w) bool mask whose upper left pixel is row `top`, column `left` of a photo of `height` rows."""
+    """Runs of an (h, w) bool mask whose upper left pixel is row `top`, column `left` of a photo of `height`
+    rows.
+    """
     rows, columns = mask.shape
     padded = np.zeros((columns, rows + 2), bool)  # one empty pixel above and below keeps columns apart
     padded[:, 1:-1] = mask.T
@@ -46,9 +61,11 @@ def fill_runs(runs: np.ndarray, height: int) -> tuple[np.ndarray, Window]:
     """(h, w) bool mask of the smallest window that holds all runs, and that window; at least one run."""
     window = bounds(runs, height)
     rows, columns = window.bottom - window.top, window.right - window.left
-    steps = np.zeros((columns, rows + 1), np.int8)  # +1 where a run starts, -1 after it ends; the end may be below the window
+    # +1 where a run starts, -1 after it ends; the end may be below the window
+    steps = np.zeros((columns, rows + 1), np.int8)
     places = (runs // height - window.left) * (rows + 1) + runs % height - window.top
-    places[:, 1] = places[:, 0] + runs[:, 1] - runs[:, 0]  # the end of a run at the foot of a column belongs to that column
+    # the end of a run at the foot of a column belongs to that column
+    places[:, 1] = places[:, 0] + runs[:, 1] - runs[:, 0]
     steps.ravel()[places[:, 0]] = 1
     steps.ravel()[places[:, 1]] = -1
     return np.cumsum(steps, axis=1, dtype=np.int8)[:, :-1].T.astype(bool), window
@@ -58,11 +75,18 @@ def bounds(runs: np.ndarray, height: int) -> Window:
     """Smallest window that holds all runs; at least one run."""
     rows = runs % height
     lengths = runs[:, 1] - runs[:, 0]
-    return Window(int(runs[0, 0] // height), int(rows[:, 0].min()), int(runs[-1, 0] // height) + 1, int((rows[:, 0] + lengths).max()))
+    return Window(
+        int(runs[0, 0] // height),
+        int(rows[:, 0].min()),
+        int(runs[-1, 0] // height) + 1,
+        int((rows[:, 0] + lengths).max()),
+    )
 
 
 def move_runs(runs: np.ndarray, height: int, new_height: int, top: int, left: int) -> np.ndarray:
-    """Runs of a window of `height` rows as runs of a photo of `new_height` rows in which that window starts at row `top`, column `left`."""
+    """Runs of a window of `height` rows as runs of a photo of `new_height` rows in which that window starts
+    at row `top`, column `left`.
+    """
     first = (runs[:, 0] // height + left) * new_height + runs[:, 0] % height + top
     return np.stack([first, first + runs[:, 1] - runs[:, 0]], axis=1)
 
@@ -72,7 +96,10 @@ def clip_runs(runs: np.ndarray, height: int, window: Window) -> np.ndarray:
     columns = runs[:, 0] // height
     inside = (columns >= window.left) & (columns < window.right)
     heads = columns[inside] * height
-    first, last = np.maximum(runs[inside, 0], heads + window.top), np.minimum(runs[inside, 1], heads + window.bottom)
+    first, last = (
+        np.maximum(runs[inside, 0], heads + window.top),
+        np.minimum(runs[inside, 1], heads + window.bottom),
+    )
     return np.stack([first, last], axis=1)[first < last]
 
 
@@ -81,8 +108,12 @@ def cut_runs(runs: np.ndarray, height: int, window: Window) -> np.ndarray:
     if window.empty:
         return runs
     num_columns = int(runs[-1, 0] // height) + 1 if len(runs) else 0
-    sides = [(0, 0, window.left, height), (window.right, 0, num_columns, height),
-             (window.left, 0, window.right, window.top), (window.left, window.bottom, window.right, height)]
+    sides = [
+        (0, 0, window.left, height),
+        (window.right, 0, num_columns, height),
+        (window.left, 0, window.right, window.top),
+        (window.left, window.bottom, window.right, height),
+    ]
     return join_runs([clip_runs(runs, height, Window(*side)) for side in sides], height)
 
 
@@ -93,8 +124,11 @@ def join_runs(parts: list[np.ndarray], height: int) -> np.ndarray:
     if not len(runs):
         return runs
     reach = np.maximum.accumulate(runs[:, 1])
-    # A run goes on with those before it if it starts where they reach, or earlier; a new column always starts a new run.
-    opens = np.concatenate([[True], (runs[1:, 0] > reach[:-1]) | (runs[1:, 0] % height == 0) & (runs[1:, 0] == reach[:-1])])
+    # A run goes on with those before it if it starts where they reach, or earlier; a new column always starts
+    # a new run.
+    opens = np.concatenate(
+        [[True], (runs[1:, 0] > reach[:-1]) | (runs[1:, 0] % height == 0) & (runs[1:, 0] == reach[:-1])]
+    )
     closes = np.concatenate([opens[1:], [True]])
     return np.stack([runs[opens, 0], reach[closes]], axis=1)
 
@@ -113,10 +147,13 @@ def iou(first: np.ndarray, second: np.ndarray, height: int) -> float:
 def encode_runs(runs: np.ndarray, size: tuple[int, int]) -> str:
     """A mask of a photo of `size` (height, width) as the compressed run-length string of COCO.
 
-    source: the COCO format: lengths of alternating runs of zeros and ones in column order, starting with zeros; from the fourth on each as
-    the difference from the length two before; written in digits of 5 bits, lowest first, with a sixth bit where more follow, plus 48 as ASCII
+    source: the COCO format: lengths of alternating runs of zeros and ones in column order, starting with
+        zeros; from the fourth on each as
+    the difference from the length two before; written in digits of 5 bits, lowest first, with a sixth bit
+    where more follow, plus 48 as ASCII
     """
-    crossing = runs[1:, 0] == runs[:-1, 1] if len(runs) else np.zeros(0, bool)  # COCO's runs go on from the foot of a column to the next head
+    # COCO's runs go on from the foot of a column to the next head
+    crossing = runs[1:, 0] == runs[:-1, 1] if len(runs) else np.zeros(0, bool)
     first = runs[np.concatenate([np.ones(min(len(runs), 1), bool), ~crossing]), 0]
     last = runs[np.concatenate([~crossing, np.ones(min(len(runs), 1), bool)]), 1]
     edges = np.stack([first, last], axis=1).ravel()

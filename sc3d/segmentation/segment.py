@@ -16,7 +16,9 @@ from sc3d.segmentation.instances import Instance, write_instances
 
 
 class Segmentation(NamedTuple):
-    """What a backend says of a photo: (H, W) uint8 class id, 0 = unlabelled; (H, W) uint8 confidence, 255 = sure; objects, None if it finds none."""
+    """What a backend says of a photo: (H, W) uint8 class id, 0 = unlabelled; (H, W) uint8 confidence, 255 =
+    sure; objects, None if it finds none.
+    """
 
     labels: np.ndarray
     confidence: np.ndarray
@@ -55,11 +57,20 @@ class Folders:
     instances: Path
 
 
-def segment_photos(photos: list[Path], folders: Folders, segmenter: Segmenter, class_table: ClassTable, overwrite: bool = False) -> SegmentSummary:
-    """Write a mask and a confidence map for every photo, and its instances if the segmenter tells objects apart.
+def segment_photos(
+    photos: list[Path],
+    folders: Folders,
+    segmenter: Segmenter,
+    class_table: ClassTable,
+    overwrite: bool = False,
+) -> SegmentSummary:
+    """Write a mask and a confidence map for every photo, and its instances if the segmenter tells objects
+    apart.
 
-    Photos that have a mask are skipped unless `overwrite`, so an interrupted run goes on where it stopped, whatever stopped it.
-    Raises InputError before the work starts if a photo cannot be opened, two share a stem, or an old mask does not fit its photo.
+    Photos that have a mask are skipped unless `overwrite`, so an interrupted run goes on where it stopped,
+    whatever stopped it.
+    Raises InputError before the work starts if a photo cannot be opened, two share a stem, or an old mask
+    does not fit its photo.
     """
     from tqdm import tqdm
 
@@ -70,11 +81,18 @@ def segment_photos(photos: list[Path], folders: Folders, segmenter: Segmenter, c
         result = Segmentation(*segmenter.segment(image))
         for array in (result.labels, result.confidence):
             if array.shape != image.shape[:2] or array.dtype != np.uint8:
-                raise ValueError(f"the segmenter returned {array.shape} {array.dtype} for a photo of {image.shape[:2]}")
+                raise ValueError(
+                    f"the segmenter returned {array.shape} {array.dtype} for a photo of {image.shape[:2]}"
+                )
         _write(photo, folders, result, class_table)
         num_pixels += np.bincount(result.labels.ravel(), minlength=256)
         num_instances += len(result.instances or ())
-    return SegmentSummary([photo.name for photo in todo], [photo.name for photo in photos if photo not in pending], num_pixels, num_instances)
+    return SegmentSummary(
+        [photo.name for photo in todo],
+        [photo.name for photo in photos if photo not in pending],
+        num_pixels,
+        num_instances,
+    )
 
 
 def _write(photo: Path, folders: Folders, result: Segmentation, class_table: ClassTable) -> None:
@@ -96,7 +114,9 @@ def _check_photos(photos: list[Path], out_masks: Path, overwrite: bool) -> list[
         size = image_size(photo)
         other = by_stem.setdefault(photo.stem, photo)
         if other is not photo:
-            raise InputError(f"{other} and {photo} share the name {photo.stem!r}, by which masks are found: rename one")
+            raise InputError(
+                f"{other} and {photo} share the name {photo.stem!r}, by which masks are found: rename one"
+            )
         mask = out_masks / f"{photo.stem}.png"
         if overwrite or not mask.exists():
             todo.append(photo)

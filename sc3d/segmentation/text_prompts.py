@@ -35,23 +35,32 @@ class Caption:
 def list_prompts(class_table: ClassTable) -> list[Prompt]:
     """Prompts of all classes in lower case; InputError if there are none or one means two classes.
 
-    Full stops and question marks separate prompts in the detector's caption, so they become spaces. A class without prompts is not looked for.
+    Full stops and question marks separate prompts in the detector's caption, so they become spaces. A class
+    without prompts is not looked for.
     """
     prompts: dict[str, Prompt] = {}
     for entry in class_table:
         for written in entry.prompts:
             text = " ".join(written.lower().replace(".", " ").replace("?", " ").split())
             if not text:
-                raise InputError(f"class {entry.name!r} has an empty prompt: remove it, or write what the class looks like in a few words")
+                raise InputError(
+                    f"class {entry.name!r} has an empty prompt: remove it, or write what the class looks like in a few words"
+                )
             known = prompts.setdefault(text, Prompt(text, entry.id))
             if known.class_id != entry.id:
-                raise InputError(f"the prompt {text!r} belongs to the classes {class_table.name(known.class_id)!r} and {entry.name!r}: keep one")
+                raise InputError(
+                    f"the prompt {text!r} belongs to the classes {class_table.name(known.class_id)!r} and {entry.name!r}: keep one"
+                )
     if not prompts:
-        raise InputError("no class has a prompt: add \"prompts\" to the class table, such as [\"building\", \"house\"]")
+        raise InputError(
+            'no class has a prompt: add "prompts" to the class table, such as ["building", "house"]'
+        )
     return list(prompts.values())
 
 
-def build_captions(tokens: list[tuple[Prompt, list[int]]], start: int, stop: int, end: int, max_tokens: int) -> list[Caption]:
+def build_captions(
+    tokens: list[tuple[Prompt, list[int]]], start: int, stop: int, end: int, max_tokens: int
+) -> list[Caption]:
     """Join prompts to as few captions as a detector's text length allows.
 
     tokens: prompts with their token ids, without special tokens
@@ -61,7 +70,9 @@ def build_captions(tokens: list[tuple[Prompt, list[int]]], start: int, stop: int
     captions: list[Caption] = []
     for prompt, ids in tokens:
         if len(ids) + 3 > max_tokens:
-            raise InputError(f"the prompt {prompt.text[:40]!r} is {len(ids)} tokens long, the detector takes {max_tokens - 3}: shorten it")
+            raise InputError(
+                f"the prompt {prompt.text[:40]!r} is {len(ids)} tokens long, the detector takes {max_tokens - 3}: shorten it"
+            )
         if not captions or len(captions[-1].token_ids) + len(ids) + 2 > max_tokens:
             captions.append(Caption([start], [], []))
         caption = captions[-1]
@@ -73,24 +84,33 @@ def build_captions(tokens: list[tuple[Prompt, list[int]]], start: int, stop: int
     return captions
 
 
-def match_prompts(token_scores: np.ndarray, caption: Caption, box_threshold: float, text_threshold: float) -> tuple[np.ndarray, np.ndarray]:
+def match_prompts(
+    token_scores: np.ndarray, caption: Caption, box_threshold: float, text_threshold: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Prompt and score of each of N boxes, from how well the box matches every token of the caption.
 
     token_scores: (N, >= T) probability 0 to 1 that the box shows what the token says
-    box_threshold, text_threshold: a prompt is a candidate if the box matches one of its tokens better than both;
+    box_threshold, text_threshold: a prompt is a candidate if the box matches one of its tokens better than
+        both;
         tokens that match no better than text_threshold do not count
-    returns: (N,) int64 number of the prompt in the caption, -1 for a box without candidate; (N,) float64 score: the best token of that prompt
+    returns: (N,) int64 number of the prompt in the caption, -1 for a box without candidate; (N,) float64
+        score: the best token of that prompt
 
-    A box may match tokens of several prompts ("building. road."). It goes to the candidate with the highest mean over all tokens of the prompt,
-    where tokens that do not count are 0: so "parking lot" with both words beats "parking garage" with one. Ties go to the lower class id.
+    A box may match tokens of several prompts ("building. road."). It goes to the candidate with the highest
+    mean over all tokens of the prompt,
+    where tokens that do not count are 0: so "parking lot" with both words beats "parking garage" with one.
+    Ties go to the lower class id.
     """
     scores = np.asarray(token_scores, np.float64)
     counted = np.where(scores > text_threshold, scores, 0.0)
-    order = np.argsort([prompt.class_id for prompt in caption.prompts], kind="stable")  # argmax takes the first of equals
+    # argmax takes the first of equals
+    order = np.argsort([prompt.class_id for prompt in caption.prompts], kind="stable")
     spans = [caption.spans[number] for number in order]
     best = np.stack([scores[:, first:last].max(axis=1) for first, last in spans], axis=1)
     mean = np.stack([counted[:, first:last].mean(axis=1) for first, last in spans], axis=1)
     candidate = (best > box_threshold) & (mean > 0)
     chosen = np.where(candidate, mean, -1.0).argmax(axis=1)
     found = candidate.any(axis=1)
-    return np.where(found, order[chosen], -1), np.where(found, np.take_along_axis(best, chosen[:, None], axis=1)[:, 0], 0.0)
+    return np.where(found, order[chosen], -1), np.where(
+        found, np.take_along_axis(best, chosen[:, None], axis=1)[:, 0], 0.0
+    )

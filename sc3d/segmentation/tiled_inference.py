@@ -1,12 +1,19 @@
-"""Large photos in overlapping tiles: the whole photo for what is large, tiles for what is small, one set of objects out of both.
+"""Large photos in overlapping tiles: the whole photo for what is large, tiles for what is small, one set of
+objects out of both.
 
-1. The photo is looked at as a whole (the model shrinks it), and in tiles of equal size that overlap and are spread evenly.
-2. In each look, of two instances of one class that are the same object (more than half of their union in common) the better stays.
-3. Instances of one class in two tiles are parts of one object if, in the strip that both tiles see, they have more than half of their union
-   in common. Parts are joined, over as many tiles as it takes; the object has the scores and the prompt of its largest part.
-4. A part that ends at a tile's border (not the photo's), has no partner, and lies where another tile sees all of it, is dropped: it is a
+1. The photo is looked at as a whole (the model shrinks it), and in tiles of equal size that overlap and are
+    spread evenly.
+2. In each look, of two instances of one class that are the same object (more than half of their union in
+    common) the better stays.
+3. Instances of one class in two tiles are parts of one object if, in the strip that both tiles see, they have
+    more than half of their union
+   in common. Parts are joined, over as many tiles as it takes; the object has the scores and the prompt of
+   its largest part.
+4. A part that ends at a tile's border (not the photo's), has no partner, and lies where another tile sees all
+    of it, is dropped: it is a
    fragment that the tile with the better view did not confirm. One that no other tile sees in full is kept.
-5. An object found both in tiles and in the whole photo (again by half of the union) has the tiles' finer outline inside the tiles in which
+5. An object found both in tiles and in the whole photo (again by half of the union) has the tiles' finer
+    outline inside the tiles in which
    it was found, the whole photo's elsewhere, and the better of the two scores.
 """
 
@@ -27,7 +34,9 @@ from sc3d.segmentation.segment import Segmentation
 
 
 class Findings(NamedTuple):
-    """What a model finds in one look at an image: instances in its pixels; what it says of every pixel, if it does."""
+    """What a model finds in one look at an image: instances in its pixels; what it says of every pixel, if it
+    does.
+    """
 
     instances: list[Instance]
     areas: Areas | None = None
@@ -40,7 +49,9 @@ class TiledObject(NamedTuple):
     windows: frozenset[Window]
 
 
-def segment_tiled(image: np.ndarray, find: Callable[[np.ndarray], Findings], tile: int, overlap: float) -> Segmentation:
+def segment_tiled(
+    image: np.ndarray, find: Callable[[np.ndarray], Findings], tile: int, overlap: float
+) -> Segmentation:
     """Segment a photo as a whole and, if it is larger than `tile`, in tiles.
 
     image: (H, W, 3) uint8 RGB
@@ -67,11 +78,15 @@ def segment_tiled(image: np.ndarray, find: Callable[[np.ndarray], Findings], til
 
 
 def list_tiles(width: int, height: int, tile: int, overlap: float) -> list[Window]:
-    """Windows of equal size that cover a photo row by row; none if the photo is no larger than a tile, or `tile` is 0."""
+    """Windows of equal size that cover a photo row by row; none if the photo is no larger than a tile, or
+    `tile` is 0.
+    """
     if not tile or max(width, height) <= tile:
         return []
     across, down = _starts(width, tile, overlap), _starts(height, tile, overlap)
-    return [Window(left, top, min(left + tile, width), min(top + tile, height)) for top in down for left in across]
+    return [
+        Window(left, top, min(left + tile, width), min(top + tile, height)) for top in down for left in across
+    ]
 
 
 def _starts(length: int, tile: int, overlap: float) -> list[int]:
@@ -107,13 +122,22 @@ def join_tiles(found: list[list[Instance]], windows: list[Window]) -> list[Tiled
 
 
 def _partners(first: list[Instance], second: list[Instance], strip: Window) -> list[tuple[int, int]]:
-    """Numbers of the instances of two tiles that are parts of one object, judged in the strip that both tiles see."""
+    """Numbers of the instances of two tiles that are parts of one object, judged in the strip that both tiles
+    see.
+    """
     if strip.empty:
         return []
     numbers, seen = [], []
     for instances in (first, second):
-        near = {number: instance for number, instance in enumerate(instances) if not instance.window.common(strip).empty}
-        clipped = {number: replace(instance, runs=clip_runs(instance.runs, instance.size[0], strip)) for number, instance in near.items()}
+        near = {
+            number: instance
+            for number, instance in enumerate(instances)
+            if not instance.window.common(strip).empty
+        }
+        clipped = {
+            number: replace(instance, runs=clip_runs(instance.runs, instance.size[0], strip))
+            for number, instance in near.items()
+        }
         numbers.append([number for number, instance in clipped.items() if len(instance.runs)])
         seen.append([clipped[number] for number in numbers[-1]])
     pairs = [(one, other) for one, other in candidates(*seen) if _same(seen[0][one], seen[1][other])]
@@ -127,7 +151,12 @@ def _same(first: Instance, second: Instance) -> bool:
 def _unconfirmed(instance: Instance, tile: int, windows: list[Window]) -> bool:
     """Whether a part without partner ends at an inner border of its tile, and another tile sees all of it."""
     (height, width), box, own = instance.size, instance.window, windows[tile]
-    cut = (box.left == own.left > 0) or (box.top == own.top > 0) or (box.right == own.right < width) or (box.bottom == own.bottom < height)
+    cut = (
+        (box.left == own.left > 0)
+        or (box.top == own.top > 0)
+        or (box.right == own.right < width)
+        or (box.bottom == own.bottom < height)
+    )
     return cut and any(window.holds(box) for number, window in enumerate(windows) if number != tile)
 
 
@@ -139,9 +168,14 @@ def _join(members: list[tuple[int, Instance]], windows: list[Window]) -> TiledOb
 
 
 def join_looks(whole: list[Instance], tiled: list[TiledObject]) -> list[Instance]:
-    """Objects from the instances of the whole photo and the objects of the tiles, by rule 5; each is joined with one other at most, the nearest."""
+    """Objects from the instances of the whole photo and the objects of the tiles, by rule 5; each is joined
+    with one other at most, the nearest.
+    """
     objects = [found.instance for found in tiled]
-    nearness = [(-iou(whole[first].runs, objects[second].runs, whole[first].size[0]), first, second) for first, second in candidates(whole, objects)]
+    nearness = [
+        (-iou(whole[first].runs, objects[second].runs, whole[first].size[0]), first, second)
+        for first, second in candidates(whole, objects)
+    ]
     joined: list[Instance] = []
     used: tuple[set[int], set[int]] = set(), set()
     for _, first, second in sorted(pair for pair in nearness if -pair[0] > SAME_OBJECT):

@@ -10,7 +10,10 @@ from sc3d.io.json_files import read_json
 
 # Only data: no pickles (*.bin, *.pt), no code (*.py).
 _FILES = ["*.json", "*.txt", "*.safetensors"]
-_FREE, _GATED = "Apache-2.0", "SAM licence, gated: accept it on the model's page on the hub and log in with `hf auth login`"
+_FREE, _GATED = (
+    "Apache-2.0",
+    "SAM licence, gated: accept it on the model's page on the hub and log in with `hf auth login`",
+)
 _KNOWN = {  # download size in MB, licence
     "IDEA-Research/grounding-dino-tiny": (690, _FREE),
     "IDEA-Research/grounding-dino-base": (930, _FREE),
@@ -35,7 +38,9 @@ def find_weights(name: str, model_dir: Path | None, download: bool) -> Path:
     Raises InputError that says where the model was looked for and how to get it.
     """
     if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", name, re.ASCII):
-        raise InputError(f"{name!r} is not the name of a model: it should look like \"facebook/sam2.1-hiera-small\"")
+        raise InputError(
+            f'{name!r} is not the name of a model: it should look like "facebook/sam2.1-hiera-small"'
+        )
     folders = [] if model_dir is None else [model_dir / name.split("/")[1], model_dir / name]
     found = next((folder for folder in folders if _is_model(folder)), None) or _find_cached(name)
     if found is None and download:
@@ -68,18 +73,31 @@ def _download(name: str) -> Path:
 
     try:
         folder = Path(snapshot_download(name, allow_patterns=_FILES))
-    except Exception as error:  # no network, no such model, access not granted, disk full: the hub has an error class for each
-        raise InputError(f"cannot download {name}: {(str(error).splitlines() or [type(error).__name__])[0]}; {_advice(name)}") from None
+    # no network, no such model, access not granted, disk full: the hub has an error class for each
+    except Exception as error:
+        raise InputError(
+            f"cannot download {name}: {(str(error).splitlines() or [type(error).__name__])[0]}; {_advice(name)}"
+        ) from None
     if not _is_model(folder):
-        raise InputError(f"{name} has no safetensors weights on the hub; other formats can hold code and are not loaded: choose another model")
+        raise InputError(
+            f"{name} has no safetensors weights on the hub; other formats can hold code and are not loaded: choose another model"
+        )
     return folder
 
 
 def _missing_message(name: str, model_dir: Path | None) -> str:
     from huggingface_hub.constants import HF_HUB_CACHE
 
-    own = "no model folder was given" if model_dir is None else f"looked for {model_dir / name.split('/')[1]} and {model_dir / name}"
-    size = "about {} MB, {}".format(*_KNOWN[name]) if name in _KNOWN else "size and licence: see its page on the hub"
+    own = (
+        "no model folder was given"
+        if model_dir is None
+        else f"looked for {model_dir / name.split('/')[1]} and {model_dir / name}"
+    )
+    size = (
+        "about {} MB, {}".format(*_KNOWN[name])
+        if name in _KNOWN
+        else "size and licence: see its page on the hub"
+    )
     return f"the weights of {name} ({size}) are not on this machine: {own}, and in the hub cache {HF_HUB_CACHE}; {_advice(name)}"
 
 

@@ -20,5 +20,6 @@ class Resources(Workers):
     """What a stage may use; results do not depend on it."""
 
     max_memory: str = ""
-    """Memory to stay below, such as 6G; what does not fit is worked on tile by tile, from disk. Half of this machine's memory otherwise. Each worker of
+    """Memory to stay below, such as 6G; what does not fit is worked on tile by tile, from disk. Half of this
+    machine's memory otherwise. Each worker of
     a --cluster may use as much."""

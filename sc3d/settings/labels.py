@@ -16,17 +16,27 @@ class Segment:
     """2D masks for all photos."""
 
     backend: Literal["files", "strokes", "grounded-sam", "sam3"] = "files"
-    """Where masks come from: files (--masks), a few strokes that you drew (--strokes, no model), or text prompts with Grounding DINO and SAM 2 or with SAM 3."""
+    """Where masks come from: files (--masks), a few strokes that you drew (--strokes, no model), or text
+    prompts with Grounding DINO and SAM 2 or with SAM 3.
+    """
     masks: Path | None = None
-    """Masks made elsewhere: a folder of PNGs <photo stem>.png, a folder of LabelMe JSONs, a COCO JSON, or a CVAT XML (files)."""
+    """Masks made elsewhere: a folder of PNGs <photo stem>.png, a folder of LabelMe JSONs, a COCO JSON, or a
+    CVAT XML (files).
+    """
     format: Literal["auto", "index", "color", "labelme", "coco", "cvat"] = "auto"
-    """Format of --masks (files): index = PNG with one id per pixel, color = PNG in the colours of the class table; auto looks at the files."""
+    """Format of --masks (files): index = PNG with one id per pixel, color = PNG in the colours of the class
+    table; auto looks at the files.
+    """
     mapping: Path | None = None
-    """JSON object of the ids, names or colours in --masks and the classes that they stand for, such as {"wall": "building", "7": "road"} (files)."""
+    """JSON object of the ids, names or colours in --masks and the classes that they stand for, such as
+    {"wall": "building", "7": "road"} (files).
+    """
     confidence: Path | None = None
     """Folder of confidence maps <photo stem>.png (files); optional."""
     strokes: Path | None = None
-    """Folder of strokes and polygons per class, LabelMe JSON or PNG in the colours of the class table; SCENE/strokes otherwise (strokes)."""
+    """Folder of strokes and polygons per class, LabelMe JSON or PNG in the colours of the class table;
+    SCENE/strokes otherwise (strokes).
+    """
     prompts: tuple[str, ...] = ()
     """Texts per class, each as NAME=text,text (grounded-sam, sam3); they replace those of classes.json."""
     model_dir: Path | None = None
@@ -44,12 +54,16 @@ class Segment:
     text_threshold: float = 0.25
     """Smallest score of a phrase (grounded-sam)."""
     tile: int = 1600
-    """Photos larger than this are also looked at in overlapping tiles of this size, px, so that small things are found; 0 = never (grounded-sam, sam3)."""
+    """Photos larger than this are also looked at in overlapping tiles of this size, px, so that small things
+    are found; 0 = never (grounded-sam, sam3).
+    """
     overlap: float = 0.2
     """Share of a tile that it has in common with the next."""
     refine: bool = False
-    """One more round on the masks that are in the scene (needs its cloud): what contradicts the fused labels loses confidence, if that brings the
-    labels nearer to the masks of photos that were left out. Writes SCENE/confidence_refined, which label then takes instead of SCENE/confidence."""
+    """One more round on the masks that are in the scene (needs its cloud): what contradicts the fused labels
+    loses confidence, if that brings the
+    labels nearer to the masks of photos that were left out. Writes SCENE/confidence_refined, which label then
+    takes instead of SCENE/confidence."""
     half: bool = False
     """Compute in half precision (bfloat16; float16 on older GPUs); needs CUDA (grounded-sam, sam3)."""
     device: str = "auto"
@@ -61,17 +75,21 @@ class Label(Resources):
     """Fuse masks into the voxel label field and the cloud."""
 
     method: Literal["direct", "majority", "conflict-lock", "paper"] = "conflict-lock"
-    """direct: last photo wins; majority: most votes win; conflict-lock: disagreeing voxels are reset and locked; paper: the same with any
+    """direct: last photo wins; majority: most votes win; conflict-lock: disagreeing voxels are reset and
+    locked; paper: the same with any
     disagreement and the paper's weights, whatever the other options say."""
     depth_filter: bool = True
     """Only the first surface along each ray is labelled; --no-depth-filter lets labels penetrate."""
     surface: Literal["auto", "surfels", "voxels"] = "auto"
-    """What hides the points behind it. auto: mesh.ply if there is one, else as voxels; voxels: the grid of the cloud's own points, traversed coarse to fine;
+    """What hides the points behind it. auto: mesh.ply if there is one, else as voxels; voxels: the grid of
+    the cloud's own points, traversed coarse to fine;
     surfels: a square around every point (more memory), which clouds in tiles have instead of voxels."""
     consensus: float = 0.66
     """Share of the votes that the winning class needs, else the voxel is locked (conflict-lock)."""
     voxel_size: float = 0.0
-    """Label voxel, world units; 0 = 2 times the median point spacing, at least 1.5 times the median mask pixel on the ground."""
+    """Label voxel, world units; 0 = 2 times the median point spacing, at least 1.5 times the median mask
+    pixel on the ground.
+    """
     use_confidence: bool = True
     """Weigh mask pixels by the confidence maps, where there are any."""
     edge_width: float = 3.0
@@ -83,12 +101,16 @@ class Label(Resources):
     range: bool = True
     """Weigh votes by the inverse distance, so that near photos count more."""
     verify: Literal["no", "lock", "weigh"] = "weigh"
-    """Hold the fused labels against each view's masks, place by place. lock: labels that rest on views which contradict them nearby are locked;
+    """Hold the fused labels against each view's masks, place by place. lock: labels that rest on views which
+    contradict them nearby are locked;
     weigh: such views count less as well."""
     density: bool = False
-    """Inside a voxel, weigh points by the density of the Gaussians around them (gaussians.ply), or by their distance to the points' mean without it."""
+    """Inside a voxel, weigh points by the density of the Gaussians around them (gaussians.ply), or by their
+    distance to the points' mean without it.
+    """
     reproject: bool = False
-    """Vote once more on locked voxels with half the depth tolerance and without mask edges and grazing views."""
+    """Vote once more on locked voxels with half the depth tolerance and without mask edges and grazing views.
+    """
     cloud: Path | None = None
     """Cloud to label; SCENE/cloud.ply otherwise."""
     output: Path | None = None
@@ -100,7 +122,9 @@ class Propagate(Resources):
     """Complete the labels along the geometry."""
 
     method: Literal["knn", "geometry", "map"] = "map"
-    """knn: nearest labelled points vote; geometry: front along similar normals and curvature (the paper's); map: Potts energy over all points."""
+    """knn: nearest labelled points vote; geometry: front along similar normals and curvature (the paper's);
+    map: Potts energy over all points.
+    """
     num_neighbors: int = 16
     """Neighbours per point in the graph."""
     fill: bool = False
@@ -110,7 +134,9 @@ class Propagate(Resources):
     color: bool = True
     """Edges between unlike colours weigh less (geometry, map); not in the paper."""
     appearance: bool = True
-    """Learn colour and relief of the classes from agreed points, and let them vote too: the only cure for errors that all views share (map)."""
+    """Learn colour and relief of the classes from agreed points, and let them vote too: the only cure for
+    errors that all views share (map).
+    """
     rounds: int = 2
     """Times that is learned: first from agreed points, then from the result (map)."""
     verify_seeds: bool = True
@@ -137,7 +163,9 @@ class Evaluate(Resources):
 
 @dataclass(frozen=True)
 class Annotate:
-    """Draw strokes and polygons per class on photos, on a page in the browser that only this machine can open, and try them out."""
+    """Draw strokes and polygons per class on photos, on a page in the browser that only this machine can
+    open, and try them out.
+    """
 
     scene: Annotated[Positional[Path], arg(help="Scene folder with images/ and classes.json.")]
     port: int = 8000

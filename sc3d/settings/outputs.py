@@ -17,10 +17,18 @@ from sc3d.settings.train import Train
 class Export:
     """Results for other programs, in SCENE/export."""
 
-    format: tuple[Literal["masks", "laz", "clouds", "splats", "spz", "orthophoto", "objects", "transforms", "colmap-text"], ...] = ("laz",)
-    """What to write. masks: the fused labels as each photo sees them; laz: LAZ 1.4 with ASPRS classes; clouds: one PLY per class; splats, spz: Gaussians
-    with labels; orthophoto: GeoTIFFs of colour, class and height; objects: footprints of buildings and crowns of trees as GeoJSON;
-    transforms: cameras and sparse points as nerfstudio's transforms.json; colmap-text: the same as COLMAP's text files."""
+    format: tuple[
+        Literal[
+            "masks", "laz", "clouds", "splats", "spz", "orthophoto", "objects", "transforms", "colmap-text"
+        ],
+        ...,
+    ] = ("laz",)
+    """What to write. masks: the fused labels as each photo sees them; laz: LAZ 1.4 with ASPRS classes;
+    clouds: one PLY per class; splats, spz: Gaussians
+    with labels; orthophoto: GeoTIFFs of colour, class and height; objects: footprints of buildings and crowns
+    of trees as GeoJSON;
+    transforms: cameras and sparse points as nerfstudio's transforms.json; colmap-text: the same as COLMAP's
+        text files."""
     classes: tuple[str, ...] = ()
     """Names of the classes to write; all otherwise (laz, clouds, splats, spz)."""
     labelled: Path | None = None
@@ -28,16 +36,21 @@ class Export:
     max_size: int = 0
     """Longest side of the masks, px; 0 = as the photo (masks)."""
     epsg: int = 0
-    """EPSG code of a projected CRS for the coordinates (laz, clouds, orthophoto, objects); 0 = that of the scene. Without a georeference it says which
+    """EPSG code of a projected CRS for the coordinates (laz, clouds, orthophoto, objects); 0 = that of the
+    scene. Without a georeference it says which
     CRS the scene's coordinates are in."""
     pixel_size: float = 0.0
-    """Side of a pixel on the ground, m; 0 = the spacing of the points, twice that without a mesh, rounded to one digit (orthophoto)."""
+    """Side of a pixel on the ground, m; 0 = the spacing of the points, twice that without a mesh, rounded to
+    one digit (orthophoto).
+    """
     min_height: float = 2.0
     """Lower buildings and plants are left out, m (objects)."""
     min_area: float = 10.0
     """Smaller buildings are left out, m2 (objects)."""
     rectangular: bool = True
-    """Draw buildings with right angles where that fits; --no-rectangular keeps the simplified outline (objects)."""
+    """Draw buildings with right angles where that fits; --no-rectangular keeps the simplified outline
+    (objects).
+    """
 
 
 @dataclass(frozen=True)
@@ -62,21 +75,29 @@ class View:
     photo: str | None = None
     """Look through the camera of this photo."""
     splats: bool = False
-    """Show the Gaussians instead of the cloud (with --web, --html, --screenshot); with --photo and --screenshot, beside the photo."""
+    """Show the Gaussians instead of the cloud (with --web, --html, --screenshot); with --photo and
+    --screenshot, beside the photo.
+    """
     from_above: bool = False
     """Straight down instead of oblique (with --web, --html, --screenshot)."""
     cameras: bool = True
     """Draw the cameras."""
     web: bool = False
-    """Serve a page for the browser instead of opening a window, until Ctrl + C; needs `pip install 'sc3d[web]'`."""
+    """Serve a page for the browser instead of opening a window, until Ctrl + C; needs `pip install
+    'sc3d[web]'`.
+    """
     host: str = "127.0.0.1"
-    """Address to serve on; 0.0.0.0 = to everybody who can reach this machine, without a password (with --web)."""
+    """Address to serve on; 0.0.0.0 = to everybody who can reach this machine, without a password (with
+    --web).
+    """
     port: int = 8080
     """Port to serve on; the next free one if it is taken (with --web)."""
     html: Path | None = None
     """Write a page that opens from disk without a server."""
     points: int = 0
-    """Points shown at the start, of which the page can show more (with --web), or at most (with --html); 0 = 1000000, and 300000 in a file."""
+    """Points shown at the start, of which the page can show more (with --web), or at most (with --html); 0 =
+    1000000, and 300000 in a file.
+    """
     screenshot: Path | None = None
     """Write a picture (PNG, JPEG) instead of opening a window."""
     flight: Path | None = None

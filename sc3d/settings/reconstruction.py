@@ -14,11 +14,14 @@ class Reconstruct:
     """Photos to cameras and sparse points (pycolmap)."""
 
     matching: Literal["exhaustive", "sequential", "spatial"] = "exhaustive"
-    """Which photo pairs to match: all, neighbours in name order, or neighbours by GPS (hundreds of photos and more)."""
+    """Which photo pairs to match: all, neighbours in name order, or neighbours by GPS (hundreds of photos and
+    more).
+    """
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP camera model, shared by all photos of one size and EXIF camera."""
     focal: Literal["auto", "refine", "exif"] = "auto"
-    """Estimate the focal length, or keep that of EXIF. auto: estimate, unless all photos look the same way from one height (straight down), where
+    """Estimate the focal length, or keep that of EXIF. auto: estimate, unless all photos look the same way
+    from one height (straight down), where
     focal length and flight height cannot be told apart."""
     max_size: int = 1600
     """Longest photo side for feature extraction, px."""
@@ -29,7 +32,9 @@ class Reconstruct:
     gcp: Path | None = None
     """Ground control points in ODM's gcp_list.txt format; they replace GPS as the frame."""
     epsg: int | None = None
-    """Projected CRS of exports; the UTM zone (or the CRS of --gcp) otherwise. `sc3d georeference` changes it afterwards."""
+    """Projected CRS of exports; the UTM zone (or the CRS of --gcp) otherwise. `sc3d georeference` changes it
+    afterwards.
+    """
     altitude_offset: float = 0.0
     """Added to all heights in exports, m: drones differ in what they measure altitude from."""
     seed: int = 0
@@ -38,14 +43,18 @@ class Reconstruct:
 
 @dataclass(frozen=True)
 class Georeference:
-    """Say where a scene lies on Earth (georeference.json), from the GPS of its photos or by hand; or choose another CRS for exports."""
+    """Say where a scene lies on Earth (georeference.json), from the GPS of its photos or by hand; or choose
+    another CRS for exports.
+    """
 
     epsg: int | None = None
     """Projected CRS of exports; the present one, or else the UTM zone, otherwise."""
     altitude_offset: float = 0.0
     """Added to all heights in exports, m."""
     offset: tuple[float, float, float] | None = None
-    """For scenes whose world is the CRS of --epsg minus this (easting, northing, height); 0 0 0 if it is the CRS itself."""
+    """For scenes whose world is the CRS of --epsg minus this (easting, northing, height); 0 0 0 if it is the
+    CRS itself.
+    """
     from_gps: bool = False
     """Replace the present georeference by one from GPS."""
 
@@ -55,7 +64,9 @@ class Extract:
     """Gaussians to mesh and cloud."""
 
     method: Annotated[Literal["tsdf", "centres"], arg(name="from")] = "tsdf"
-    """Fuse rendered depth into a truncated signed distance field, or take the Gaussians' centres as the cloud."""
+    """Fuse rendered depth into a truncated signed distance field, or take the Gaussians' centres as the
+    cloud.
+    """
     max_size: int = 800
     """Longest side of the depth maps, px."""
     voxel_size: float = 0.0
@@ -63,8 +74,10 @@ class Extract:
     min_views: int = 1
     """Neighbour views that must confirm a depth (within 1 px)."""
     coverage: float | None = None
-    """Holes of the confirmed surface are filled with the depth of single views, the surer first, until this share of all pixels hits a surface: labels
-    need one. 0 = leave holes; None = 1 where all photos look the same way (straight down), 0.97 otherwise, as oblique photos see the floaters that it costs."""
+    """Holes of the confirmed surface are filled with the depth of single views, the surer first, until this
+    share of all pixels hits a surface: labels
+    need one. 0 = leave holes; None = 1 where all photos look the same way (straight down), 0.97 otherwise, as
+    oblique photos see the floaters that it costs."""
     min_opacity: float = 0.3
     """Smallest opacity of a Gaussian whose centre becomes a point (centres)."""
 
@@ -82,27 +95,41 @@ class ReconstructCommand:
 
 @dataclass(frozen=True)
 class Import:
-    """Start from another program's project, cloud or mesh: nerfstudio, OpenSfM, ODM, Metashape, Pix4D, COLMAP; PLY, LAS, LAZ, PCD, XYZ, OBJ."""
+    """Start from another program's project, cloud or mesh: nerfstudio, OpenSfM, ODM, Metashape, Pix4D,
+    COLMAP; PLY, LAS, LAZ, PCD, XYZ, OBJ.
+    """
 
-    source: Annotated[Literal["auto", "nerfstudio", "opensfm", "odm", "metashape", "pix4d", "colmap", "cloud"], arg(name="from")] = "auto"
+    source: Annotated[
+        Literal["auto", "nerfstudio", "opensfm", "odm", "metashape", "pix4d", "colmap", "cloud"],
+        arg(name="from"),
+    ] = "auto"
     """What PROJECT is; auto looks at it."""
     images: Path | None = None
-    """Folder of the photos; where the project says otherwise. Needed for Metashape and Pix4D, which do not say."""
+    """Folder of the photos; where the project says otherwise. Needed for Metashape and Pix4D, which do not
+    say.
+    """
     cloud: tuple[Path, ...] = ()
-    """Cloud (PLY, LAS, LAZ, PCD, XYZ) or mesh (PLY, OBJ) that belongs to it, or one of each; becomes cloud.ply and mesh.ply."""
+    """Cloud (PLY, LAS, LAZ, PCD, XYZ) or mesh (PLY, OBJ) that belongs to it, or one of each; becomes
+    cloud.ply and mesh.ply.
+    """
     epsg: int | None = None
     """CRS of coordinates whose file does not state one."""
     tolerance: float = 0.01
-    """Largest error, px, from lens parameters that no COLMAP model has; a project that needs more is refused."""
+    """Largest error, px, from lens parameters that no COLMAP model has; a project that needs more is refused.
+    """
     project: Annotated[Path, Suppress] = Path()
     """Set by the command."""
 
 
 @dataclass(frozen=True)
 class ImportCommand:
-    """Start from another program's project, cloud or mesh: nerfstudio, OpenSfM, ODM, Metashape, Pix4D, COLMAP; PLY, LAS, LAZ, PCD, XYZ, OBJ."""
+    """Start from another program's project, cloud or mesh: nerfstudio, OpenSfM, ODM, Metashape, Pix4D,
+    COLMAP; PLY, LAS, LAZ, PCD, XYZ, OBJ.
+    """
 
-    project: Annotated[Positional[Path], arg(help="Project folder or file, or a cloud or mesh alone; never modified.")]
+    project: Annotated[
+        Positional[Path], arg(help="Project folder or file, or a cloud or mesh alone; never modified.")
+    ]
     scene: Annotated[Positional[Path], arg(help="Scene folder to write.")]
     settings: Annotated[Import, arg(name="")] = Import()
     overwrite: bool = False

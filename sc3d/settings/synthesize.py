@@ -48,7 +48,9 @@ class Synthesize:
 
 @dataclass(frozen=True)
 class SynthesizeCity:
-    """Make a synthetic city to measure on: sites of the generator side by side, with cloud, mesh, cameras, masks and truth, but without photos."""
+    """Make a synthetic city to measure on: sites of the generator side by side, with cloud, mesh, cameras,
+    masks and truth, but without photos.
+    """
 
     scene: Annotated[Positional[Path], arg(help="Scene folder to write; it must not exist, or be empty.")]
     sites: tuple[int, int] = (6, 5)
@@ -56,7 +58,8 @@ class SynthesizeCity:
     points_per_site: int = 1_000_000
     """Points of the cloud on each site."""
     views: int = 200
-    """Number of views over the whole city: 60 % look straight down, the others obliquely from the four sides."""
+    """Number of views over the whole city: 60 % look straight down, the others obliquely from the four sides.
+    """
     width: int = 1600
     """Width of the masks, px; the height follows at 3:2."""
     seed: int = 0

@@ -11,7 +11,9 @@ from sc3d.settings.common import Workers
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Gaussian training. Times are fractions of the run, so that a short run goes through all phases of a long one."""
+    """Gaussian training. Times are fractions of the run, so that a short run goes through all phases of a
+    long one.
+    """
 
     iterations: int = 3000
     """training steps, one photo each; 30 000 is the paper's, 1500 to 7000 suit a CPU"""
@@ -22,7 +24,9 @@ class TrainSettings:
     downscale: float = 0.0
     """divide the photos' size by this instead of fitting max_size; 0 = fit max_size"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """where to train: on the CPU, or on a GPU with gsplat (pip install 'sc3d[cuda]'); auto = the GPU if there are both"""
+    """where to train: on the CPU, or on a GPU with gsplat (pip install 'sc3d[cuda]'); auto = the GPU if there
+    are both
+    """
     sh_degree: int = 2
     """degree of the view-dependent colour, 0 to 3; 0 = the same from everywhere"""
     seed: int = 0
@@ -54,7 +58,9 @@ class TrainSettings:
     """7x7 patches compared per step"""
 
     fill: bool = True
-    """also start from points between the sparse ones, at the depth where the photos' patches agree, or an interpolated one"""
+    """also start from points between the sparse ones, at the depth where the photos' patches agree, or an
+    interpolated one
+    """
     random_background: bool = True
     """render before a random colour, so that dark surfaces become opaque; False = black"""
     coarse_until: float = 0.25
@@ -68,11 +74,21 @@ class TrainSettings:
     absolute_gradient_threshold: float = 8e-4
     """mean absolute gradient that splits Gaussians with a large radius"""
     means_rate: float = 1.6e-4
-    """first learning rate of positions in a run of 30 000, relative to the scene; up to 4 times that in shorter ones; falls to 1 %"""
+    """first learning rate of positions in a run of 30 000, relative to the scene; up to 4 times that in
+    shorter ones; falls to 1 %
+    """
 
     def __post_init__(self) -> None:
-        if self.iterations < 1 or self.max_gaussians < 1 or self.max_size < 16 or not 0 <= self.sh_degree <= 3 or self.downscale < 0:
-            raise InputError("iterations and max_gaussians must be at least 1, max_size at least 16, sh_degree 0 to 3, downscale not negative")
+        if (
+            self.iterations < 1
+            or self.max_gaussians < 1
+            or self.max_size < 16
+            or not 0 <= self.sh_degree <= 3
+            or self.downscale < 0
+        ):
+            raise InputError(
+                "iterations and max_gaussians must be at least 1, max_size at least 16, sh_degree 0 to 3, downscale not negative"
+            )
 
     def size(self, longest: int) -> int:
         """Longest side of the training image of a photo whose longest side is `longest`, px."""
@@ -87,12 +103,16 @@ class TrainSettings:
         return min(self.sh_degree, 30 * iteration // self.iterations)
 
     def position_rate(self, iteration: int, extent: float) -> float:
-        """Learning rate of the means, world units: log-linear; a short run takes larger steps, as the root of the number of steps it lacks."""
+        """Learning rate of the means, world units: log-linear; a short run takes larger steps, as the root of
+        the number of steps it lacks.
+        """
         boost = min(max((30_000 / self.iterations) ** 0.5, 1.0), 4.0)
         return self.means_rate * boost * extent * 0.01 ** (iteration / self.iterations)
 
     def densify_interval(self, num_views: int) -> int:
-        """Iterations between densifications: a 300th of the run, but long enough for statistics of every view (or of 100)."""
+        """Iterations between densifications: a 300th of the run, but long enough for statistics of every view
+        (or of 100).
+        """
         return max(self.iterations // 300, min(self.iterations // 60, 50), min(num_views, 100), 1)
 
     def densifies(self, iteration: int, num_views: int) -> bool:
@@ -101,12 +121,21 @@ class TrainSettings:
         return active and iteration % self.densify_interval(num_views) == 0
 
     def allowed_gaussians(self, iteration: int, num_initial: int) -> int:
-        """The cap at this iteration: it rises linearly while densifying, so that the places that need most get Gaussians, not the first to ask."""
-        progress = (iteration / self.iterations - self.densify_from) / max(self.densify_until - self.densify_from, 1e-9)
-        return min(self.max_gaussians, round(num_initial + max(self.max_gaussians - num_initial, 0) * min(max(progress, 0.0), 1.0)))
+        """The cap at this iteration: it rises linearly while densifying, so that the places that need most
+        get Gaussians, not the first to ask.
+        """
+        progress = (iteration / self.iterations - self.densify_from) / max(
+            self.densify_until - self.densify_from, 1e-9
+        )
+        return min(
+            self.max_gaussians,
+            round(num_initial + max(self.max_gaussians - num_initial, 0) * min(max(progress, 0.0), 1.0)),
+        )
 
     def trims(self, iteration: int, num_views: int) -> bool:
-        """Whether to drop what fewer than two views saw, asked after each pass over the views: every 30th of the run while densifying."""
+        """Whether to drop what fewer than two views saw, asked after each pass over the views: every 30th of
+        the run while densifying.
+        """
         interval = max(self.iterations // 30, num_views)
         due = iteration // interval > (iteration - num_views) // interval
         return due and num_views >= 4 and 2 * num_views <= iteration <= self.densify_until * self.iterations
@@ -114,7 +143,11 @@ class TrainSettings:
     def resets_opacity(self, iteration: int) -> bool:
         """Every tenth of the run while densifying, in runs long enough to recover from it (700 iterations)."""
         interval = self.iterations // 10
-        return interval >= 700 and 0 < iteration < self.densify_until * self.iterations and iteration % interval == 0
+        return (
+            interval >= 700
+            and 0 < iteration < self.densify_until * self.iterations
+            and iteration % interval == 0
+        )
 
     def coarse(self, iteration: int) -> bool:
         """Whether the images of this iteration are halved."""
@@ -127,10 +160,13 @@ class TrainSettings:
 
 @dataclass(frozen=True)
 class Train(Workers, TrainSettings):
-    """Gaussian training. Times are fractions of the run, so that a short run goes through all phases of a long one."""
+    """Gaussian training. Times are fractions of the run, so that a short run goes through all phases of a
+    long one.
+    """
 
     blocks: int = 0
-    """cut the ground into so many blocks, which are trained one by one, or side by side on --workers or --cluster, in the memory of a block, and
+    """cut the ground into so many blocks, which are trained one by one, or side by side on --workers or
+    --cluster, in the memory of a block, and
     merged; each takes its share of iterations and max_gaussians; 0 = train everything at once"""
 
     def __post_init__(self) -> None:

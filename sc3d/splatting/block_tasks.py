@@ -1,6 +1,8 @@
-"""Where blocks are trained: one task each, here or on Dask workers. A block that is finished, or has a checkpoint, is not begun again.
+"""Where blocks are trained: one task each, here or on Dask workers. A block that is finished, or has a
+checkpoint, is not begun again.
 
-Beside the checkpoint of block 3, `3.checkpoint`, lie its Gaussians, `3.ply`, and, written last, `3.json` with the rest: with that it is finished.
+Beside the checkpoint of block 3, `3.checkpoint`, lie its Gaussians, `3.ply`, and, written last, `3.json` with
+the rest: with that it is finished.
 """
 
 from __future__ import annotations
@@ -32,7 +34,9 @@ GPU = {"GPU": 1}  # what a worker must offer to get a block, with --device cuda
 
 @dataclass(frozen=True)
 class BlockJob:
-    """What every block's task needs to know. settings: of the whole run; blocks: all of them; folder: for what the tasks write; progress: show a bar"""
+    """What every block's task needs to know. settings: of the whole run; blocks: all of them; folder: for
+    what the tasks write; progress: show a bar
+    """
 
     scene: Path
     settings: TrainSettings
@@ -44,13 +48,19 @@ class BlockJob:
 def train_blocks(job: BlockJob, data: TrainingData, tasks: Tasks) -> tuple[TrainResult, dict[str, object]]:
     """Train all blocks and put them together.
 
-    returns: the result as `train` has it, with "block" in the rows of the log, the last of which is about "all"; exposures are means over the
+    returns: the result as `train` has it, with "block" in the rows of the log, the last of which is about
+        "all"; exposures are means over the
         blocks; figures for the summary
     Raises InputError, before any work, for a block that fewer than two photos see.
     """
     _check(job, data)
     job.folder.mkdir(exist_ok=True)
-    tasks.run("blocks", partial(train_block, job), range(len(job.blocks)), GPU if job.settings.device == "cuda" else None)
+    tasks.run(
+        "blocks",
+        partial(train_block, job),
+        range(len(job.blocks)),
+        GPU if job.settings.device == "cuda" else None,
+    )
     parts = [Gaussians.load(_file(job, index, "ply"))[0] for index in range(len(job.blocks))]
     records = [read_json(_file(job, index, "json")) for index in range(len(job.blocks))]
     gaussians = merge(parts, list(job.blocks))
@@ -60,10 +70,16 @@ def train_blocks(job: BlockJob, data: TrainingData, tasks: Tasks) -> tuple[Train
         counts[record["views"]] += 1
     rows = [{"block": index, **row} for index, record in enumerate(records) for row in record["log"]]
     rows.append(_total(records, len(gaussians)))
-    summary = {"blocks": len(parts), "block_photos": [len(record["views"]) for record in records],
-               "block_gaussians": [len(part) for part in parts], "block_peak_memory_mb": [record["peak_memory_mb"] for record in records]}
+    summary = {
+        "blocks": len(parts),
+        "block_photos": [len(record["views"]) for record in records],
+        "block_gaussians": [len(part) for part in parts],
+        "block_peak_memory_mb": [record["peak_memory_mb"] for record in records],
+    }
     scores = held_out_scores(gaussians, data, job.settings)
-    return TrainResult(gaussians, (exposures / np.maximum(counts, 1)).astype(np.float32), rows, scores), summary
+    return TrainResult(
+        gaussians, (exposures / np.maximum(counts, 1)).astype(np.float32), rows, scores
+    ), summary
 
 
 def train_block(job: BlockJob, index: int) -> None:
@@ -77,14 +93,20 @@ def train_block(job: BlockJob, index: int) -> None:
     with one_thread():
         result = train(restrict(data, block, views), settings, checkpoint, job.progress)
     result.gaussians.save(_file(job, index, "ply"))
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024  # of the process, so a worker's earlier blocks count
-    write_json(_file(job, index, "json"), {"views": views, "exposures": result.exposures.tolist(), "log": result.log, "peak_memory_mb": peak})
+    # of the process, so a worker's earlier blocks count
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+    write_json(
+        _file(job, index, "json"),
+        {"views": views, "exposures": result.exposures.tolist(), "log": result.log, "peak_memory_mb": peak},
+    )
     _file(job, index, "checkpoint").unlink(missing_ok=True)
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Blocks are what runs side by side, and the last digits of a training depend on the number of its threads: with one, all workers agree."""
+    """Blocks are what runs side by side, and the last digits of a training depend on the number of its
+    threads: with one, all workers agree.
+    """
     before = torch.get_num_threads(), numba.get_num_threads()
     torch.set_num_threads(1)
     numba.set_num_threads(1)
@@ -104,7 +126,9 @@ def _check(job: BlockJob, data: TrainingData) -> None:
     for index, block in enumerate(job.blocks):
         views = _trained_views(job, data, block)
         if len(views) < 2:
-            raise InputError(f"block {index} of {len(job.blocks)} is seen by {len(views)} photos (with {MIN_POINTS} sparse points): lower --blocks")
+            raise InputError(
+                f"block {index} of {len(job.blocks)} is seen by {len(views)} photos (with {MIN_POINTS} sparse points): lower --blocks"
+            )
 
 
 def _file(job: BlockJob, index: int, suffix: str) -> Path:
@@ -116,4 +140,10 @@ def _total(records: list[dict], num_gaussians: int) -> dict[str, object]:
     last = [record["log"][-1] for record in records]
     means = {name: float(np.mean([row[name] for row in last])) for name in ("loss", "psnr")}
     sums = {name: sum(row[name] for row in last) for name in ("iteration", "seconds")}
-    return {"block": "all", "iteration": sums["iteration"], **means, "num_gaussians": num_gaussians, "seconds": sums["seconds"]}
+    return {
+        "block": "all",
+        "iteration": sums["iteration"],
+        **means,
+        "num_gaussians": num_gaussians,
+        "seconds": sums["seconds"],
+    }

@@ -1,4 +1,6 @@
-"""What a checkpoint must be like before training goes on from it: the kernels believe the shapes of the tensors that it holds."""
+"""What a checkpoint must be like before training goes on from it: the kernels believe the shapes of the
+tensors that it holds.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +14,11 @@ from sc3d.splatting.strategy import Statistics
 
 
 def check_state(state: dict, parameters: dict[str, torch.Tensor], views: list[View], path: str) -> None:
-    """Raise ValueError, KeyError, RuntimeError or InputError unless a state has the shapes and ranges of one that `Trainer.save` wrote.
+    """Raise ValueError, KeyError, RuntimeError or InputError unless a state has the shapes and ranges of one
+    that `Trainer.save` wrote.
 
-    state: as loaded, with tensors and plain values only; parameters: as a fresh run has them; views: all of them
+    state: as loaded, with tensors and plain values only; parameters: as a fresh run has them; views: all of
+        them
     """
     size = len(state["parameters"]["means"])
     shapes = {name: (size, *tensor.shape[1:]) for name, tensor in parameters.items()}
@@ -25,12 +29,26 @@ def check_state(state: dict, parameters: dict[str, torch.Tensor], views: list[Vi
     _check_tensors({"exposure": state["exposure"]}, exposure)
     _check_adam(state["exposure_optimiser"], exposure)
     _check_tensors(state["statistics"], {field.name: (size,) for field in fields(Statistics)})
-    _check_tensors(state["depths"], {index: (views[index].height, views[index].width) for index in state["depths"]})
+    _check_tensors(
+        state["depths"], {index: (views[index].height, views[index].width) for index in state["depths"]}
+    )
     torch.Generator().set_state(state["generator"])  # RuntimeError for a state that cannot be
-    numbers = [state["iteration"], state["optimiser"]["count"], state["exposure_optimiser"]["count"], *state["queue"], *state["depths"]]
-    if not all(type(number) is int and number >= 0 for number in numbers) or any(index >= len(views) for index in [*state["queue"], *state["depths"]]):
+    numbers = [
+        state["iteration"],
+        state["optimiser"]["count"],
+        state["exposure_optimiser"]["count"],
+        *state["queue"],
+        *state["depths"],
+    ]
+    if not all(type(number) is int and number >= 0 for number in numbers) or any(
+        index >= len(views) for index in [*state["queue"], *state["depths"]]
+    ):
         raise ValueError("counts or views that do not exist")
-    if not isinstance(state["log"], list) or not isinstance(state["recent"], list) or not isinstance(state["seconds"], float):
+    if (
+        not isinstance(state["log"], list)
+        or not isinstance(state["recent"], list)
+        or not isinstance(state["seconds"], float)
+    ):
         raise ValueError("no log")
 
 
@@ -43,5 +61,10 @@ def _check_tensors(tensors: dict, shapes: dict) -> None:
     if tensors.keys() != shapes.keys():
         raise ValueError("other tensors")
     for name, tensor in tensors.items():
-        if not isinstance(tensor, torch.Tensor) or tensor.shape != shapes[name] or tensor.dtype != torch.float32 or tensor.layout != torch.strided:
+        if (
+            not isinstance(tensor, torch.Tensor)
+            or tensor.shape != shapes[name]
+            or tensor.dtype != torch.float32
+            or tensor.layout != torch.strided
+        ):
             raise ValueError(f"{name} has another shape or type")

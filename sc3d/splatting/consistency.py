@@ -1,4 +1,6 @@
-"""Does the depth of one view agree with another's? Round trip of pixels through both depth maps (METHOD, multi-view terms and surface)."""
+"""Does the depth of one view agree with another's? Round trip of pixels through both depth maps (METHOD,
+multi-view terms and surface).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ def pinhole(view: View) -> tuple[float, float, float, float]:
 
 
 def pixel_rays(view: View, device: torch.device | str = "cpu") -> torch.Tensor:
-    """(H, W, 3) rays ((u - cx) / fx, (v - cy) / fy, 1) of the pixel centres, camera frame: a pixel's point is depth * ray."""
+    """(H, W, 3) rays ((u - cx) / fx, (v - cy) / fy, 1) of the pixel centres, camera frame: a pixel's point is
+    depth * ray.
+    """
     fx, fy, cx, cy = pinhole(view)
     columns = (torch.arange(view.width, dtype=torch.float32, device=device) + 0.5 - cx) / fx
     rows = (torch.arange(view.height, dtype=torch.float32, device=device) + 0.5 - cy) / fy
@@ -22,18 +26,26 @@ def pixel_rays(view: View, device: torch.device | str = "cpu") -> torch.Tensor:
     return torch.stack([columns, rows, torch.ones_like(columns)], 2)
 
 
-def relative_pose(view: View, other: View, device: torch.device | str = "cpu") -> tuple[torch.Tensor, torch.Tensor]:
+def relative_pose(
+    view: View, other: View, device: torch.device | str = "cpu"
+) -> tuple[torch.Tensor, torch.Tensor]:
     """(3, 3) and (3,) of other_from_view between the camera frames; composed in float64, returned as float32."""
     rotation = other.cam_from_world[:3, :3] @ view.cam_from_world[:3, :3].T
     translation = other.cam_from_world[:3, 3] - rotation @ view.cam_from_world[:3, 3]
-    return torch.from_numpy(rotation.astype(np.float32)).to(device), torch.from_numpy(translation.astype(np.float32)).to(device)
+    return torch.from_numpy(rotation.astype(np.float32)).to(device), torch.from_numpy(
+        translation.astype(np.float32)
+    ).to(device)
 
 
 def sample(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
-    """(N,) bilinear values of an (H, W) image at (N, 2) pixel coordinates; differentiable in both; clamped to the border."""
+    """(N,) bilinear values of an (H, W) image at (N, 2) pixel coordinates; differentiable in both; clamped to
+    the border.
+    """
     size = pixels.new_tensor([image.shape[1], image.shape[0]])
     grid = (2 * pixels / size - 1)[None, None]
-    return torch.nn.functional.grid_sample(image[None, None], grid, padding_mode="border", align_corners=False)[0, 0, 0]
+    return torch.nn.functional.grid_sample(
+        image[None, None], grid, padding_mode="border", align_corners=False
+    )[0, 0, 0]
 
 
 def reprojection_error(
@@ -43,28 +55,39 @@ def reprojection_error(
 
     points_cam: (N, 3) surface points of pixels of `view`, in its camera frame, depth > 0
     other_depth: (h, w) depth of `other`; 0 = none
-    returns: (N,) phi, px of `view`, differentiable in both depths; (N,) bool: the pixel is seen by `other` and has a depth there
+    returns: (N,) phi, px of `view`, differentiable in both depths; (N,) bool: the pixel is seen by `other`
+        and has a depth there
     """
     rotation, translation = relative_pose(view, other, points_cam.device)
     points_other = points_cam @ rotation.T + translation
     in_front = points_other[:, 2] > 1e-6
     pixels = _project(points_other, other)
-    inside = (pixels >= 0.5).all(1) & (pixels[:, 0] <= other.width - 0.5) & (pixels[:, 1] <= other.height - 0.5)
+    inside = (
+        (pixels >= 0.5).all(1) & (pixels[:, 0] <= other.width - 0.5) & (pixels[:, 1] <= other.height - 0.5)
+    )
     pixels = torch.where((in_front & inside)[:, None], pixels, torch.full_like(pixels, 0.5))
     has_depth = other_depth > 0
     # 1 / depth is linear in the pixel on a plane, depth is not: so a plane is interpolated exactly.
-    inverse = torch.where(has_depth, 1 / torch.where(has_depth, other_depth, torch.ones_like(other_depth)), torch.zeros_like(other_depth))
+    inverse = torch.where(
+        has_depth,
+        1 / torch.where(has_depth, other_depth, torch.ones_like(other_depth)),
+        torch.zeros_like(other_depth),
+    )
     inverse = sample(inverse, pixels)
     valid = in_front & inside & (sample(has_depth.float(), pixels.detach()) > 0.999)
     fx, fy, cx, cy = pinhole(other)
     ray = torch.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, torch.ones_like(inverse)], 1)
     back = (ray / torch.where(valid, inverse, torch.ones_like(inverse))[:, None] - translation) @ rotation
     valid = valid & (back[:, 2] > 1e-6)
-    gap = torch.where(valid[:, None], _project(back, view) - _project(points_cam, view), torch.zeros_like(pixels))
+    gap = torch.where(
+        valid[:, None], _project(back, view) - _project(points_cam, view), torch.zeros_like(pixels)
+    )
     return (gap.square().sum(1) + 1e-12).sqrt(), valid
 
 
-def consistent(depth: torch.Tensor, view: View, others: list[tuple[torch.Tensor, View]], tolerance: float = 1.0) -> torch.Tensor:
+def consistent(
+    depth: torch.Tensor, view: View, others: list[tuple[torch.Tensor, View]], tolerance: float = 1.0
+) -> torch.Tensor:
     """(H, W) uint8: in how many other views a pixel's depth is confirmed, phi < `tolerance` px.
 
     depth: (H, W), 0 = none; others: depth maps with their views, any sizes
@@ -78,8 +101,11 @@ def consistent(depth: torch.Tensor, view: View, others: list[tuple[torch.Tensor,
     return count
 
 
-def blocking(depth: torch.Tensor, view: View, others: list[tuple[torch.Tensor, View]], margin: float) -> torch.Tensor:
-    """(H, W) uint8: how many other views look through a pixel's point: they know a surface there that is farther by `margin` of its depth.
+def blocking(
+    depth: torch.Tensor, view: View, others: list[tuple[torch.Tensor, View]], margin: float
+) -> torch.Tensor:
+    """(H, W) uint8: how many other views look through a pixel's point: they know a surface there that is
+    farther by `margin` of its depth.
 
     depth: (H, W), 0 = none; others: depth maps that can be trusted, 0 = unknown, with their views
     """
@@ -90,7 +116,12 @@ def blocking(depth: torch.Tensor, view: View, others: list[tuple[torch.Tensor, V
         rotation, translation = relative_pose(view, other, points_cam.device)
         points_other = points_cam @ rotation.T + translation
         pixels = _project(points_other, other)
-        inside = (points_other[:, 2] > 1e-6) & (pixels >= 0).all(1) & (pixels[:, 0] < other.width) & (pixels[:, 1] < other.height)
+        inside = (
+            (points_other[:, 2] > 1e-6)
+            & (pixels >= 0).all(1)
+            & (pixels[:, 0] < other.width)
+            & (pixels[:, 1] < other.height)
+        )
         columns, rows = torch.where(inside[:, None], pixels, torch.zeros_like(pixels)).long().unbind(1)
         known = other_depth[rows, columns]
         count[present] += (inside & (known > 0) & (points_other[:, 2] < (1 - margin) * known)).to(torch.uint8)

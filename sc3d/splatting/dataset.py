@@ -25,7 +25,8 @@ class TrainingData:
     """Photos and sparse points; positions in a local world frame that float32 can hold.
 
     views: V pinhole views at training size, V >= 2
-    images: per view (H, W, 3) uint8 RGB, a sequence or a function of the view's index (then read anew each time)
+    images: per view (H, W, 3) uint8 RGB, a sequence or a function of the view's index (then read anew each
+        time)
     points, colors: (N, 3) sparse points; (N, 3) uint8 RGB
     tracks: per view the row indices of the sparse points it sees; None = unknown
     masks: per view (H, W) bool, False = ignored; sequence, function (may return None) or None
@@ -54,15 +55,24 @@ class TrainingData:
             view = view.resized(max(1, view.width // 2), max(1, view.height // 2))
             image = cv2.resize(image, (view.width, view.height), interpolation=cv2.INTER_AREA)
             if mask is not None:
-                mask = cv2.resize(mask.astype(np.uint8), (view.width, view.height), interpolation=cv2.INTER_NEAREST).astype(bool)
+                mask = cv2.resize(
+                    mask.astype(np.uint8), (view.width, view.height), interpolation=cv2.INTER_NEAREST
+                ).astype(bool)
         planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).float() / 255
-        return view, planes.permute(1, 2, 0), None if mask is None else torch.from_numpy(mask)  # plane by plane, as `render` stores images
+        # plane by plane, as `render` stores images
+        return view, planes.permute(1, 2, 0), None if mask is None else torch.from_numpy(mask)
 
     def subset(self, indices: list[int]) -> TrainingData:
         """The same points with some of the views, renumbered from 0."""
         tracks = None if self.tracks is None else [self.tracks[index] for index in indices]
-        return TrainingData([self.views[index] for index in indices], lambda row: _item(self.images, indices[row]), self.points, self.colors,
-                            tracks, lambda row: _item(self.masks, indices[row]))
+        return TrainingData(
+            [self.views[index] for index in indices],
+            lambda row: _item(self.images, indices[row]),
+            self.points,
+            self.colors,
+            tracks,
+            lambda row: _item(self.masks, indices[row]),
+        )
 
     def seen(self, index: int) -> np.ndarray:
         """(T,) rows of the sparse points that a view sees; all in its image, where tracks are unknown."""
@@ -74,19 +84,27 @@ class TrainingData:
     def _checked(self, array: np.ndarray, index: int, what: str) -> np.ndarray:
         view = self.views[index]
         if array.shape[:2] != (view.height, view.width):
-            raise InputError(f"{what} of {view.name} is {array.shape[1]}x{array.shape[0]}, its view {view.width}x{view.height}")
+            raise InputError(
+                f"{what} of {view.name} is {array.shape[1]}x{array.shape[0]}, its view {view.width}x{view.height}"
+            )
         return array
 
 
 def scene_data(scene: Scene, settings: TrainSettings) -> tuple[TrainingData, np.ndarray]:
-    """A scene's photos, undistorted at training size when they are asked for, and sparse points; the (3,) world position of the local origin."""
+    """A scene's photos, undistorted at training size when they are asked for, and sparse points; the (3,)
+    world position of the local origin.
+    """
     model = scene.model
     origin = local_origin(model.views)
-    views = [undistorted(view.shifted(origin), settings.size(max(view.width, view.height))) for view in model.views]
+    views = [
+        undistorted(view.shifted(origin), settings.size(max(view.width, view.height))) for view in model.views
+    ]
 
     @lru_cache(maxsize=max(2, CACHED_PIXELS // max(view.width * view.height for view in views)))
     def image(index: int) -> np.ndarray:
-        return resample(read_image(scene.photo(model.views[index].name)), model.views[index].shifted(origin), views[index])
+        return resample(
+            read_image(scene.photo(model.views[index].name)), model.views[index].shifted(origin), views[index]
+        )
 
     return TrainingData(views, image, model.points - origin, model.colors, model.tracks), origin
 
@@ -100,11 +118,17 @@ def _item(source: Sequence | Callable | None, index: int) -> np.ndarray | None:
 def load_gaussians(scene: Scene) -> tuple[Gaussians, np.ndarray]:
     """The trained Gaussians of a scene and the (3,) world position of their local origin.
 
-    Raises InputError that says what to run if there are none, or if they belong to other cameras than the scene's.
+    Raises InputError that says what to run if there are none, or if they belong to other cameras than the
+    scene's.
     """
     scene.require(scene.gaussians, hint=f"run `sc3d train {scene.path}` first")
     gaussians, comments = Gaussians.load(scene.gaussians)
     origin = local_origin(scene.model.views)
-    if any(line.startswith("sc3d origin") for line in comments) and f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}" not in comments:
-        raise InputError(f"{scene.gaussians} was trained with other cameras than those in {scene.sparse}: run `sc3d train {scene.path} --overwrite`")
+    if (
+        any(line.startswith("sc3d origin") for line in comments)
+        and f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}" not in comments
+    ):
+        raise InputError(
+            f"{scene.gaussians} was trained with other cameras than those in {scene.sparse}: run `sc3d train {scene.path} --overwrite`"
+        )
     return gaussians, origin

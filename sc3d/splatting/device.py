@@ -1,4 +1,6 @@
-"""Where the numbers live: the numba kernels work on the CPU; on a GPU gsplat renders and plain torch does the rest."""
+"""Where the numbers live: the numba kernels work on the CPU; on a GPU gsplat renders and plain torch does the
+rest.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,13 @@ def has_kernels(tensor: torch.Tensor) -> bool:
 
 
 def pick_device(name: str) -> torch.device:
-    """The device to train on. name: cpu, cuda, or auto = CUDA if torch finds a GPU and gsplat is installed, else the CPU.
+    """The device to train on. name: cpu, cuda, or auto = CUDA if torch finds a GPU and gsplat is installed,
+    else the CPU.
 
-    Choosing CUDA switches TF32 convolutions off: the variances of SSIM are differences of large numbers, which TF32 cannot hold.
-    Raises InputError if `cuda` is asked for and torch finds no GPU, MissingPackageError if gsplat is not installed.
+    Choosing CUDA switches TF32 convolutions off: the variances of SSIM are differences of large numbers,
+    which TF32 cannot hold.
+    Raises InputError if `cuda` is asked for and torch finds no GPU, MissingPackageError if gsplat is not
+    installed.
     """
     available, installed = torch.cuda.is_available(), importlib.util.find_spec("gsplat") is not None
     if name == "cpu" or (name == "auto" and not (available and installed)):

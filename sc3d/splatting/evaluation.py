@@ -22,9 +22,14 @@ def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
 
 @torch.no_grad()
 def score_view(
-    gaussians: Gaussians, view: View, target: torch.Tensor, mask: torch.Tensor | None = None, fit_exposure: bool = False
+    gaussians: Gaussians,
+    view: View,
+    target: torch.Tensor,
+    mask: torch.Tensor | None = None,
+    fit_exposure: bool = False,
 ) -> tuple[float, float]:
-    """PSNR (dB) and SSIM of a rendered view against its (H, W, 3) photo; outside the (H, W) mask nothing counts.
+    """PSNR (dB) and SSIM of a rendered view against its (H, W, 3) photo; outside the (H, W) mask nothing
+    counts.
 
     target, mask: on any device
     fit_exposure: allow the photo its own gain and offset, as in training
@@ -40,8 +45,13 @@ def score_view(
 
 
 def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSettings) -> dict[str, float]:
-    """Mean "psnr" (dB) and "ssim" of the held-out views, whose exposure is fitted to the photo if exposures are used; empty without any."""
-    scores = [score_view(gaussians, *data.photo(index), settings.exposure) for index in settings.held_out(len(data.views))]
+    """Mean "psnr" (dB) and "ssim" of the held-out views, whose exposure is fitted to the photo if exposures
+    are used; empty without any.
+    """
+    scores = [
+        score_view(gaussians, *data.photo(index), settings.exposure)
+        for index in settings.held_out(len(data.views))
+    ]
     if not scores:
         return {}
     means = np.mean(scores, axis=0)
@@ -49,7 +59,9 @@ def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSet
 
 
 @torch.no_grad()
-def depth_map(gaussians: Gaussians, view: View, min_alpha: float = 0.5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def depth_map(
+    gaussians: Gaussians, view: View, min_alpha: float = 0.5
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The surface a view sees.
 
     returns: (H, W) float32 depth z, world units, 0 where alpha < `min_alpha`; (H, W) alpha;

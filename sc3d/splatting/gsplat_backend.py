@@ -1,12 +1,17 @@
-"""`render.render` for Gaussians on a GPU, through gsplat's low-level functions (written against gsplat 1.5.3).
+"""`render.render` for Gaussians on a GPU, through gsplat's low-level functions (written against gsplat
+1.5.3).
 
-The rules are those of the CPU kernels: near plane 0.01, +0.3 px^2, Jacobian clamp at 1.3 tan(fov / 2) around the real principal point, pixel centres
-at +0.5, fragments from alpha 1/255 on. gsplat bins boxes of min(3.33, sqrt(2 ln(255 opacity))) standard deviations, rounded up to whole pixels;
+The rules are those of the CPU kernels: near plane 0.01, +0.3 px^2, Jacobian clamp at 1.3 tan(fov / 2) around
+the real principal point, pixel centres
+at +0.5, fragments from alpha 1/255 on. gsplat bins boxes of min(3.33, sqrt(2 ln(255 opacity))) standard
+deviations, rounded up to whole pixels;
 alpha is below 1/255 outside of them, so no fragment is lost. It differs in four ways:
 - alpha is limited to 0.999 instead of 0.99;
 - a pixel ends before the fragment that would bring its transmittance to 1e-4 instead of after it;
-- a Gaussian is visible (radius > 0) if that box touches the image, the CPU's if the box without rounding holds a pixel centre;
-- sums are float32 in the order of the GPU's atomic additions: gradients vary in their last digits from run to run.
+- a Gaussian is visible (radius > 0) if that box touches the image, the CPU's if the box without rounding
+    holds a pixel centre;
+- sums are float32 in the order of the GPU's atomic additions: gradients vary in their last digits from run to
+    run.
 """
 
 from __future__ import annotations
@@ -34,7 +39,9 @@ _ALL = 1 << 30  # more batches of Gaussians than a tile has
 
 @dataclass(frozen=True)
 class Functions:
-    """The functions of gsplat that run CUDA kernels, by their names there. Tests put gsplat's pure-torch twins in their place."""
+    """The functions of gsplat that run CUDA kernels, by their names there. Tests put gsplat's pure-torch
+    twins in their place.
+    """
 
     fully_fused_projection: Callable
     spherical_harmonics: Callable
@@ -57,10 +64,14 @@ def cuda_functions() -> Functions:
     try:
         from gsplat.cuda._backend import _C as kernels
     except Exception as error:  # whatever its build raises
-        raise MissingPackageError(f"gsplat has no CUDA kernels and cannot compile them ({type(error).__name__}): install a gsplat wheel built for "
-                                  "this torch, or the CUDA toolkit (or use --device cpu)") from None
+        raise MissingPackageError(
+            f"gsplat has no CUDA kernels and cannot compile them ({type(error).__name__}): install a gsplat wheel built for "
+            "this torch, or the CUDA toolkit (or use --device cpu)"
+        ) from None
     if kernels is None:
-        raise MissingPackageError("gsplat finds no CUDA toolkit to compile its kernels with: install one (or use --device cpu)")
+        raise MissingPackageError(
+            "gsplat finds no CUDA toolkit to compile its kernels with: install one (or use --device cpu)"
+        )
     return Functions(**{field.name: getattr(gsplat, field.name) for field in fields(Functions)})
 
 
@@ -68,9 +79,11 @@ def cuda_functions() -> Functions:
 class _Screen:
     """N Gaussians projected into one view, in gsplat's form: a leading dimension of 1 for the view.
 
-    means2d: (1, N, 2) px; conics: (1, N, 3) xx, xy, yy of the inverse covariance, 1 / px^2; opacities: (1, N); radii: (1, N, 2) int32 half
+    means2d: (1, N, 2) px; conics: (1, N, 3) xx, xy, yy of the inverse covariance, 1 / px^2; opacities: (1,
+        N); radii: (1, N, 2) int32 half
     extents, px, 0 = cannot touch the image, all else of that row is then undefined
-    offsets: (1, rows, columns) int32 first entry of each tile in ids: (P,) int32 Gaussians tile by tile, near to far; size: width, height, px
+    offsets: (1, rows, columns) int32 first entry of each tile in ids: (P,) int32 Gaussians tile by tile, near
+        to far; size: width, height, px
     """
 
     means2d: Tensor
@@ -93,7 +106,8 @@ class _Screen:
 
 
 class GsplatStatistics(ViewStatistics):
-    """`ViewStatistics` computed when asked for: listing all fragments costs about as much as the rendering itself, and only training needs it.
+    """`ViewStatistics` computed when asked for: listing all fragments costs about as much as the rendering
+    itself, and only training needs it.
 
     The gradients need `means2d.retain_grad()` before, and read zero until, backward().
     """
@@ -131,21 +145,38 @@ class GsplatStatistics(ViewStatistics):
 
 
 def render_gsplat(
-    gaussians: Gaussians, view: View, sh_degree: int, background: Tensor | None, geometry: bool, functions: Functions,
+    gaussians: Gaussians,
+    view: View,
+    sh_degree: int,
+    background: Tensor | None,
+    geometry: bool,
+    functions: Functions,
 ) -> Rendering:
-    """`render.render` with checked arguments. sh_degree: at most the stored one; functions: `cuda_functions()`, or twins of them."""
+    """`render.render` with checked arguments. sh_degree: at most the stored one; functions:
+    `cuda_functions()`, or twins of them.
+    """
     screen = project(gaussians, view, functions)
     if screen.means2d.requires_grad:
         screen.means2d.retain_grad()
     features = _features(gaussians, view, sh_degree, geometry, functions)
     image, alpha = functions.rasterize_to_pixels(
-        screen.means2d, screen.conics, features[None], screen.opacities, *screen.rasterisation, absgrad=screen.means2d.requires_grad)
+        screen.means2d,
+        screen.conics,
+        features[None],
+        screen.opacities,
+        *screen.rasterisation,
+        absgrad=screen.means2d.requires_grad,
+    )
     image, alpha = image[0], alpha[0, ..., 0]
     color = image[..., :3]
     if background is not None:
         color = color + (1 - alpha)[..., None] * background.detach().to(color)
-    normal, plane_distance = (image[..., 3:6], image[..., 6]) if geometry else (torch.zeros_like(color), torch.zeros_like(alpha))
-    return Rendering(color, alpha, normal, plane_distance, _three_sigma(screen), GsplatStatistics(screen, functions))
+    normal, plane_distance = (
+        (image[..., 3:6], image[..., 6]) if geometry else (torch.zeros_like(color), torch.zeros_like(alpha))
+    )
+    return Rendering(
+        color, alpha, normal, plane_distance, _three_sigma(screen), GsplatStatistics(screen, functions)
+    )
 
 
 def project(gaussians: Gaussians, view: View, functions: Functions) -> _Screen:
@@ -153,27 +184,53 @@ def project(gaussians: Gaussians, view: View, functions: Functions) -> _Screen:
     means, opacities, size = gaussians.means, gaussians.opacities, (view.width, view.height)
     pose, matrix = (means.new_tensor(array)[None] for array in (view.cam_from_world, view.matrix))
     radii, means2d, depths, conics, _ = functions.fully_fused_projection(
-        means, None, gaussians.quats, gaussians.scales, pose, matrix, *size, eps2d=DILATION, near_plane=NEAR, opacities=opacities.detach())
+        means,
+        None,
+        gaussians.quats,
+        gaussians.scales,
+        pose,
+        matrix,
+        *size,
+        eps2d=DILATION,
+        near_plane=NEAR,
+        opacities=opacities.detach(),
+    )
     columns, rows = (-(-length // TILE) for length in size)
     _, keys, ids = functions.isect_tiles(means2d.detach(), radii, depths.detach(), TILE, columns, rows)
-    return _Screen(means2d, conics, opacities[None], radii, functions.isect_offset_encode(keys, 1, columns, rows), ids, size)
+    return _Screen(
+        means2d,
+        conics,
+        opacities[None],
+        radii,
+        functions.isect_offset_encode(keys, 1, columns, rows),
+        ids,
+        size,
+    )
 
 
 def contributions(screen: _Screen, functions: Functions) -> tuple[Tensor, Tensor]:
-    """(N,) sum of each Gaussian's weights, and (N,) largest transmittance in front of its fragments, 0 = none; no gradients.
+    """(N,) sum of each Gaussian's weights, and (N,) largest transmittance in front of its fragments, 0 =
+    none; no gradients.
 
-    gsplat lists the fragments of a band of rows at a time, pixel by pixel and near to far: a pixel that starts with transmittance 0 has none.
+    gsplat lists the fragments of a band of rows at a time, pixel by pixel and near to far: a pixel that
+    starts with transmittance 0 has none.
     """
-    means2d, conics, opacities = (tensor.detach() for tensor in (screen.means2d, screen.conics, screen.opacities))
+    means2d, conics, opacities = (
+        tensor.detach() for tensor in (screen.means2d, screen.conics, screen.opacities)
+    )
     weight, largest = torch.zeros_like(opacities[0]), torch.zeros_like(opacities[0])
     width, height = screen.size
     rows = max(1, BAND_PIXELS // width)
     for top in range(0, height if len(screen.ids) else 0, rows):
         band = means2d.new_zeros(1, height, width)
-        band[:, top:top + rows] = 1
-        ids, pixels, _ = functions.rasterize_to_indices_in_range(0, _ALL, band, means2d, conics, opacities, *screen.rasterisation)
+        band[:, top : top + rows] = 1
+        ids, pixels, _ = functions.rasterize_to_indices_in_range(
+            0, _ALL, band, means2d, conics, opacities, *screen.rasterisation
+        )
         offsets = torch.stack([pixels % width, pixels // width], 1) + 0.5 - means2d[0, ids]
-        alphas = (opacities[0, ids] * torch.exp(-0.5 * _squared_distance(offsets, conics[0, ids]))).clamp_max(MAX_ALPHA)
+        alphas = (opacities[0, ids] * torch.exp(-0.5 * _squared_distance(offsets, conics[0, ids]))).clamp_max(
+            MAX_ALPHA
+        )
         reached = transmittances(alphas, pixels)
         weight.index_add_(0, ids, alphas * reached)
         largest.scatter_reduce_(0, ids, reached, "amax")
@@ -181,7 +238,9 @@ def contributions(screen: _Screen, functions: Functions) -> tuple[Tensor, Tensor
 
 
 def transmittances(alphas: Tensor, pixels: Tensor) -> Tensor:
-    """(M,) product of 1 - alpha over the fragments before each one in its pixel. alphas: (M,); pixels: (M,) equal ones side by side."""
+    """(M,) product of 1 - alpha over the fragments before each one in its pixel. alphas: (M,); pixels: (M,)
+    equal ones side by side.
+    """
     logs = torch.log1p(-alphas.double())
     before = logs.cumsum(0) - logs
     starts = torch.ones_like(pixels, dtype=torch.bool)
@@ -195,8 +254,12 @@ def _squared_distance(offsets: Tensor, conics: Tensor) -> Tensor:
     return xx * x * x + 2 * xy * x * y + yy * y * y
 
 
-def _features(gaussians: Gaussians, view: View, sh_degree: int, geometry: bool, functions: Functions) -> Tensor:
-    """(N, 7) what a fragment adds: colour, normal (camera frame, towards the camera), plane distance; (N, 3) without geometry."""
+def _features(
+    gaussians: Gaussians, view: View, sh_degree: int, geometry: bool, functions: Functions
+) -> Tensor:
+    """(N, 7) what a fragment adds: colour, normal (camera frame, towards the camera), plane distance; (N, 3)
+    without geometry.
+    """
     means = gaussians.means
     directions = means - means.new_tensor(view.centre)
     colors = (functions.spherical_harmonics(sh_degree, directions, gaussians.sh) + 0.5).clamp_min(0)
@@ -213,6 +276,7 @@ def _three_sigma(screen: _Screen) -> Tensor:
     """(N,) three standard deviations along the longer axis, px; 0 where not visible."""
     xx, xy, yy = screen.conics[0].unbind(1)
     determinant = xx * yy - xy * xy
-    middle = 0.5 * (xx + yy) / determinant  # of the covariance: its diagonal is that of the conic, swapped, over the determinant
+    # of the covariance: its diagonal is that of the conic, swapped, over the determinant
+    middle = 0.5 * (xx + yy) / determinant
     radius = 3 * (middle + (middle * middle - 1 / determinant).clamp_min(0).sqrt()).sqrt()
     return torch.where(screen.visible, radius, 0)

@@ -1,6 +1,8 @@
-"""More starting points where the sparse points leave parts of the photos empty (trees, lawn, asphalt): a small plane-sweep stereo.
+"""More starting points where the sparse points leave parts of the photos empty (trees, lawn, asphalt): a
+small plane-sweep stereo.
 
-Optimisation moves a Gaussian by little per step, so a tree crown that starts on the ground stays there: starting depth matters.
+Optimisation moves a Gaussian by little per step, so a tree crown that starts on the ground stays there:
+starting depth matters.
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ FARTHEST = 3.0  # in depths of the farthest sparse points: what lies behind is b
 
 @dataclass(frozen=True)
 class _Sight:
-    """What one view knows: pixels (T, 2) and depths (T,) of its sparse points; grid (G, 2) pixels without any nearby."""
+    """What one view knows: pixels (T, 2) and depths (T,) of its sparse points; grid (G, 2) pixels without any
+    nearby.
+    """
 
     pixels: np.ndarray
     depths: np.ndarray
@@ -47,7 +51,9 @@ class _Layer:
 
     @classmethod
     def of(cls, points: np.ndarray, views: list[View]) -> _Layer | None:
-        """The layer of the sparse points, across the mean viewing direction; None if a camera is not above it: then it is no flight."""
+        """The layer of the sparse points, across the mean viewing direction; None if a camera is not above
+        it: then it is no flight.
+        """
         up = -np.sum([view.cam_from_world[2, :3] for view in views], axis=0)
         up = up / np.maximum(np.linalg.norm(up), 1e-12)
         low, high = np.quantile(points @ up, [0.02, 0.995])
@@ -61,15 +67,23 @@ class _Layer:
         return view.cam_from_world[:3, :3] @ self.up, float(view.centre @ self.up - height)
 
 
-def fill_points(data: TrainingData, neighbours: list[np.ndarray], budget: int) -> tuple[np.ndarray, np.ndarray]:
+def fill_points(
+    data: TrainingData, neighbours: list[np.ndarray], budget: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Points on a pixel grid of every photo, away from sparse points.
 
-    neighbours: per view indices of other views, best first; budget: number of grid points over all photos; fewer remain, as photos overlap
-    returns: (M, 3) float64 points, the views' world; (M, 3) uint8 colours. M = 0 where there is nothing to fill.
-    Depth: where patches agree with the neighbours' (plane sweep); elsewhere interpolated from what the view knows around the pixel.
+    neighbours: per view indices of other views, best first; budget: number of grid points over all photos;
+        fewer remain, as photos overlap
+    returns: (M, 3) float64 points, the views' world; (M, 3) uint8 colours. M = 0 where there is nothing to
+        fill.
+    Depth: where patches agree with the neighbours' (plane sweep); elsewhere interpolated from what the view
+        knows around the pixel.
     """
     masks = map(data.mask, range(len(data.views)))
-    num_pixels = sum(view.width * view.height if mask is None else int(mask.sum()) for view, mask in zip(data.views, masks, strict=True))
+    num_pixels = sum(
+        view.width * view.height if mask is None else int(mask.sum())
+        for view, mask in zip(data.views, masks, strict=True)
+    )
     step = max(4.0, np.sqrt(num_pixels / max(budget, 1)))
     greys = [_small_grey(data, index) for index in range(len(data.views))]
     layer = _Layer.of(np.asarray(data.points, np.float64), data.views)
@@ -79,12 +93,18 @@ def fill_points(data: TrainingData, neighbours: list[np.ndarray], budget: int) -
         if sight is None:
             continue
         planes = _planes(sight, view, layer)
-        swept, cost = _sweep(sight.grid, planes, greys[index], [greys[other] for other in neighbours[index]], view)
+        swept, cost = _sweep(
+            sight.grid, planes, greys[index], [greys[other] for other in neighbours[index]], view
+        )
         good = _settled(sight.grid, swept, cost < MAX_COST, step)
         known = np.concatenate([sight.pixels, sight.grid[good]]), np.concatenate([sight.depths, swept[good]])
         lowest = planes[0] if layer else (np.array([0.0, 0.0, -1.0]), 1.0)
         relative = _interpolated(known[0], known[1] / _plane_depth(lowest, view, known[0]), sight.grid)
-        depth = np.where(good, swept, np.minimum(relative * _plane_depth(lowest, view, sight.grid), FARTHEST * sight.depths.max()))
+        depth = np.where(
+            good,
+            swept,
+            np.minimum(relative * _plane_depth(lowest, view, sight.grid), FARTHEST * sight.depths.max()),
+        )
         rays_cam = _rays(view, sight.grid)
         found.append((rays_cam * depth[:, None] - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3])
         columns, rows = sight.grid.astype(int).T
@@ -104,7 +124,9 @@ def _small_grey(data: TrainingData, index: int) -> tuple[torch.Tensor, View]:
 
 
 def _sight(data: TrainingData, index: int, step: float) -> _Sight | None:
-    """None where too few sparse points are seen, or nothing is empty. Without tracks every point in the image counts as seen."""
+    """None where too few sparse points are seen, or nothing is empty. Without tracks every point in the image
+    counts as seen.
+    """
     view, points = data.views[index], np.asarray(data.points, np.float64)
     pixels, depths = project(view, points if data.tracks is None else points[data.tracks[index]])
     usable = in_image(view, pixels) & (depths > 0)
@@ -121,12 +143,20 @@ def _sight(data: TrainingData, index: int, step: float) -> _Sight | None:
 
 
 def _planes(sight: _Sight, view: View, layer: _Layer | None) -> list[tuple[np.ndarray, float]]:
-    """NUM_DEPTHS planes to try, farthest first: horizontal ones through the layer, else fronto-parallel ones around the sparse depths."""
+    """NUM_DEPTHS planes to try, farthest first: horizontal ones through the layer, else fronto-parallel ones
+    around the sparse depths.
+    """
     if layer is None:
         nearest, farthest = np.quantile(sight.depths, [0.01, 0.99]) * [0.6, 1.15]
-        return [(np.array([0.0, 0.0, -1.0]), depth) for depth in 1 / np.linspace(1 / farthest, 1 / nearest, NUM_DEPTHS)]
+        return [
+            (np.array([0.0, 0.0, -1.0]), depth)
+            for depth in 1 / np.linspace(1 / farthest, 1 / nearest, NUM_DEPTHS)
+        ]
     height = view.centre @ layer.up
-    return [layer.plane(view, height - below) for below in 1 / np.linspace(1 / (height - layer.low), 1 / (height - layer.high), NUM_DEPTHS)]
+    return [
+        layer.plane(view, height - below)
+        for below in 1 / np.linspace(1 / (height - layer.low), 1 / (height - layer.high), NUM_DEPTHS)
+    ]
 
 
 def _plane_depth(plane: tuple[np.ndarray, float], view: View, pixels: np.ndarray) -> np.ndarray:
@@ -140,9 +170,15 @@ def _rays(view: View, pixels: np.ndarray) -> np.ndarray:
 
 
 def _sweep(
-    grid: np.ndarray, planes: list[tuple[np.ndarray, float]], own: tuple[torch.Tensor, View], others: list[tuple[torch.Tensor, View]], view: View
+    grid: np.ndarray,
+    planes: list[tuple[np.ndarray, float]],
+    own: tuple[torch.Tensor, View],
+    others: list[tuple[torch.Tensor, View]],
+    view: View,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(G,) depth of the plane whose patches agree best with the two best of the other views; (G,) that mean 1 - NCC, 2 = none."""
+    """(G,) depth of the plane whose patches agree best with the two best of the other views; (G,) that mean 1
+    - NCC, 2 = none.
+    """
     pixels = torch.from_numpy((grid * (own[1].width / view.width)).astype(np.int64))
     around = cKDTree(grid).query(grid, k=min(AROUND, len(grid)))[1].reshape(len(grid), -1)
     best_cost, best_depth = np.full(len(pixels), 2.0), np.ones(len(pixels))
@@ -150,7 +186,9 @@ def _sweep(
         normals = torch.from_numpy(plane[0].astype(np.float32)).expand(len(pixels), 3).contiguous()
         costs = []
         for other in others:
-            cost, inside = losses.patch_dissimilarity((normals, torch.full((len(pixels),), plane[1])), pixels, own, other)
+            cost, inside = losses.patch_dissimilarity(
+                (normals, torch.full((len(pixels),), plane[1])), pixels, own, other
+            )
             costs.append(torch.where(inside, cost, 2.0))
         cost = torch.stack(costs).sort(0).values[:2].mean(0).numpy()
         cost = cost[around].mean(axis=1)  # leaves in the wind: one patch says little
@@ -169,7 +207,8 @@ def _settled(grid: np.ndarray, depth: np.ndarray, good: np.ndarray, step: float)
 
 
 def _interpolated(pixels: np.ndarray, relative: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """(G,) third quartile of the depths of the 8 nearest known pixels: what no patch matches is more often the ground beside a roof than the roof.
+    """(G,) third quartile of the depths of the 8 nearest known pixels: what no patch matches is more often
+    the ground beside a roof than the roof.
 
     relative: depths relative to the lowest plane's, which continues the ground to where nothing is known
     """

@@ -1,6 +1,7 @@
 """The terms of the training loss (METHOD section 1): pure functions on tensors, each a scalar.
 
-Rendered maps are sums over a pixel's Gaussians: N = sum w n (camera frame, towards the camera), D = sum w d, A = sum w.
+Rendered maps are sums over a pixel's Gaussians: N = sum w n (camera frame, towards the camera), D = sum w d,
+A = sum w.
 The plane of a pixel is N . x + D = 0, whose scale cancels.
 """
 
@@ -20,15 +21,21 @@ GREY = (0.299, 0.587, 0.114)
 
 
 def apply_exposure(image: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
-    """exp(a) image + b: a photo's brightness against the scene's. exposure: (2,) a, b, on any device; zeros change nothing."""
+    """exp(a) image + b: a photo's brightness against the scene's. exposure: (2,) a, b, on any device; zeros
+    change nothing.
+    """
     exposure = exposure.to(image.device)
     return exposure[0].exp() * image + exposure[1]
 
 
 def fit_exposure(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """(2,) the exposure that brings `image` closest to `target` (least squares), for photos that were not trained on."""
+    """(2,) the exposure that brings `image` closest to `target` (least squares), for photos that were not
+    trained on.
+    """
     mean_image, mean_target = image.mean(), target.mean()
-    gain = ((image - mean_image) * (target - mean_target)).mean() / (image - mean_image).square().mean().clamp_min(1e-12)
+    gain = ((image - mean_image) * (target - mean_target)).mean() / (
+        image - mean_image
+    ).square().mean().clamp_min(1e-12)
     gain = gain.clamp(0.25, 4.0)
     return torch.stack([gain.log(), mean_target - gain * mean_image])
 
@@ -47,12 +54,15 @@ def image_edges(image: torch.Tensor) -> torch.Tensor:
     """(H, W) gradient magnitude of an (H, W, 3) image, divided by its maximum: 1 at the strongest edge."""
     grey = to_grey(image)
     padded = torch.nn.functional.pad(grey[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    gradient = ((padded[1:-1, 2:] - padded[1:-1, :-2]).square() + (padded[2:, 1:-1] - padded[:-2, 1:-1]).square()).sqrt()
+    gradient = (
+        (padded[1:-1, 2:] - padded[1:-1, :-2]).square() + (padded[2:, 1:-1] - padded[:-2, 1:-1]).square()
+    ).sqrt()
     return gradient / gradient.max().clamp_min(1e-12)
 
 
 def normals_from_depth(depth: torch.Tensor, view: View) -> torch.Tensor:
-    """(H, W, 3) unit normals, camera frame, towards the camera: cross product of the differences between the 4 neighbours' points.
+    """(H, W, 3) unit normals, camera frame, towards the camera: cross product of the differences between the
+    4 neighbours' points.
 
     depth: (H, W), 0 = none. Zero at the image border and where one of the four has no depth.
     """
@@ -62,21 +72,30 @@ def normals_from_depth(depth: torch.Tensor, view: View) -> torch.Tensor:
     normals = torch.linalg.cross(down, across)
     length = normals.norm(dim=2, keepdim=True)
     known = known[..., None] & (length > 0)
-    normals = torch.where(known, normals / torch.where(known, length, torch.ones_like(length)), torch.zeros_like(normals))
+    normals = torch.where(
+        known, normals / torch.where(known, length, torch.ones_like(length)), torch.zeros_like(normals)
+    )
     return torch.nn.functional.pad(normals, (0, 0, 1, 1, 1, 1))
 
 
-def depth_normal_loss(normal: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, edges: torch.Tensor, view: View) -> torch.Tensor:
-    """`normal_loss` against `normals_from_depth` of a depth map, (H, W), 0 = none; differentiable in `normal` and `depth`."""
+def depth_normal_loss(
+    normal: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, edges: torch.Tensor, view: View
+) -> torch.Tensor:
+    """`normal_loss` against `normals_from_depth` of a depth map, (H, W), 0 = none; differentiable in `normal`
+    and `depth`.
+    """
     if device.has_kernels(normal):
         return kernels_normals.depth_normal_loss(normal, depth, alpha, edges, pinhole(view))
     return normal_loss(normal, normals_from_depth(depth, view), alpha, edges)
 
 
-def normal_loss(normal: torch.Tensor, depth_normals: torch.Tensor, alpha: torch.Tensor, edges: torch.Tensor) -> torch.Tensor:
+def normal_loss(
+    normal: torch.Tensor, depth_normals: torch.Tensor, alpha: torch.Tensor, edges: torch.Tensor
+) -> torch.Tensor:
     """(1 - g)^2 |A N_depth - N|_1, mean over the pixels where N_depth is known.
 
-    normal: (H, W, 3) N; depth_normals: (H, W, 3) `normals_from_depth`; alpha: (H, W) A; edges: (H, W) g, `image_edges`
+    normal: (H, W, 3) N; depth_normals: (H, W, 3) `normals_from_depth`; alpha: (H, W) A; edges: (H, W) g,
+        `image_edges`
     """
     known = depth_normals.detach().abs().sum(2) > 0
     gap = (alpha.detach()[..., None] * depth_normals - normal).abs().sum(2)
@@ -95,12 +114,16 @@ def geometric_loss(error: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
 
 
 def photometric_loss(
-    planes: tuple[torch.Tensor, torch.Tensor], pixels: torch.Tensor, weights: torch.Tensor,
-    source: tuple[torch.Tensor, View], other: tuple[torch.Tensor, View],
+    planes: tuple[torch.Tensor, torch.Tensor],
+    pixels: torch.Tensor,
+    weights: torch.Tensor,
+    source: tuple[torch.Tensor, View],
+    other: tuple[torch.Tensor, View],
 ) -> torch.Tensor:
     """Patches around pixels must look the same after their plane's homography carried them into another view.
 
-    planes: (M, 3) N and (M,) D of the pixels; pixels: (M, 2) int64 column, row; weights: (M,) exp(-phi), not differentiated
+    planes: (M, 3) N and (M,) D of the pixels; pixels: (M, 2) int64 column, row; weights: (M,) exp(-phi), not
+        differentiated
     source, other: grey (H, W) images in [0, 1] with their views
     returns: weighted mean of 1 - NCC over the patches with 1 - NCC < 0.9
     """
@@ -112,21 +135,30 @@ def photometric_loss(
 
 
 def patch_dissimilarity(
-    planes: tuple[torch.Tensor, torch.Tensor], pixels: torch.Tensor, source: tuple[torch.Tensor, View], other: tuple[torch.Tensor, View]
+    planes: tuple[torch.Tensor, torch.Tensor],
+    pixels: torch.Tensor,
+    source: tuple[torch.Tensor, View],
+    other: tuple[torch.Tensor, View],
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """1 - NCC of 7x7 patches warped by H = K_n (R - t n^T / d) K_r^-1; arguments as in `photometric_loss`.
 
-    returns: (M,) in [0, 2], about 1 where there is no texture; (M,) bool: both patches lie inside their images
+    returns: (M,) in [0, 2], about 1 where there is no texture; (M,) bool: both patches lie inside their
+        images
     """
     if not device.has_kernels(planes[0]):
         return patch_dissimilarity_reference(planes, pixels, source, other)
     rotation, translation = relative_pose(source[1], other[1])
-    cameras = np.concatenate([pinhole(source[1]), pinhole(other[1]), rotation.numpy().ravel(), translation.numpy()])
+    cameras = np.concatenate(
+        [pinhole(source[1]), pinhole(other[1]), rotation.numpy().ravel(), translation.numpy()]
+    )
     return kernels_patches.patch_dissimilarity(*planes, pixels, (source[0], other[0]), cameras)
 
 
 def patch_dissimilarity_reference(
-    planes: tuple[torch.Tensor, torch.Tensor], pixels: torch.Tensor, source: tuple[torch.Tensor, View], other: tuple[torch.Tensor, View]
+    planes: tuple[torch.Tensor, torch.Tensor],
+    pixels: torch.Tensor,
+    source: tuple[torch.Tensor, View],
+    other: tuple[torch.Tensor, View],
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """`patch_dissimilarity` in plain torch: for GPUs, and for tests of the kernel."""
     (grey, view), (other_grey, other_view) = source, other
@@ -145,10 +177,14 @@ def patch_dissimilarity_reference(
 
 
 def normalised_correlation(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """(M,) NCC of rows of two (M, P) arrays in [0, 1]. Variances below (1/255)^2 count as noise: they pull it to 0."""
+    """(M,) NCC of rows of two (M, P) arrays in [0, 1]. Variances below (1/255)^2 count as noise: they pull it
+    to 0.
+    """
     first, second = first - first.mean(1, keepdim=True), second - second.mean(1, keepdim=True)
     noise = 1 / 255**2
-    return (first * second).mean(1) / ((first.square().mean(1) + noise) * (second.square().mean(1) + noise)).sqrt()
+    return (first * second).mean(1) / (
+        (first.square().mean(1) + noise) * (second.square().mean(1) + noise)
+    ).sqrt()
 
 
 def to_grey(image: torch.Tensor) -> torch.Tensor:
@@ -156,13 +192,20 @@ def to_grey(image: torch.Tensor) -> torch.Tensor:
     return image @ image.new_tensor(GREY)
 
 
-def _warp(pixels: torch.Tensor, planes: tuple[torch.Tensor, torch.Tensor], view: View, other: View) -> torch.Tensor:
-    """(M, P, 2) pixels of `view`, each row on its own plane, in `other`; far outside where the plane is behind."""
+def _warp(
+    pixels: torch.Tensor, planes: tuple[torch.Tensor, torch.Tensor], view: View, other: View
+) -> torch.Tensor:
+    """(M, P, 2) pixels of `view`, each row on its own plane, in `other`; far outside where the plane is
+    behind.
+    """
     normal, distance = planes
     rotation, translation = relative_pose(view, other, pixels.device)
     fx, fy, cx, cy = pinhole(view)
-    rays = torch.stack([(pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy, torch.ones_like(pixels[..., 0])], 2)
-    # x' = R x - t (n . x) / d, per pixel up to scale; multiplied by d > 0, which also cancels the scale of N and D.
+    rays = torch.stack(
+        [(pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy, torch.ones_like(pixels[..., 0])], 2
+    )
+    # x' = R x - t (n . x) / d, per pixel up to scale; multiplied by d > 0, which also cancels the scale of N
+    # and D.
     along = (rays * normal[:, None]).sum(2, keepdim=True)
     moved = (rays @ rotation.T) * distance[:, None, None] - translation * along
     depth = moved[..., 2]
@@ -171,4 +214,3 @@ def _warp(pixels: torch.Tensor, planes: tuple[torch.Tensor, torch.Tensor], view:
     fx, fy, cx, cy = pinhole(other)
     warped = torch.stack([moved[..., 0] / safe * fx + cx, moved[..., 1] / safe * fy + cy], 2)
     return torch.where(ahead[..., None], warped, torch.full_like(warped, -1e6))
-

@@ -24,14 +24,24 @@ class Neighbour:
     depth: torch.Tensor
 
 
-def single_view_normal_loss(rendering: Rendering, depth: torch.Tensor, view: View, target: torch.Tensor) -> torch.Tensor:
-    """Rendered normals against those of the rendered depth, (H, W), away from the edges of the photo `target` (H, W, 3)."""
+def single_view_normal_loss(
+    rendering: Rendering, depth: torch.Tensor, view: View, target: torch.Tensor
+) -> torch.Tensor:
+    """Rendered normals against those of the rendered depth, (H, W), away from the edges of the photo `target`
+    (H, W, 3).
+    """
     depth = torch.where(rendering.alpha > 0.5, depth, 0)
-    return losses.depth_normal_loss(rendering.normal, depth, rendering.alpha, losses.image_edges(target), view)
+    return losses.depth_normal_loss(
+        rendering.normal, depth, rendering.alpha, losses.image_edges(target), view
+    )
 
 
 def multi_view_losses(
-    rendering: Rendering, depth: torch.Tensor, source: tuple[torch.Tensor, View], neighbour: Neighbour, draw: tuple[int, torch.Generator]
+    rendering: Rendering,
+    depth: torch.Tensor,
+    source: tuple[torch.Tensor, View],
+    neighbour: Neighbour,
+    draw: tuple[int, torch.Generator],
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Geometric and photometric loss of random pixels.
 
@@ -40,7 +50,9 @@ def multi_view_losses(
     """
     num_patches, generator = draw
     present = torch.nonzero(((rendering.alpha > 0.5) & (depth > 0)).reshape(-1))[:, 0]
-    chosen = torch.randint(max(len(present), 1), (min(PIXELS_PER_PATCH * num_patches, len(present)),), generator=generator)
+    chosen = torch.randint(
+        max(len(present), 1), (min(PIXELS_PER_PATCH * num_patches, len(present)),), generator=generator
+    )
     chosen = present[chosen.to(present.device)]
     view = source[1]
     points_cam = pixel_rays(view, depth.device).reshape(-1, 3)[chosen] * depth.reshape(-1)[chosen, None]
@@ -51,5 +63,7 @@ def multi_view_losses(
     picked = chosen[near]
     planes = rendering.normal.reshape(-1, 3)[picked], rendering.plane_distance.reshape(-1)[picked]
     pixels = torch.stack([picked % view.width, picked // view.width], 1)
-    photometric = losses.photometric_loss(planes, pixels, torch.exp(-error[near].detach()), source, (neighbour.grey, neighbour.view))
+    photometric = losses.photometric_loss(
+        planes, pixels, torch.exp(-error[near].detach()), source, (neighbour.grey, neighbour.view)
+    )
     return losses.geometric_loss(error, valid), photometric

@@ -1,4 +1,6 @@
-"""Adam over rows: one row per Gaussian (or photo), so that rows can be skipped, reordered and added together with their moments."""
+"""Adam over rows: one row per Gaussian (or photo), so that rows can be skipped, reordered and added together
+with their moments.
+"""
 
 from __future__ import annotations
 
@@ -25,20 +27,36 @@ class RowAdam:
         self.parameters = parameters
         self.rates = dict(rates)
         self.count = 0
-        self.means = {name: torch.zeros_like(tensor, requires_grad=False) for name, tensor in parameters.items()}
-        self.squares = {name: torch.zeros_like(tensor, requires_grad=False) for name, tensor in parameters.items()}
+        self.means = {
+            name: torch.zeros_like(tensor, requires_grad=False) for name, tensor in parameters.items()
+        }
+        self.squares = {
+            name: torch.zeros_like(tensor, requires_grad=False) for name, tensor in parameters.items()
+        }
 
     def step(self, rows: torch.Tensor | None = None) -> None:
-        """One update from the tensors' `.grad`, which is cleared. rows: (N,) bool; the others keep values and moments; None = all."""
+        """One update from the tensors' `.grad`, which is cleared. rows: (N,) bool; the others keep values and
+        moments; None = all.
+        """
         self.count += 1
         corrections = 1 - BETAS[0] ** self.count, math.sqrt(1 - BETAS[1] ** self.count)
         for name, tensor in self.parameters.items():
             if tensor.grad is None or not len(tensor):
                 continue
-            rates = np.broadcast_to(np.float32(self.rates[name]), tensor.numel() // len(tensor)) * np.float32(corrections[1] / corrections[0])
-            rates, epsilon = torch.from_numpy(np.ascontiguousarray(rates, np.float32)), np.float32(EPSILON * corrections[1])
-            flat = [part.detach().view(len(tensor), -1) for part in (tensor, tensor.grad.contiguous(), self.means[name], self.squares[name])]
-            chosen = tensor.new_ones(len(tensor), dtype=torch.bool) if rows is None else rows.to(tensor.device)
+            rates = np.broadcast_to(np.float32(self.rates[name]), tensor.numel() // len(tensor)) * np.float32(
+                corrections[1] / corrections[0]
+            )
+            rates, epsilon = (
+                torch.from_numpy(np.ascontiguousarray(rates, np.float32)),
+                np.float32(EPSILON * corrections[1]),
+            )
+            flat = [
+                part.detach().view(len(tensor), -1)
+                for part in (tensor, tensor.grad.contiguous(), self.means[name], self.squares[name])
+            ]
+            chosen = (
+                tensor.new_ones(len(tensor), dtype=torch.bool) if rows is None else rows.to(tensor.device)
+            )
             if device.has_kernels(tensor):
                 _update_rows(*(part.numpy() for part in (*flat, rates, chosen)), epsilon)
             else:
@@ -46,9 +64,11 @@ class RowAdam:
             tensor.grad = None
 
     def take(self, source: torch.Tensor, fresh: torch.Tensor) -> None:
-        """Rebuild every tensor from rows of the present one: new[i] = old[source[i]]; its moments too, but zero where `fresh`.
+        """Rebuild every tensor from rows of the present one: new[i] = old[source[i]]; its moments too, but
+        zero where `fresh`.
 
-        source: (M,) int64; fresh: (M,) bool; on any device. The entries of `parameters` are replaced by new leaves.
+        source: (M,) int64; fresh: (M,) bool; on any device. The entries of `parameters` are replaced by new
+            leaves.
         """
         for name, tensor in self.parameters.items():
             source, fresh = source.to(tensor.device), fresh.to(tensor.device)
@@ -68,7 +88,9 @@ class RowAdam:
             kept.update({name: moments.to(self.parameters[name].device) for name, moments in saved.items()})
 
 
-def _update_rows_torch(flat: list[torch.Tensor], rates: torch.Tensor, chosen: torch.Tensor, epsilon: float) -> None:
+def _update_rows_torch(
+    flat: list[torch.Tensor], rates: torch.Tensor, chosen: torch.Tensor, epsilon: float
+) -> None:
     """`_update_rows` in torch operations, for GPUs. flat: (N, C) values, gradient, means and squares."""
     values, gradient, means, squares = flat
     chosen = chosen[:, None]

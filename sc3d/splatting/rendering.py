@@ -1,4 +1,6 @@
-"""Differentiable rendering of planar Gaussians: colour, alpha, normal and plane distance of a pinhole view in one pass (eq. 1-3)."""
+"""Differentiable rendering of planar Gaussians: colour, alpha, normal and plane distance of a pinhole view in
+one pass (eq. 1-3).
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from sc3d.splatting.cpu import rasterization_backward as kernels_unraster
 from sc3d.splatting.cpu import tile_binning as kernels_bin
 from sc3d.splatting.gaussians import Gaussians
 
-_JACOBIAN_MARGIN = 0.3  # half image sizes that a mean may lie outside the image before its Jacobian is clamped: 1.3 tan(fov / 2)
+# half image sizes that a mean may lie outside the image before its Jacobian is clamped: 1.3 tan(fov / 2)
+_JACOBIAN_MARGIN = 0.3
 _BLOCKS = 8  # work items of the counting sort
 _STREAMS = 16  # interleaving of tiles and chunks, so that threads with contiguous shares get similar work
 
@@ -28,9 +31,12 @@ class ViewStatistics:
     """What one view tells about each Gaussian, for densification and pruning; no gradients.
 
     weight: (N,) float32 sum over pixels of w_i; after forward
-    max_transmittance: (N,) float32 largest transmittance in front of any of its fragments, 0 = never hit; after forward
-    gradient: (N,) float32 |d loss / d mean2d| in normalised device units: pixel gradient times (W / 2, H / 2); zero until backward
-    absolute_gradient: (N,) float32 the same from sums of absolute per-pixel gradients (AbsGS); zero until backward
+    max_transmittance: (N,) float32 largest transmittance in front of any of its fragments, 0 = never hit;
+        after forward
+    gradient: (N,) float32 |d loss / d mean2d| in normalised device units: pixel gradient times (W / 2, H /
+        2); zero until backward
+    absolute_gradient: (N,) float32 the same from sums of absolute per-pixel gradients (AbsGS); zero until
+        backward
     """
 
     weight: Tensor
@@ -41,7 +47,8 @@ class ViewStatistics:
 
 @dataclass
 class Rendering:
-    """One rendered view; w_i = alpha_i T_i is the weight of a fragment. Images may be non-contiguous (stored plane by plane).
+    """One rendered view; w_i = alpha_i T_i is the weight of a fragment. Images may be non-contiguous (stored
+    plane by plane).
 
     color: (H, W, 3) sum w c (+ (1 - A) background)
     alpha: (H, W) A = sum w
@@ -78,21 +85,34 @@ class _Frame:
 
 
 def render(
-    gaussians: Gaussians, view: View, sh_degree: int | None = None, background: Tensor | None = None, geometry: bool = True,
+    gaussians: Gaussians,
+    view: View,
+    sh_degree: int | None = None,
+    background: Tensor | None = None,
+    geometry: bool = True,
 ) -> Rendering:
-    """Render Gaussians, differentiable in all five parameter tensors (eq. 1-3; rules in `kernels_project` and `kernels_raster`).
+    """Render Gaussians, differentiable in all five parameter tensors (eq. 1-3; rules in `kernels_project` and
+    `kernels_raster`).
 
-    Gaussians on a GPU are rendered there by gsplat, with the differences that `gsplat_backend` lists; images and statistics stay on it.
+    Gaussians on a GPU are rendered there by gsplat, with the differences that `gsplat_backend` lists; images
+    and statistics stay on it.
 
     view: pinhole, in the same local world as the Gaussians; its principal point is honoured
     sh_degree: highest active degree, None = all that are stored; colours are clamped at 0 from below
     background: (3,) colour seen through what is left of the transmittance, None = black; gets no gradient
     geometry: False leaves `normal` and `plane_distance` zero, which saves a few percent of the time
-    raises ValueError for a view with distortion or parameters that are not float32, MissingPackageError on a GPU without gsplat
+    raises ValueError for a view with distortion or parameters that are not float32, MissingPackageError on a
+    GPU without gsplat
     """
     if not view.camera.is_undistorted():
         raise ValueError(f"{view.name}: only undistorted views can be rendered")
-    parameters = (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh)
+    parameters = (
+        gaussians.means,
+        gaussians.log_scales,
+        gaussians.quats,
+        gaussians.opacity_logits,
+        gaussians.sh,
+    )
     if any(parameter.dtype != torch.float32 for parameter in parameters):
         raise ValueError("Gaussians must be float32 to be rendered")
     stored = int(np.sqrt(gaussians.sh.shape[1])) - 1
@@ -100,20 +120,26 @@ def render(
     if not device.has_kernels(gaussians.means):
         from sc3d.splatting import gsplat_backend  # it imports this module, and gsplat is optional
 
-        return gsplat_backend.render_gsplat(gaussians, view, degree, background, geometry, gsplat_backend.cuda_functions())
+        return gsplat_backend.render_gsplat(
+            gaussians, view, degree, background, geometry, gsplat_backend.cuda_functions()
+        )
     count = len(gaussians)
     statistics = ViewStatistics(*(torch.zeros(count) for _ in range(4)))
     radii = torch.zeros(count)
     shade = np.zeros(3, np.float32) if background is None else background.detach().numpy().astype(np.float32)
     settings = (camera_array(view), degree, geometry, shade, radii, statistics)
     color, normal, plane_distance, alpha = _Render.apply(*parameters, settings)
-    return Rendering(color.permute(1, 2, 0), alpha, normal.permute(1, 2, 0), plane_distance, radii, statistics)
+    return Rendering(
+        color.permute(1, 2, 0), alpha, normal.permute(1, 2, 0), plane_distance, radii, statistics
+    )
 
 
 def unbiased_depth(rendering: Rendering, view: View) -> Tensor:
-    """Depth of the rendered planes along each pixel's ray: z = D / -(N . r), r = ((u - cx) / fx, (v - cy) / fy, 1).
+    """Depth of the rendered planes along each pixel's ray: z = D / -(N . r), r = ((u - cx) / fx, (v - cy) /
+    fy, 1).
 
-    returns: (H, W) depth z, world units; 0 where nothing was rendered or the plane is seen from behind; differentiable
+    returns: (H, W) depth z, world units; 0 where nothing was rendered or the plane is seen from behind;
+        differentiable
     """
     normal = rendering.normal
     column, row = (slopes.to(normal.device) for slopes in _ray_slopes(view))
@@ -136,7 +162,9 @@ def camera_array(view: View) -> np.ndarray:
     size = np.array([view.width, view.height], np.float64)
     margin = _JACOBIAN_MARGIN * size / (2 * focal)
     limits = np.stack([-principal / focal - margin, (size - principal) / focal + margin], axis=1)
-    return np.concatenate([pose[:3, :3].ravel(), pose[:3, 3], focal, principal, size, view.centre, limits.ravel()])
+    return np.concatenate(
+        [pose[:3, :3].ravel(), pose[:3, 3], focal, principal, size, view.centre, limits.ravel()]
+    )
 
 
 @lru_cache(maxsize=64)
@@ -153,10 +181,15 @@ def _near_to_far(depths: np.ndarray) -> np.ndarray:
 
 
 def sort_into_tiles(camera: np.ndarray, all_records: np.ndarray, depths: np.ndarray) -> tuple:
-    """Tile lists: visible (M,) ids, records (M, 16) in depth order, offsets (M + 1,), ranks (P,), instances (P,), starts (tiles + 1,)."""
+    """Tile lists: visible (M,) ids, records (M, 16) in depth order, offsets (M + 1,), ranks (P,), instances
+    (P,), starts (tiles + 1,).
+    """
     width, height = int(camera[16]), int(camera[17])
     visible = np.flatnonzero(depths)
-    order, records = _near_to_far(depths[visible]), np.empty((len(visible), kernels_project.RECORD), np.float32)
+    order, records = (
+        _near_to_far(depths[visible]),
+        np.empty((len(visible), kernels_project.RECORD), np.float32),
+    )
     tiles = -(-width // kernels_bin.TILE) * -(-height // kernels_bin.TILE)
     histograms, starts = np.zeros((_BLOCKS, tiles), np.int32), np.empty(tiles + 1, np.int64)
     offsets = np.zeros(len(visible) + 1, np.int64)
@@ -172,19 +205,42 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, log_scales, quats, opacity_logits, sh, settings):
         camera, degree, geometry, background, radii, statistics = settings
-        arrays = [tensor.detach().contiguous().numpy() for tensor in (means, log_scales, quats, opacity_logits, sh)]
+        arrays = [
+            tensor.detach().contiguous().numpy() for tensor in (means, log_scales, quats, opacity_logits, sh)
+        ]
         count, width, height = len(means), int(camera[16]), int(camera[17])
-        all_records, depths = np.empty((count, kernels_project.RECORD), np.float32), np.zeros(count, np.float32)
+        all_records, depths = (
+            np.empty((count, kernels_project.RECORD), np.float32),
+            np.zeros(count, np.float32),
+        )
         chunks = interleaved(-(-count // kernels_project.CHUNK)) if count else np.empty(0, np.int64)
         kernels_project.project(*arrays, degree, camera, chunks, all_records, depths, radii.numpy())
         visible, records, offsets, ranks, instances, starts = sort_into_tiles(camera, all_records, depths)
         image = np.empty((kernels_raster.CHANNELS, height, width), np.float32)
         contributions, order = np.zeros((len(ranks), 2), np.float32), interleaved(len(starts) - 1)
-        kernels_raster.rasterise(records.reshape(-1), ranks, instances, starts, order, background, geometry, image, contributions)
-        kernels_raster.collect_contributions(visible, offsets, contributions, statistics.weight.numpy(), statistics.max_transmittance.numpy())
+        kernels_raster.rasterise(
+            records.reshape(-1), ranks, instances, starts, order, background, geometry, image, contributions
+        )
+        kernels_raster.collect_contributions(
+            visible, offsets, contributions, statistics.weight.numpy(), statistics.max_transmittance.numpy()
+        )
         outputs = [torch.from_numpy(image[planes]) for planes in (slice(0, 3), slice(3, 6), 6, 7)]
-        ctx.save_for_backward(means, log_scales, quats, opacity_logits, sh, *outputs)  # outputs too: autograd then refuses edits in place
-        ctx.frame = _Frame(camera, degree, geometry, background, records.reshape(-1), visible, offsets, ranks, instances, starts, order, image)
+        # outputs too: autograd then refuses edits in place
+        ctx.save_for_backward(means, log_scales, quats, opacity_logits, sh, *outputs)
+        ctx.frame = _Frame(
+            camera,
+            degree,
+            geometry,
+            background,
+            records.reshape(-1),
+            visible,
+            offsets,
+            ranks,
+            instances,
+            starts,
+            order,
+            image,
+        )
         ctx.statistics = statistics
         ctx.set_materialize_grads(False)
         return tuple(outputs)
@@ -196,17 +252,43 @@ class _Render(torch.autograd.Function):
         arrays = [tensor.detach().contiguous().numpy() for tensor in parameters]
         geometry = frame.geometry and not (grad_normal is None and grad_distance is None)
         size = frame.image.shape[1:]
-        image_gradients = [_plane_array(grad_color, (3, *size)), _plane_array(grad_normal, (3, *size) if geometry else (0, 0, 0)),
-                           _plane_array(grad_distance, size if geometry else (0, 0)), _plane_array(grad_alpha, size)]
+        image_gradients = [
+            _plane_array(grad_color, (3, *size)),
+            _plane_array(grad_normal, (3, *size) if geometry else (0, 0, 0)),
+            _plane_array(grad_distance, size if geometry else (0, 0)),
+            _plane_array(grad_alpha, size),
+        ]
         gradients = np.zeros(len(frame.ranks) * kernels_project.RECORD, np.float32)
-        kernels_unraster.rasterise_backward(frame.records, frame.ranks, frame.instances, frame.starts, frame.order, frame.background, geometry,
-                                            frame.image, *image_gradients, gradients)
+        kernels_unraster.rasterise_backward(
+            frame.records,
+            frame.ranks,
+            frame.instances,
+            frame.starts,
+            frame.order,
+            frame.background,
+            geometry,
+            frame.image,
+            *image_gradients,
+            gradients,
+        )
         outputs = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in parameters]
         kernels_backproject.project_backward(
-            frame.visible, frame.offsets, gradients.reshape(-1, kernels_project.RECORD), *arrays, frame.degree, frame.camera,
-            *(output.numpy() for output in outputs), statistics.gradient.numpy(), statistics.absolute_gradient.numpy())
+            frame.visible,
+            frame.offsets,
+            gradients.reshape(-1, kernels_project.RECORD),
+            *arrays,
+            frame.degree,
+            frame.camera,
+            *(output.numpy() for output in outputs),
+            statistics.gradient.numpy(),
+            statistics.absolute_gradient.numpy(),
+        )
         return *outputs, None
 
 
 def _plane_array(gradient: Tensor | None, shape: tuple[int, ...]) -> np.ndarray:
-    return np.zeros(shape, np.float32) if gradient is None or 0 in shape else gradient.detach().contiguous().numpy()
+    return (
+        np.zeros(shape, np.float32)
+        if gradient is None or 0 in shape
+        else gradient.detach().contiguous().numpy()
+    )

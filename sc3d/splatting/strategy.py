@@ -1,6 +1,8 @@
-"""Where Gaussians are added and removed during training: clone, split, prune, opacity reset, multi-view trim, under a cap.
+"""Where Gaussians are added and removed during training: clone, split, prune, opacity reset, multi-view trim,
+under a cap.
 
-Every change of the set is one gather, `RowAdam.take`: rows of parameters, of Adam's moments and of the statistics move together.
+Every change of the set is one gather, `RowAdam.take`: rows of parameters, of Adam's moments and of the
+statistics move together.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from sc3d.splatting.optimizer import RowAdam
 class Statistics:
     """What the views seen since the last densification say about each of N Gaussians.
 
-    gradient: (N,) sum of the loss' gradient norms by the image position, NDC units; absolute_gradient: (N,) the same of absolute values
+    gradient: (N,) sum of the loss' gradient norms by the image position, NDC units; absolute_gradient: (N,)
+        the same of absolute values
     count: (N,) views in which it was visible; radius: (N,) largest radius, px
     seen: (N,) views since the last pass over all views began in which it was hit with transmittance above 0.5
     inside: (N,) views since then in which it was visible at all
@@ -36,7 +39,13 @@ class Statistics:
         """Statistics of `size` Gaussians that no view has seen."""
         return cls(*(torch.zeros(size, device=device) for _ in fields(cls)))
 
-    def add(self, gradient: torch.Tensor, absolute_gradient: torch.Tensor, radius: torch.Tensor, max_transmittance: torch.Tensor) -> None:
+    def add(
+        self,
+        gradient: torch.Tensor,
+        absolute_gradient: torch.Tensor,
+        radius: torch.Tensor,
+        max_transmittance: torch.Tensor,
+    ) -> None:
         """Add one view's (N,) values; radius 0 = not visible."""
         visible = radius > 0
         self.gradient += torch.where(visible, gradient, 0)
@@ -97,13 +106,21 @@ def useless(gaussians: Gaussians, limits: DensifyLimits) -> torch.Tensor:
     with torch.no_grad():
         largest = gaussians.log_scales.amax(1).exp()
         finite = torch.isfinite(gaussians.means).all(1) & torch.isfinite(largest)
-        return (gaussians.opacities < limits.min_opacity) | (largest > limits.max_scale * limits.extent) | ~finite
+        return (
+            (gaussians.opacities < limits.min_opacity)
+            | (largest > limits.max_scale * limits.extent)
+            | ~finite
+        )
 
 
-def select(gaussians: Gaussians, statistics: Statistics, limits: DensifyLimits, room: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Which Gaussians to clone and which to split, at most `room` together: the largest gradients (relative to their thresholds) first.
+def select(
+    gaussians: Gaussians, statistics: Statistics, limits: DensifyLimits, room: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Which Gaussians to clone and which to split, at most `room` together: the largest gradients (relative
+    to their thresholds) first.
 
-    returns: two (N,) bool, disjoint. Clone: mean gradient over the threshold and small; split: the same and large, or mean absolute gradient
+    returns: two (N,) bool, disjoint. Clone: mean gradient over the threshold and small; split: the same and
+        large, or mean absolute gradient
         over its threshold and a large radius in the image.
     """
     views = statistics.count.clamp_min(1)
@@ -122,8 +139,15 @@ def select(gaussians: Gaussians, statistics: Statistics, limits: DensifyLimits, 
     return clones, splits
 
 
-def clone_and_split(optimiser: RowAdam, statistics: Statistics, clones: torch.Tensor, splits: torch.Tensor, generator: torch.Generator) -> None:
-    """Add a copy of each of `clones`; replace each of `splits` by two samples of itself with 1 / 1.6 of its scales.
+def clone_and_split(
+    optimiser: RowAdam,
+    statistics: Statistics,
+    clones: torch.Tensor,
+    splits: torch.Tensor,
+    generator: torch.Generator,
+) -> None:
+    """Add a copy of each of `clones`; replace each of `splits` by two samples of itself with 1 / 1.6 of its
+    scales.
 
     clones, splits: (N,) bool, disjoint. New Gaussians start without momentum.
     """
@@ -144,8 +168,12 @@ def clone_and_split(optimiser: RowAdam, statistics: Statistics, clones: torch.Te
         gaussians.log_scales[first:] -= math.log(1.6)
 
 
-def densify(optimiser: RowAdam, statistics: Statistics, limits: DensifyLimits, generator: torch.Generator) -> None:
-    """One round: prune, then clone and split what the statistics ask for as far as the cap leaves room; statistics start again."""
+def densify(
+    optimiser: RowAdam, statistics: Statistics, limits: DensifyLimits, generator: torch.Generator
+) -> None:
+    """One round: prune, then clone and split what the statistics ask for as far as the cap leaves room;
+    statistics start again.
+    """
     prune(optimiser, statistics, useless(current(optimiser), limits))
     gaussians = current(optimiser)
     room = limits.max_gaussians - len(gaussians)
@@ -158,7 +186,8 @@ def densify(optimiser: RowAdam, statistics: Statistics, limits: DensifyLimits, g
 
 
 def trim(optimiser: RowAdam, statistics: Statistics) -> None:
-    """Drop Gaussians that no view, or one of more than two that could, saw unoccluded during the last pass: hidden or floating ones.
+    """Drop Gaussians that no view, or one of more than two that could, saw unoccluded during the last pass:
+    hidden or floating ones.
 
     What only one or two photos contain, at the border of a flight, stays.
     """
@@ -166,7 +195,9 @@ def trim(optimiser: RowAdam, statistics: Statistics) -> None:
 
 
 def reset_opacity(optimiser: RowAdam, ceiling: float = 0.01) -> None:
-    """Lower all opacities to at most `ceiling` and forget their momentum: what no view needs does not come back."""
+    """Lower all opacities to at most `ceiling` and forget their momentum: what no view needs does not come
+    back.
+    """
     logits = optimiser.parameters["opacity_logits"]
     with torch.no_grad():
         logits.clamp_(max=math.log(ceiling / (1 - ceiling)))

@@ -44,16 +44,30 @@ class Trainer:
         self.test_views = settings.held_out(num_views)
         self.train_views = [index for index in range(num_views) if index not in self.test_views]
         if len(self.train_views) < 2:
-            raise InputError(f"{len(self.train_views)} photos to train on: at least 2 are needed (test_every holds {len(self.test_views)} out)")
+            raise InputError(
+                f"{len(self.train_views)} photos to train on: at least 2 are needed (test_every holds {len(self.test_views)} out)"
+            )
         self.generator = torch.Generator().manual_seed(settings.seed)
         used = data.subset(self.train_views)
         self.extent = scene_extent(used.views, data.points)
-        self.limits = DensifyLimits(self.extent, settings.max_gaussians, settings.gradient_threshold, settings.absolute_gradient_threshold)
+        self.limits = DensifyLimits(
+            self.extent,
+            settings.max_gaussians,
+            settings.gradient_threshold,
+            settings.absolute_gradient_threshold,
+        )
         centres = np.stack([view.centre for view in used.views])
-        neighbours = neighbour_views(used.tracks, np.asarray(data.points, np.float64), centres, settings.num_neighbours)
-        self.neighbours = {index: [self.train_views[other] for other in others] for index, others in zip(self.train_views, neighbours, strict=True)}
+        neighbours = neighbour_views(
+            used.tracks, np.asarray(data.points, np.float64), centres, settings.num_neighbours
+        )
+        self.neighbours = {
+            index: [self.train_views[other] for other in others]
+            for index, others in zip(self.train_views, neighbours, strict=True)
+        }
         self.optimiser = RowAdam(*self._initial(used, neighbours))
-        self.exposure = RowAdam({"exposure": torch.zeros(num_views, 2, requires_grad=True)}, {"exposure": 1e-3})
+        self.exposure = RowAdam(
+            {"exposure": torch.zeros(num_views, 2, requires_grad=True)}, {"exposure": 1e-3}
+        )
         self.num_initial = len(self.gaussians)
         self.statistics = Statistics.zeros(self.num_initial, self.device)
         self.iteration, self.queue, self.depths = 0, [], {}
@@ -72,13 +86,21 @@ class Trainer:
         return self.exposure.parameters["exposure"].detach().numpy().copy()
 
     def step(self) -> dict[str, float] | None:
-        """One photo: render, compare, update, and densify when it is time. Returns a log row every 50 iterations."""
+        """One photo: render, compare, update, and densify when it is time. Returns a log row every 50
+        iterations.
+        """
         index, iteration = self._next_view(), self.iteration
         view, target, mask = self._photo(index, self.settings.coarse(iteration))
         gaussians = self.gaussians
         # A different colour behind the surface each time: holes never pay off.
         background = torch.rand(3, generator=self.generator) if self.settings.random_background else None
-        rendering = render(gaussians, view, self.settings.active_sh_degree(iteration), background, self.settings.shapes_surface(iteration))
+        rendering = render(
+            gaussians,
+            view,
+            self.settings.active_sh_degree(iteration),
+            background,
+            self.settings.shapes_surface(iteration),
+        )
         image = rendering.color
         if self.settings.exposure:
             image = losses.apply_exposure(image, self.exposure.parameters["exposure"][index])
@@ -86,10 +108,14 @@ class Trainer:
             image = torch.where(mask[..., None], image, target)
         loss = image_loss(image, target, self.settings.ssim_weight)
         if self.settings.flatten_weight:
-            loss = loss + self.settings.flatten_weight * losses.flatten_loss(gaussians.log_scales, rendering.radii > 0, self.extent)
+            loss = loss + self.settings.flatten_weight * losses.flatten_loss(
+                gaussians.log_scales, rendering.radii > 0, self.extent
+            )
         if self.settings.shapes_surface(iteration):
             depth = unbiased_depth(rendering, view)
-            loss = loss + self._surface_terms(index, target, rendering, depth if mask is None else torch.where(mask, depth, 0))
+            loss = loss + self._surface_terms(
+                index, target, rendering, depth if mask is None else torch.where(mask, depth, 0)
+            )
         loss.backward()
         self._update(index, rendering)
         self.iteration += 1
@@ -98,17 +124,27 @@ class Trainer:
         return self._record(float(loss.detach()), psnr(image.detach()[used], target[used]))
 
     def evaluate(self) -> dict[str, float]:
-        """Mean PSNR (dB) and SSIM of the held-out views; their exposure is fitted to the photo if exposures are used."""
+        """Mean PSNR (dB) and SSIM of the held-out views; their exposure is fitted to the photo if exposures
+        are used.
+        """
         return held_out_scores(self.gaussians, self.data, self.settings)
 
     def save(self, path: Path) -> None:
         """Write everything the rest of the run depends on."""
         state = {
-            **self._identity(), "iteration": self.iteration, "queue": self.queue,
+            **self._identity(),
+            "iteration": self.iteration,
+            "queue": self.queue,
             "parameters": {name: tensor.detach() for name, tensor in self.optimiser.parameters.items()},
-            "optimiser": self.optimiser.state(), "exposure": self.exposure.parameters["exposure"].detach(),
-            "exposure_optimiser": self.exposure.state(), "statistics": vars(self.statistics), "depths": self.depths,
-            "generator": self.generator.get_state(), "log": self.log, "recent": self._recent, "seconds": self._elapsed(),
+            "optimiser": self.optimiser.state(),
+            "exposure": self.exposure.parameters["exposure"].detach(),
+            "exposure_optimiser": self.exposure.state(),
+            "statistics": vars(self.statistics),
+            "depths": self.depths,
+            "generator": self.generator.get_state(),
+            "log": self.log,
+            "recent": self._recent,
+            "seconds": self._elapsed(),
         }
         with atomic_path(path) as temporary:
             torch.save(state, temporary)
@@ -121,15 +157,21 @@ class Trainer:
             if matches:
                 check_state(state, self.optimiser.parameters, self.data.views, str(path))
         except Exception as error:  # torch raises many types for broken files
-            raise InputError(f"{path} is not a readable checkpoint ({type(error).__name__}): delete it to start over") from None
+            raise InputError(
+                f"{path} is not a readable checkpoint ({type(error).__name__}): delete it to start over"
+            ) from None
         if not matches:
             log.warning("%s was made with other settings or photos: starting over", path)
             return False
-        self.optimiser.parameters.update({name: tensor.to(self.device).requires_grad_() for name, tensor in state["parameters"].items()})
+        self.optimiser.parameters.update(
+            {name: tensor.to(self.device).requires_grad_() for name, tensor in state["parameters"].items()}
+        )
         self.optimiser.restore(state["optimiser"])
         self.exposure.parameters["exposure"] = state["exposure"].requires_grad_()
         self.exposure.restore(state["exposure_optimiser"])
-        self.statistics = Statistics(**{name: values.to(self.device) for name, values in state["statistics"].items()})
+        self.statistics = Statistics(
+            **{name: values.to(self.device) for name, values in state["statistics"].items()}
+        )
         self.depths = {index: depth.to(self.device) for index, depth in state["depths"].items()}
         self.iteration, self.queue, self.log = state["iteration"], state["queue"], state["log"]
         self.generator.set_state(state["generator"])
@@ -139,21 +181,34 @@ class Trainer:
     def _identity(self) -> dict[str, object]:
         """What must be the same for a checkpoint to fit."""
         views = [f"{view.name} {view.width}x{view.height}" for view in self.data.views]
-        return {"version": CHECKPOINT_VERSION, "settings": asdict(self.settings), "views": views, "num_points": len(self.data.points)}
+        return {
+            "version": CHECKPOINT_VERSION,
+            "settings": asdict(self.settings),
+            "views": views,
+            "num_points": len(self.data.points),
+        }
 
-    def _initial(self, data: TrainingData, neighbours: list[np.ndarray]) -> tuple[dict[str, torch.Tensor], dict[str, float | np.ndarray]]:
+    def _initial(
+        self, data: TrainingData, neighbours: list[np.ndarray]
+    ) -> tuple[dict[str, torch.Tensor], dict[str, float | np.ndarray]]:
         points, colors = np.asarray(data.points, np.float64), np.asarray(data.colors)
         if self.settings.fill:
             more = fill_points(data, neighbours, self.settings.max_gaussians // 4)
             points, colors = np.concatenate([points, more[0]]), np.concatenate([colors, more[1]])
         if len(points) > self.settings.max_gaussians:
-            chosen = torch.randperm(len(points), generator=self.generator)[: self.settings.max_gaussians].sort().values.numpy()
+            chosen = (
+                torch.randperm(len(points), generator=self.generator)[: self.settings.max_gaussians]
+                .sort()
+                .values.numpy()
+            )
             points, colors = points[chosen], colors[chosen]
         gaussians = Gaussians.from_points(points, colors, self.settings.sh_degree)
         sh_rates = np.full(3 * gaussians.sh.shape[1], 1.25e-4)
         sh_rates[:3] = 2.5e-3
         rates = {"means": 0.0, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 0.05, "sh": sh_rates}
-        return {name: tensor.to(self.device).requires_grad_() for name, tensor in gaussians.parameters().items()}, rates
+        return {
+            name: tensor.to(self.device).requires_grad_() for name, tensor in gaussians.parameters().items()
+        }, rates
 
     def _photo(self, index: int, halved: bool = False) -> tuple[View, torch.Tensor, torch.Tensor | None]:
         """`TrainingData.photo` on the device."""
@@ -166,8 +221,12 @@ class Trainer:
             self.queue = [self.train_views[position] for position in order.tolist()]
         return self.queue.pop()
 
-    def _surface_terms(self, index: int, target: torch.Tensor, rendering: Rendering, depth: torch.Tensor) -> torch.Tensor:
-        """Normal and multi-view terms against one random neighbour, whose depth is the one it had when it was trained on last."""
+    def _surface_terms(
+        self, index: int, target: torch.Tensor, rendering: Rendering, depth: torch.Tensor
+    ) -> torch.Tensor:
+        """Normal and multi-view terms against one random neighbour, whose depth is the one it had when it was
+        trained on last.
+        """
         settings, view, others = self.settings, self.data.views[index], self.neighbours[index]
         loss = settings.normal_weight * single_view_normal_loss(rendering, depth, view, target)
         self.depths[index] = torch.where(rendering.alpha > 0.5, depth, 0).detach()
@@ -175,7 +234,9 @@ class Trainer:
             other = others[int(torch.randint(len(others), (1,), generator=self.generator))]
             other_view, other_target, _ = self._photo(other)
             if other not in self.depths:
-                self.depths[other] = torch.from_numpy(depth_map(self.gaussians, other_view)[0]).to(self.device)
+                self.depths[other] = torch.from_numpy(depth_map(self.gaussians, other_view)[0]).to(
+                    self.device
+                )
             neighbour = Neighbour(other_view, losses.to_grey(other_target), self.depths[other])
             source, draw = (losses.to_grey(target), view), (settings.num_patches, self.generator)
             geometric, photometric = multi_view_losses(rendering, depth, source, neighbour, draw)
@@ -185,7 +246,9 @@ class Trainer:
     def _update(self, index: int, rendering: Rendering) -> None:
         """Adam steps, and the view's statistics."""
         statistics = rendering.statistics
-        self.statistics.add(statistics.gradient, statistics.absolute_gradient, rendering.radii, statistics.max_transmittance)
+        self.statistics.add(
+            statistics.gradient, statistics.absolute_gradient, rendering.radii, statistics.max_transmittance
+        )
         self.optimiser.rates["means"] = self.settings.position_rate(self.iteration, self.extent)
         self.optimiser.step()
         if self.settings.exposure:
@@ -200,7 +263,9 @@ class Trainer:
                 densify.trim(self.optimiser, self.statistics)
             self.statistics.start_pass()
         if settings.densifies(iteration, num_views):
-            limits = replace(self.limits, max_gaussians=settings.allowed_gaussians(iteration, self.num_initial))
+            limits = replace(
+                self.limits, max_gaussians=settings.allowed_gaussians(iteration, self.num_initial)
+            )
             densify.densify(self.optimiser, self.statistics, limits, self.generator)
         if settings.resets_opacity(iteration):
             densify.reset_opacity(self.optimiser)
@@ -211,7 +276,13 @@ class Trainer:
             return None
         loss, quality = np.mean(self._recent, axis=0).tolist()
         self._recent = []
-        row = {"iteration": self.iteration, "loss": loss, "psnr": quality, "num_gaussians": len(self.gaussians), "seconds": self._elapsed()}
+        row = {
+            "iteration": self.iteration,
+            "loss": loss,
+            "psnr": quality,
+            "num_gaussians": len(self.gaussians),
+            "seconds": self._elapsed(),
+        }
         self.log.append(row)
         return row
 
@@ -220,10 +291,11 @@ class Trainer:
 
 
 def scene_extent(views: list[View], points: np.ndarray) -> float:
-    """E, world units: 1.1 x the largest distance of a camera from their mean, but at least half the median distance to the points."""
+    """E, world units: 1.1 x the largest distance of a camera from their mean, but at least half the median
+    distance to the points.
+    """
     centres = np.stack([view.centre for view in views])
     middle = centres.mean(0)
     spread = np.linalg.norm(centres - middle, axis=1).max()
     distance = np.median(np.linalg.norm(np.asarray(points, np.float64) - middle, axis=1))
     return float(max(1.1 * spread, 0.5 * distance))
-

@@ -24,7 +24,14 @@ SOURCES = ("labels", "masks", "labels_near_edges", "labels_elsewhere")  # order 
 
 
 def inputs(scene: Scene, settings: Evaluate) -> list[Path]:
-    return [scene.sparse, scene.classes, scene.masks, scene.mesh, settings.truth or scene.truth, settings.labelled or scene.labelled]
+    return [
+        scene.sparse,
+        scene.classes,
+        scene.masks,
+        scene.mesh,
+        settings.truth or scene.truth,
+        settings.labelled or scene.labelled,
+    ]
 
 
 def outputs(scene: Scene, settings: Evaluate) -> list[Path]:
@@ -53,19 +60,36 @@ def run(scene: Scene, settings: Evaluate) -> dict[str, object]:
         mask = read_index_image(mask_files[view.name]) if view.name in mask_files else None
         pixels = _judged(surface, view, truth, settings.band)
         beliefs.append(pixels.reliability(labels.label, labels.confidence))
-        per_photo[view.name] = _confusions(pixels, labels.label, class_table.num_ids) | _masks(truth, mask, class_table.num_ids)
-    parts = {key: total((photo[key] for photo in per_photo.values() if key in photo), class_table.num_ids) for key in SOURCES}
-    totals = {key: confusion.summary(class_table) for key, confusion in parts.items() if key != "masks" or mask_files}
-    photos = {name: {key: confusion.summary(class_table) for key, confusion in confusions.items()} for name, confusions in per_photo.items()}
+        per_photo[view.name] = _confusions(pixels, labels.label, class_table.num_ids) | _masks(
+            truth, mask, class_table.num_ids
+        )
+    parts = {
+        key: total((photo[key] for photo in per_photo.values() if key in photo), class_table.num_ids)
+        for key in SOURCES
+    }
+    totals = {
+        key: confusion.summary(class_table)
+        for key, confusion in parts.items()
+        if key != "masks" or mask_files
+    }
+    photos = {
+        name: {key: confusion.summary(class_table) for key, confusion in confusions.items()}
+        for name, confusions in per_photo.items()
+    }
     believed = Reliability.total(beliefs).summary() if beliefs else {}
-    metrics = {"photos": [view.name for view in views], "classes": [entry.name for entry in class_table]} | totals
+    metrics = {
+        "photos": [view.name for view in views],
+        "classes": [entry.name for entry in class_table],
+    } | totals
     write_json(settings.output or scene.metrics, metrics | {"reliability": believed, "per_photo": photos})
     if isinstance(surface, TiledSurface):
         surface.parts.remove()
     return _summary(totals) | ({"calibration_error": round(believed["ece"], 4)} if believed else {})
 
 
-def _judged(surface: LabelledSurface | TiledSurface, view: View, truth: np.ndarray, band: float) -> JudgedPixels:
+def _judged(
+    surface: LabelledSurface | TiledSurface, view: View, truth: np.ndarray, band: float
+) -> JudgedPixels:
     """The pixels of a photo that have truth, and the cloud point that each shows."""
     rows, first = surface.rows(view, truth.shape[::-1], truth > 0)
     return JudgedPixels.of(truth, rows, depth_edge_band(first.range, band))
@@ -79,12 +103,18 @@ def _confusions(pixels: JudgedPixels, label: np.ndarray, num_ids: int) -> dict[s
 def _masks(truth: np.ndarray, mask: np.ndarray | None, num_ids: int) -> dict[str, Confusion]:
     if mask is None:
         return {}
-    return {"masks": Confusion.of(truth, cv2.resize(mask, truth.shape[::-1], interpolation=cv2.INTER_NEAREST), num_ids)}
+    return {
+        "masks": Confusion.of(
+            truth, cv2.resize(mask, truth.shape[::-1], interpolation=cv2.INTER_NEAREST), num_ids
+        )
+    }
 
 
 def _summary(totals: dict) -> dict[str, object]:
     rows = {}
     for key, figures in totals.items():
         classes = "  ".join(f"{name} {value:.1%}" for name, value in figures["iou"].items())
-        rows[key] = f"OA {figures['oa']:.1%}  mIoU {figures['miou']:.1%}  ({classes})  coverage {figures['coverage']:.1%}"
+        rows[key] = (
+            f"OA {figures['oa']:.1%}  mIoU {figures['miou']:.1%}  ({classes})  coverage {figures['coverage']:.1%}"
+        )
     return rows

@@ -9,13 +9,29 @@ from sc3d.georeferencing.georeference import georeference_path
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
 
-MODULES = {"masks": "masks", "laz": "laz", "clouds": "clouds", "splats": "splats", "spz": "spz", "orthophoto": "orthophoto", "objects": "objects",
-           "transforms": "transforms", "colmap-text": "colmap_text"}
+MODULES = {
+    "masks": "masks",
+    "laz": "laz",
+    "clouds": "clouds",
+    "splats": "splats",
+    "spz": "spz",
+    "orthophoto": "orthophoto",
+    "objects": "objects",
+    "transforms": "transforms",
+    "colmap-text": "colmap_text",
+}
 CAMERAS_ONLY = {"transforms", "colmap-text"}  # formats that hold no labels, and so need no class table
 
 
 def inputs(scene: Scene, settings: Export) -> list[Path]:
-    return [scene.sparse, scene.classes, scene.mesh, settings.labelled or scene.labelled, scene.gaussians, georeference_path(scene)]
+    return [
+        scene.sparse,
+        scene.classes,
+        scene.mesh,
+        settings.labelled or scene.labelled,
+        scene.gaussians,
+        georeference_path(scene),
+    ]
 
 
 def outputs(scene: Scene, settings: Export) -> list[Path]:

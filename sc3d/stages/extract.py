@@ -38,7 +38,9 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
     views = [undistorted(view.shifted(origin), settings.max_size) for view in model.views]
 
     def image(row: int) -> np.ndarray:
-        return resample(read_image(scene.photo(model.views[row].name)), model.views[row].shifted(origin), views[row])
+        return resample(
+            read_image(scene.photo(model.views[row].name)), model.views[row].shifted(origin), views[row]
+        )
 
     data = DepthViews(views, image, neighbour_views(model.tracks, model.points, centres), _depth_range(model))
     surfaces = extract_surface(gaussians, data, settings)
@@ -55,9 +57,15 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
 
 def _depth_range(model) -> tuple[float, float]:
     """0.7 times the 1st and 1.2 times the 99th percentile of the sparse points' depths."""
-    depths = [project(view, model.points[track])[1] for view, track in zip(model.views, model.tracks, strict=True) if len(track)]
+    depths = [
+        project(view, model.points[track])[1]
+        for view, track in zip(model.views, model.tracks, strict=True)
+        if len(track)
+    ]
     if not depths:
-        raise InputError("the COLMAP model has no tracks: sparse points with the photos that see them are needed")
+        raise InputError(
+            "the COLMAP model has no tracks: sparse points with the photos that see them are needed"
+        )
     near, far = np.quantile(np.concatenate(depths), [0.01, 0.99])
     return 0.7 * float(near), 1.2 * float(far)
 

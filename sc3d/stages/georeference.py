@@ -1,4 +1,6 @@
-"""georeference.json for a scene that has cameras: from the GPS of its photos, from options alone, or the present one with another CRS."""
+"""georeference.json for a scene that has cameras: from the GPS of its photos, from options alone, or the
+present one with another CRS.
+"""
 
 from __future__ import annotations
 
@@ -41,8 +43,12 @@ def run(scene: Scene, settings: Georeference) -> dict[str, object]:
         found = _from_photos(scene, settings)
     found = replace(found, altitude_offset=settings.altitude_offset)
     write_georeference(scene, found)
-    return {"epsg": found.epsg, "crs": found.crs.name, "world": "local ENU" if found.origin else f"CRS minus {list(found.offset)}",
-            "moved": found.is_moved} | ({"rms_to_gps_m": found.figures["gps"]["rms"]} if "gps" in found.figures else {})
+    return {
+        "epsg": found.epsg,
+        "crs": found.crs.name,
+        "world": "local ENU" if found.origin else f"CRS minus {list(found.offset)}",
+        "moved": found.is_moved,
+    } | ({"rms_to_gps_m": found.figures["gps"]["rms"]} if "gps" in found.figures else {})
 
 
 def _changed(present: Found, settings: Georeference) -> Found:
@@ -50,8 +56,10 @@ def _changed(present: Found, settings: Georeference) -> Found:
     if settings.epsg in (None, present.epsg):
         return present
     if present.origin is None:
-        raise InputError(f"the scene's own coordinates are EPSG:{present.epsg}: they cannot become EPSG:{settings.epsg} here, "
-                         "but `sc3d export --epsg` converts them")
+        raise InputError(
+            f"the scene's own coordinates are EPSG:{present.epsg}: they cannot become EPSG:{settings.epsg} here, "
+            "but `sc3d export --epsg` converts them"
+        )
     other = from_origin(present.origin, settings.epsg)
     return replace(present, epsg=other.epsg, offset=other.offset)
 
@@ -59,9 +67,19 @@ def _changed(present: Found, settings: Georeference) -> Found:
 def _from_photos(scene: Scene, settings: Georeference) -> Found:
     views = [view for view in scene.model.views if scene.photo(view.name).is_file()]
     if not views:
-        raise InputError(f"none of the photos is in {scene.images}: link their folder there, or pass --epsg and --offset")
+        raise InputError(
+            f"none of the photos is in {scene.images}: link their folder there, or pass --epsg and --offset"
+        )
     flight = read_flight(scene.images, [view.name for view in views])
-    found = find_georeference(flight, {view.name: view.centre for view in views}, scene.model.points, settings.epsg) if flight else None
+    found = (
+        find_georeference(
+            flight, {view.name: view.centre for view in views}, scene.model.points, settings.epsg
+        )
+        if flight
+        else None
+    )
     if found is None:
-        raise InputError(f"the photos in {scene.images} have no GPS that fits the cameras: pass --epsg and --offset if the scene is in a CRS")
+        raise InputError(
+            f"the photos in {scene.images} have no GPS that fits the cameras: pass --epsg and --offset if the scene is in a CRS"
+        )
     return found

@@ -44,12 +44,18 @@ def main(command: ImportCommand) -> None:
 
 def is_geometry(path: Path, settings: Import) -> bool:
     """Whether the project is a cloud or mesh alone, for a scene that has cameras or gets them otherwise."""
-    return settings.source == "cloud" or (settings.source == "auto" and path.is_file() and path.suffix.lower() in CLOUDS | MESHES
-                                          and not path.name.endswith("calibrated_camera_parameters.txt"))
+    return settings.source == "cloud" or (
+        settings.source == "auto"
+        and path.is_file()
+        and path.suffix.lower() in CLOUDS | MESHES
+        and not path.name.endswith("calibrated_camera_parameters.txt")
+    )
 
 
 def inputs(scene: Scene, settings: Import) -> list[Path]:
-    return list(settings.cloud) + ([] if settings.project in settings.cloud else project_files(settings.project, settings))
+    return list(settings.cloud) + (
+        [] if settings.project in settings.cloud else project_files(settings.project, settings)
+    )
 
 
 def outputs(scene: Scene, settings: Import) -> list[Path]:
@@ -68,21 +74,33 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
         views, georeference, figures = *_present(scene, geometries, settings), {}
         placed = _place(geometries, georeference, views, settings)
     else:
-        project, photos = locate_photos(near_origin(read_project(settings.project, settings), settings.epsg), settings.images)
+        project, photos = locate_photos(
+            near_origin(read_project(settings.project, settings), settings.epsg), settings.images
+        )
         _require_place_for_photos(scene, photos)
         placed = _place(geometries, project.georeference, project.views, settings)
-        georeference, figures = project.georeference, _write_project(scene, project, photos, [geometry for geometry, _ in placed.values()])
+        georeference, figures = (
+            project.georeference,
+            _write_project(scene, project, photos, [geometry for geometry, _ in placed.values()]),
+        )
         georeference_path(scene).unlink(missing_ok=True)
     if georeference is not None:
         write_georeference(scene, georeference)
     for geometry, _ in placed.values():
         write_geometry(scene.cloud if geometry.triangles is None else scene.mesh, to_open3d(geometry))
     figures |= {"epsg": georeference.epsg if georeference else None}
-    return figures | {f"{path.name}": f"{len(geometry.positions):,} points, read as {frame}" for path, (geometry, frame) in placed.items()}
+    return figures | {
+        f"{path.name}": f"{len(geometry.positions):,} points, read as {frame}"
+        for path, (geometry, frame) in placed.items()
+    }
 
 
-def _present(scene: Scene, geometries: dict[Path, Geometry], settings: Import) -> tuple[list[View], Georeference | None]:
-    """Cameras and place of a scene that is there; for one without cameras, a place near its first cloud if that states a CRS."""
+def _present(
+    scene: Scene, geometries: dict[Path, Geometry], settings: Import
+) -> tuple[list[View], Georeference | None]:
+    """Cameras and place of a scene that is there; for one without cameras, a place near its first cloud if
+    that states a CRS.
+    """
     has_cameras = any((scene.sparse / f"cameras{suffix}").exists() for suffix in (".bin", ".txt"))
     views, georeference = scene.model.views if has_cameras else [], read_georeference(scene)
     first = next(iter(geometries.values()))
@@ -92,37 +110,66 @@ def _present(scene: Scene, geometries: dict[Path, Geometry], settings: Import) -
     return views, georeference
 
 
-def _place(geometries: dict[Path, Geometry], georeference: Georeference | None, views: list[View], settings: Import) -> dict[Path, tuple[Geometry, str]]:
+def _place(
+    geometries: dict[Path, Geometry], georeference: Georeference | None, views: list[View], settings: Import
+) -> dict[Path, tuple[Geometry, str]]:
     """The geometries in the scene's world, each with what its coordinates were taken for."""
     placed = {}
     for path, geometry in geometries.items():
-        positions, frame = to_world(geometry.positions, geometry.epsg or settings.epsg, georeference, views, str(path))
+        positions, frame = to_world(
+            geometry.positions, geometry.epsg or settings.epsg, georeference, views, str(path)
+        )
         placed[path] = replace(geometry, positions=positions), frame
     return placed
 
 
-def _write_project(scene: Scene, project: Project, photos: Path | None, geometries: list[Geometry]) -> dict[str, object]:
+def _write_project(
+    scene: Scene, project: Project, photos: Path | None, geometries: list[Geometry]
+) -> dict[str, object]:
     """Write cameras and points, and link the photos; returns figures."""
-    points, colors, observations, told = project.points, project.colors, project.observations, "from the project"
+    points, colors, observations, told = (
+        project.points,
+        project.colors,
+        project.observations,
+        "from the project",
+    )
     if not len(points) and geometries:
         positions, told = geometries[0].positions, "drawn from the cloud, seen where they are nearest"
-        points, colors = sample(positions, np.full((len(positions), 3), 128, np.uint8) if geometries[0].colors is None else geometries[0].colors)
+        points, colors = sample(
+            positions,
+            np.full((len(positions), 3), 128, np.uint8)
+            if geometries[0].colors is None
+            else geometries[0].colors,
+        )
         observations = None
     if observations is None:
         points, colors = sample(points, colors)
-        observations, told = guess_observations(project.views, points), told.replace("from the project", "from the project, seen where they are nearest")
+        observations, told = (
+            guess_observations(project.views, points),
+            told.replace("from the project", "from the project, seen where they are nearest"),
+        )
     if project.model is not None and len(project.points):
         write_copy(scene.sparse, project)
     else:
         write_model(scene.sparse, project.views, points, colors, observations)
     if photos is not None:
         _link(photos, scene.images)
-    return {"program": project.program, "photos": len(project.views), "points": len(points), "points_are": told if len(points) else "none",
-            "images": str(photos.resolve()) if photos else "not found: link them to SCENE/images"} | project.notes
+    return {
+        "program": project.program,
+        "photos": len(project.views),
+        "points": len(points),
+        "points_are": told if len(points) else "none",
+        "images": str(photos.resolve()) if photos else "not found: link them to SCENE/images",
+    } | project.notes
 
 
 def _require_place_for_photos(scene: Scene, photos: Path | None) -> None:
-    if photos is not None and scene.images.exists() and not scene.images.is_symlink() and scene.images.resolve() != photos.resolve():
+    if (
+        photos is not None
+        and scene.images.exists()
+        and not scene.images.is_symlink()
+        and scene.images.resolve() != photos.resolve()
+    ):
         raise InputError(f"{scene.images} already holds other photos: choose another scene folder")
 
 

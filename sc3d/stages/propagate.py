@@ -37,16 +37,27 @@ def run(scene: Scene, settings: Propagate) -> dict[str, object]:
     cloud, seeds = read_labelled(path, "label")
     votes = read_votes(cloud)
     if settings.method == "map" and votes is None:
-        raise InputError(f"{path} has no votes, which --method map needs: run `sc3d label` again, or choose --method geometry")
+        raise InputError(
+            f"{path} has no votes, which --method map needs: run `sc3d label` again, or choose --method geometry"
+        )
     if not (seeds.label > 0).any():
-        raise InputError(f"{path} has no labelled point to start from: check that masks and cloud belong together, or lower --consensus in label")
+        raise InputError(
+            f"{path} has no labelled point to start from: check that masks and cloud belong together, or lower --consensus in label"
+        )
     points = cloud.point.positions.numpy().astype(np.float64)
     normals = cloud.point.normals.numpy()
     evidence = Evidence(points, seeds, votes, cloud.point.colors.numpy() if "colors" in cloud.point else None)
     labels = complete(evidence, normals, settings)
     write_geometry(settings.output or scene.labelled, with_labels(cloud, normals, labels))
     labelled = labels.label > 0
-    return _summary(Summary(len(labelled), int(labelled.sum()), int((labels.state == PROPAGATED).sum()), float(labels.confidence[labelled].sum(dtype=np.float64))))
+    return _summary(
+        Summary(
+            len(labelled),
+            int(labelled.sum()),
+            int((labels.state == PROPAGATED).sum()),
+            float(labels.confidence[labelled].sum(dtype=np.float64)),
+        )
+    )
 
 
 def _summary(found: Summary) -> dict[str, object]:

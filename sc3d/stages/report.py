@@ -10,7 +10,16 @@ from sc3d.settings.outputs import Report
 
 
 def inputs(scene: Scene, settings: Report) -> list[Path]:
-    return [scene.labelled, scene.metrics, scene.sparse, scene.masks, scene.classes, scene.mesh, scene.images, scene.path / "train.jpg"]
+    return [
+        scene.labelled,
+        scene.metrics,
+        scene.sparse,
+        scene.masks,
+        scene.classes,
+        scene.mesh,
+        scene.images,
+        scene.path / "train.jpg",
+    ]
 
 
 def outputs(scene: Scene, settings: Report) -> list[Path]:

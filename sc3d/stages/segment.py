@@ -32,7 +32,11 @@ def inputs(scene: Scene, settings: Segment) -> list[Path]:
     given = [path for path in (settings.masks, settings.confidence, settings.mapping) if path is not None]
     if settings.backend == "files":
         return [scene.classes, *given]
-    return [scene.classes, scene.images, *([settings.strokes or scene.strokes] if settings.backend == "strokes" else [])]
+    return [
+        scene.classes,
+        scene.images,
+        *([settings.strokes or scene.strokes] if settings.backend == "strokes" else []),
+    ]
 
 
 def outputs(scene: Scene, settings: Segment) -> list[Path]:
@@ -51,7 +55,8 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
     class_table = with_prompts(class_table, settings.prompts)
     segmenter = _segmenter(scene, settings, class_table)
     folders = Folders(scene.masks, scene.confidence, scene.instances)
-    # Masks of an interrupted run are gone on with if they were made with the same settings; others are set aside.
+    # Masks of an interrupted run are gone on with if they were made with the same settings; others are set
+    # aside.
     marker, state = scene.path / "segment.unfinished.json", _state(scene, settings, class_table)
     unfinished = marker.exists()
     if unfinished and read_json(marker) == state:
@@ -63,21 +68,32 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
     summary = segment_photos(find_photos(scene.images), folders, segmenter, class_table)
     marker.unlink()
     pixels = {class_table.name(label): int(count) for label, count in enumerate(summary.num_pixels) if count}
-    figures = {"segmented": len(summary.segmented), "already_there": len(summary.skipped), "instances": summary.num_instances}
+    figures = {
+        "segmented": len(summary.segmented),
+        "already_there": len(summary.skipped),
+        "instances": summary.num_instances,
+    }
     return figures | {f"pixels_{name}": count for name, count in pixels.items()}
 
 
 def _state(scene: Scene, settings: Segment, class_table: ClassTable) -> object:
-    """What decides the masks, as JSON: everything but where the models lie and run. Photos are told by size and time, as they are read often."""
+    """What decides the masks, as JSON: everything but where the models lie and run. Photos are told by size
+    and time, as they are read often.
+    """
     decisive = replace(settings, device="auto", download=False, model_dir=None)
     strokes = digest(settings.strokes or scene.strokes) if settings.backend == "strokes" else ""
-    photos = [(str(photo.relative_to(scene.images)), photo.stat().st_size, photo.stat().st_mtime_ns) for photo in find_photos(scene.images)]
+    photos = [
+        (str(photo.relative_to(scene.images)), photo.stat().st_size, photo.stat().st_mtime_ns)
+        for photo in find_photos(scene.images)
+    ]
     seen = hashlib.blake2b(repr(photos).encode(), digest_size=16).hexdigest()
     return json.loads(json.dumps([repr(decisive), class_table.as_json(), strokes, seen]))
 
 
 def _set_aside(folders: Folders, suffix: str) -> None:
-    """Older masks may hold somebody's work: they become `<folder>.<suffix>`, in place of still older ones. Goes on where it was interrupted."""
+    """Older masks may hold somebody's work: they become `<folder>.<suffix>`, in place of still older ones.
+    Goes on where it was interrupted.
+    """
     for folder in (folders.masks, folders.confidence, folders.instances):
         aside = folder.with_name(f"{folder.name}.{suffix}")
         if folder.is_dir():
@@ -106,9 +122,13 @@ def with_prompts(class_table: ClassTable, prompts: tuple[str, ...]) -> ClassTabl
     for prompt in prompts:
         name, separator, values = prompt.partition("=")
         if not separator or name not in {entry.name for entry in class_table} or not values.strip():
-            raise InputError(f"--prompts {prompt!r} must be NAME=text,text with a class name of {[entry.name for entry in class_table]}")
+            raise InputError(
+                f"--prompts {prompt!r} must be NAME=text,text with a class name of {[entry.name for entry in class_table]}"
+            )
         texts[name] = tuple(value.strip() for value in values.split(",") if value.strip())
-    return ClassTable(tuple(replace(entry, prompts=texts.get(entry.name, entry.prompts)) for entry in class_table))
+    return ClassTable(
+        tuple(replace(entry, prompts=texts.get(entry.name, entry.prompts)) for entry in class_table)
+    )
 
 
 def _refine(scene: Scene, settings: Segment) -> dict[str, object]:
@@ -117,7 +137,9 @@ def _refine(scene: Scene, settings: Segment) -> dict[str, object]:
     from sc3d.segmentation.mask_refinement import material_of, refine
 
     if settings.backend != "files" or settings.masks is not None:
-        raise InputError("--refine works on the masks that are in the scene: make them first, then run `sc3d segment SCENE --refine`")
+        raise InputError(
+            "--refine works on the masks that are in the scene: make them first, then run `sc3d segment SCENE --refine`"
+        )
     masks = Masks.of(scene, scene.confidence)
     refinement = refine(material_of(scene, masks), masks.views, masks.read)
     if refinement.helps:
@@ -127,7 +149,11 @@ def _refine(scene: Scene, settings: Segment) -> dict[str, object]:
                 write_image(folder / f"{Path(view.name).stem}.png", refinement.confidence(view, masks.read))
     else:
         discard(scene.confidence_refined)
-    return {"agreement_before": f"{refinement.before:.2%}", "agreement_after": f"{refinement.after:.2%}", "kept": refinement.helps}
+    return {
+        "agreement_before": f"{refinement.before:.2%}",
+        "agreement_after": f"{refinement.after:.2%}",
+        "kept": refinement.helps,
+    }
 
 
 def _import(scene: Scene, settings: Segment, class_table: ClassTable) -> dict[str, object]:
@@ -138,7 +164,9 @@ def _import(scene: Scene, settings: Segment, class_table: ClassTable) -> dict[st
         if settings.mapping is not None or settings.format not in ("auto", "index"):
             raise InputError("--mapping and --format say how to read --masks, which is missing")
         if not scene.masks.is_dir():
-            raise InputError("--masks FOLDER is needed (or --backend grounded-sam, which makes masks from the prompts in classes.json)")
+            raise InputError(
+                "--masks FOLDER is needed (or --backend grounded-sam, which makes masks from the prompts in classes.json)"
+            )
         return {"masks": len(scene.mask_files(scene.masks, class_table)), "source": "already in the scene"}
     source, sizes = MaskFiles(settings.masks, settings.format, settings.mapping), photo_sizes(scene.images)
     names = import_masks(source, scene.masks, sizes, class_table, settings.confidence, scene.confidence)

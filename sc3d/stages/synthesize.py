@@ -16,7 +16,16 @@ def inputs(scene: Scene, settings: Synthesize) -> list[Path]:
 
 
 def outputs(scene: Scene, settings: Synthesize) -> list[Path]:
-    return [scene.images, scene.path / "depth", scene.truth, scene.masks, scene.confidence, scene.sparse, scene.classes, scene.path / "truth.ply"]
+    return [
+        scene.images,
+        scene.path / "depth",
+        scene.truth,
+        scene.masks,
+        scene.confidence,
+        scene.sparse,
+        scene.classes,
+        scene.path / "truth.ply",
+    ]
 
 
 def run(scene: Scene, settings: Synthesize) -> dict[str, object]:

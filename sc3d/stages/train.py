@@ -33,24 +33,39 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
         pick_device(settings.device)  # complain before the work begins
     check_photos(scene, [view.name for view in scene.model.views])
     if len(scene.model.points) < 10:
-        raise InputError(f"{scene.sparse} has {len(scene.model.points)} sparse points, too few to start from: run `sc3d reconstruct` with more overlap")
+        raise InputError(
+            f"{scene.sparse} has {len(scene.model.points)} sparse points, too few to start from: run `sc3d reconstruct` with more overlap"
+        )
     data, origin = scene_data(scene, settings.training)
     unfinished = _unfinished(scene, settings)
     if in_blocks:
         result, summary = _train_blocks(scene, settings, data, unfinished)
     else:
-        result, summary = train(data, settings.training, unfinished if settings.checkpoint_every else None), {}
+        result, summary = (
+            train(data, settings.training, unfinished if settings.checkpoint_every else None),
+            {},
+        )
     result.gaussians.save(scene.gaussians, [f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}"])
     write_log(result.log, scene.path / "train.csv")
     write_training_sheet(scene.path / "train.jpg", result, data, settings.training)
     remove(unfinished)
     last = result.log[-1] if result.log else {}
     held_out = {f"held_out_{name}": round(value, 3) for name, value in result.metrics.items()}
-    return {"photos": len(data.views), "size": f"{data.views[0].width}x{data.views[0].height}", "gaussians": len(result.gaussians)} | {
-        "psnr": round(last.get("psnr", float("nan")), 2)} | held_out | summary
+    return (
+        {
+            "photos": len(data.views),
+            "size": f"{data.views[0].width}x{data.views[0].height}",
+            "gaussians": len(result.gaussians),
+        }
+        | {"psnr": round(last.get("psnr", float("nan")), 2)}
+        | held_out
+        | summary
+    )
 
 
-def _train_blocks(scene: Scene, settings: Train, data: TrainingData, folder: Path) -> tuple[TrainResult, dict[str, object]]:
+def _train_blocks(
+    scene: Scene, settings: Train, data: TrainingData, folder: Path
+) -> tuple[TrainResult, dict[str, object]]:
     blocks = tuple(split_blocks(data.points, settings.blocks))
     here = not settings.workers and not settings.cluster
     job = BlockJob(scene.path.absolute(), settings.training, blocks, folder.absolute(), progress=here)
@@ -59,10 +74,15 @@ def _train_blocks(scene: Scene, settings: Train, data: TrainingData, folder: Pat
 
 
 def _unfinished(scene: Scene, settings: Train) -> Path:
-    """Where this run's checkpoint lies, or the folder of its blocks; those of other settings, photos or cameras are removed."""
+    """Where this run's checkpoint lies, or the folder of its blocks; those of other settings, photos or
+    cameras are removed.
+    """
     blocks = settings.blocks if settings.blocks > 1 else 0
     state = repr((settings.training, blocks, digest(scene.images), digest(scene.sparse)))
-    mine = scene.path / f"train.{hashlib.blake2b(state.encode(), digest_size=8).hexdigest()}.{'blocks' if blocks else 'checkpoint'}"
+    mine = (
+        scene.path
+        / f"train.{hashlib.blake2b(state.encode(), digest_size=8).hexdigest()}.{'blocks' if blocks else 'checkpoint'}"
+    )
     for other in [*scene.path.glob("train.*.checkpoint"), *scene.path.glob("train.*.blocks")]:
         if other != mine:
             remove(other)

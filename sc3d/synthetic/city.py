@@ -1,4 +1,6 @@
-"""A synthetic city: sites of the generator side by side, made one after the other, so that no cloud of more than one site is ever in memory."""
+"""A synthetic city: sites of the generator side by side, made one after the other, so that no cloud of more
+than one site is ever in memory.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +27,17 @@ from sc3d.synthetic.mesh import OTHER
 from sc3d.synthetic.shading import surface_labels
 from sc3d.synthetic.world import World, build_world, ray_tensor
 
-OFFSET = np.array([500_000.0, 5_500_000.0, 0.0])  # of the city's middle in the world, m: coordinates of the size of UTM's
+# of the city's middle in the world, m: coordinates of the size of UTM's
+OFFSET = np.array([500_000.0, 5_500_000.0, 0.0])
 EXTENT = 120.0  # side of a site, m; a multiple of 15 m, so that cells of the ground end at its edges
 RAYS = 1 << 19  # cast at a time
 
 
 @dataclass(frozen=True)
 class Site:
-    """One site. number: from 0, row by row from the south-west; middle: (3,) float64 in the city's frame, whose origin is the city's middle."""
+    """One site. number: from 0, row by row from the south-west; middle: (3,) float64 in the city's frame,
+    whose origin is the city's middle.
+    """
 
     number: int
     middle: np.ndarray
@@ -40,14 +45,18 @@ class Site:
 
     @property
     def own(self) -> np.ndarray:
-        """(K,) triangles of the world that reach into the site; the others are its surroundings, which a city replaces by other sites."""
+        """(K,) triangles of the world that reach into the site; the others are its surroundings, which a city
+        replaces by other sites.
+        """
         low, high = self.world.corners[:, :, :2].min(1), self.world.corners[:, :, :2].max(1)
         return np.flatnonzero(((low < EXTENT / 2) & (high > -EXTENT / 2)).all(1))
 
 
 @dataclass
 class City:
-    """What rays need of all sites: `scene` in the city's frame, whose geometry ids are the numbers of `sites`."""
+    """What rays need of all sites: `scene` in the city's frame, whose geometry ids are the numbers of
+    `sites`.
+    """
 
     scene: o3d.t.geometry.RaycastingScene
     sites: list[SiteLabels]
@@ -56,20 +65,30 @@ class City:
         """Append the next site."""
         own = site.own
         corners = (site.world.corners[own] + site.middle).astype(np.float32).reshape(-1, 3)
-        self.scene.add_triangles(o3d.core.Tensor(corners), o3d.core.Tensor(np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)))
+        self.scene.add_triangles(
+            o3d.core.Tensor(corners), o3d.core.Tensor(np.arange(len(corners), dtype=np.uint32).reshape(-1, 3))
+        )
         ground = site.world.ground
-        self.sites.append(SiteLabels(site.middle, site.world.ints[own], ground.half, ground.rasters, ground.rects))
+        self.sites.append(
+            SiteLabels(site.middle, site.world.ints[own], ground.half, ground.rasters, ground.rects)
+        )
 
     def label(self, view: View) -> np.ndarray:
-        """(H, W) uint8 true label of the pixels of a view in the city's frame; 0 = other objects, nothing there."""
+        """(H, W) uint8 true label of the pixels of a view in the city's frame; 0 = other objects, nothing
+        there.
+        """
         band = max(1, RAYS // view.width)
-        parts = [self._label_rows(view, row, min(row + band, view.height)) for row in range(0, view.height, band)]
+        parts = [
+            self._label_rows(view, row, min(row + band, view.height)) for row in range(0, view.height, band)
+        ]
         return np.concatenate(parts).reshape(view.height, view.width)
 
     def _label_rows(self, view: View, first: int, last: int) -> np.ndarray:
         directions, _ = rays(view, pixel_centres(view.width, last - first) + [0.0, first])
         hits = self.scene.cast_rays(ray_tensor(np.broadcast_to(view.centre, directions.shape), directions))
-        distance, triangles, numbers = (hits[name].numpy() for name in ("t_hit", "primitive_ids", "geometry_ids"))
+        distance, triangles, numbers = (
+            hits[name].numpy() for name in ("t_hit", "primitive_ids", "geometry_ids")
+        )
         label = np.full(len(directions), OTHER, np.uint8)
         for number in np.unique(numbers[np.isfinite(distance)]):
             rows = np.flatnonzero(numbers == number)
@@ -80,7 +99,9 @@ class City:
 
 @dataclass(frozen=True)
 class SiteLabels:
-    """What tells the label of a place on a site: (3,) middle; (K, 3) material, label and object of its triangles; the plan of its ground."""
+    """What tells the label of a place on a site: (3,) middle; (K, 3) material, label and object of its
+    triangles; the plan of its ground.
+    """
 
     middle: np.ndarray
     ints: np.ndarray
@@ -98,21 +119,36 @@ def make_sites(settings: SynthesizeCity) -> Iterator[Site]:
     """The sites, each built when it is asked for; level at their edges, so that they meet."""
     columns, rows = settings.sites
     for number in range(columns * rows):
-        middle = np.array([(number % columns - (columns - 1) / 2) * EXTENT, (number // columns - (rows - 1) / 2) * EXTENT, 0.0])
-        yield Site(number, middle, build_world(Synthesize(seed=1000 * settings.seed + number, extent=EXTENT), level_edges=True))
+        middle = np.array(
+            [
+                (number % columns - (columns - 1) / 2) * EXTENT,
+                (number // columns - (rows - 1) / 2) * EXTENT,
+                0.0,
+            ]
+        )
+        yield Site(
+            number,
+            middle,
+            build_world(Synthesize(seed=1000 * settings.seed + number, extent=EXTENT), level_edges=True),
+        )
 
 
 def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
-    """Write cloud.ply (a link to truth.ply, which has the true labels), mesh.ply, sparse/0, truth/, masks/, confidence/ and classes.json.
+    """Write cloud.ply (a link to truth.ply, which has the true labels), mesh.ply, sparse/0, truth/, masks/,
+    confidence/ and classes.json.
 
     returns: points, views, triangles, mask_accuracy (over pixels with truth != 0)
     """
     scene, city = Scene(settings.scene), City(o3d.t.geometry.RaycastingScene(), [])
     columns, rows = settings.sites
     with ExitStack() as files:
-        cloud = files.enter_context(open_cloud(scene.path / "truth.ply", columns * rows * settings.points_per_site))
+        cloud = files.enter_context(
+            open_cloud(scene.path / "truth.ply", columns * rows * settings.points_per_site)
+        )
         mesh = files.enter_context(open_mesh(scene.mesh))
-        for site in tqdm(make_sites(settings), total=columns * rows, desc="building", unit="site", disable=None):
+        for site in tqdm(
+            make_sites(settings), total=columns * rows, desc="building", unit="site", disable=None
+        ):
             _write_site(site, settings, cloud, mesh)
             city.add(site)
     views = fly_over((columns * EXTENT, rows * EXTENT), settings)
@@ -124,14 +160,21 @@ def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
 
 
 def _write_site(site: Site, settings: SynthesizeCity, cloud: CloudFile, mesh: MeshFile) -> None:
-    made = truth_cloud(site.world, settings.points_per_site, np.random.default_rng([settings.seed, 5, site.number]))
+    made = truth_cloud(
+        site.world, settings.points_per_site, np.random.default_rng([settings.seed, 5, site.number])
+    )
     names = ("normals", "colors", "label")
-    cloud.append(made.point.positions.numpy() + site.middle + OFFSET, **{name: made.point[name].numpy() for name in names})
+    cloud.append(
+        made.point.positions.numpy() + site.middle + OFFSET,
+        **{name: made.point[name].numpy() for name in names},
+    )
     mesh.append(site.world.corners[site.own].astype(np.float64) + site.middle + OFFSET)
 
 
 def _write_masks(scene: Scene, city: City, views: list[View], seed: int) -> float:
-    """True and noisy masks of all views; returns the share of the labelled pixels that the noisy ones have right."""
+    """True and noisy masks of all views; returns the share of the labelled pixels that the noisy ones have
+    right.
+    """
     right = labelled = 0
     for number, view in enumerate(tqdm(views, desc="masks", unit="view", disable=None)):
         truth = city.label(view)

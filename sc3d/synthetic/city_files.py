@@ -1,4 +1,6 @@
-"""Files of a city, written piece by piece: clouds and meshes as PLY in the dialect of Open3D, cameras as a COLMAP model."""
+"""Files of a city, written piece by piece: clouds and meshes as PLY in the dialect of Open3D, cameras as a
+COLMAP model.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,20 @@ from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
 from sc3d.synthetic.flight import camera_in_model
 
-CLOUD = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"),
-                  ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("label", "u1")])
+CLOUD = np.dtype(
+    [
+        ("x", "<f8"),
+        ("y", "<f8"),
+        ("z", "<f8"),
+        ("nx", "<f4"),
+        ("ny", "<f4"),
+        ("nz", "<f4"),
+        ("red", "u1"),
+        ("green", "u1"),
+        ("blue", "u1"),
+        ("label", "u1"),
+    ]
+)
 VERTEX = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8")])
 FACE = np.dtype([("count", "u1"), ("corners", "<u4", 3)])
 NAMES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
@@ -31,10 +45,14 @@ class CloudFile:
     stream: BinaryIO
     rows: int = 0
 
-    def append(self, positions: np.ndarray, normals: np.ndarray, colors: np.ndarray, label: np.ndarray) -> None:
+    def append(
+        self, positions: np.ndarray, normals: np.ndarray, colors: np.ndarray, label: np.ndarray
+    ) -> None:
         """positions: (N, 3) float64; normals: (N, 3) float32; colors: (N, 3) uint8; label: (N, 1) uint8."""
         table = np.empty(len(positions), CLOUD)
-        for name, column in zip(CLOUD.names, [*positions.T, *normals.T, *colors.T, label.ravel()], strict=True):
+        for name, column in zip(
+            CLOUD.names, [*positions.T, *normals.T, *colors.T, label.ravel()], strict=True
+        ):
             table[name] = column
         self.stream.write(table.tobytes())
         self.rows += len(table)
@@ -78,7 +96,12 @@ def open_mesh(path: Path) -> Iterator[MeshFile]:
             faces["count"], faces["corners"] = 3, 3 * numbers[:, None] + np.arange(3)
             stream.write(faces.tobytes())
         stream.seek(0)
-        elements = [f"element vertex {3 * mesh.triangles}", *_properties(VERTEX), f"element face {mesh.triangles}", "property list uchar uint vertex_indices"]
+        elements = [
+            f"element vertex {3 * mesh.triangles}",
+            *_properties(VERTEX),
+            f"element face {mesh.triangles}",
+            "property list uchar uint vertex_indices",
+        ]
         stream.write(_header(elements, ROOM))
 
 

@@ -16,7 +16,8 @@ LIFT = 0.002  # rays start this far off the surface, m
 def truth_cloud(world: World, num_points: int, rng: np.random.Generator) -> o3d.t.geometry.PointCloud:
     """Area-uniform samples of every surface of the site that shows from some direction above the horizon.
 
-    returns: `num_points` points: positions float64 (world, m), normals float32 (outward), colors uint8, label uint8 (0 = cars, walls)
+    returns: `num_points` points: positions float64 (world, m), normals float32 (outward), colors uint8, label
+        uint8 (0 = cars, walls)
     """
     points, triangles = sample_surface(world, num_points, rng)
     light = world.light(points.astype(np.float32), triangles, np.full(len(points), 0.1, np.float32))
@@ -30,7 +31,9 @@ def truth_cloud(world: World, num_points: int, rng: np.random.Generator) -> o3d.
 def sample_surface(world: World, num_points: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """(N, 3) float64 points uniform over the outer surfaces of the site, and their triangles (N,)."""
     corners = world.corners.astype(np.float64)
-    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    areas = 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     near = np.abs(corners[:, :, :2]).min(1).max(1) <= world.ground.extent / 2
     share = np.cumsum(np.where(near, areas, 0.0))
     found_points, found_triangles, missing = [], [], num_points
@@ -48,37 +51,56 @@ def sample_surface(world: World, num_points: int, rng: np.random.Generator) -> t
     return np.concatenate(found_points)[:num_points], np.concatenate(found_triangles)[:num_points]
 
 
-def find_tracks(world: World, views: list[View], num_points: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, list]:
+def find_tracks(
+    world: World, views: list[View], num_points: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, list]:
     """True sparse points seen by at least three views.
 
-    returns: (P, 3) points; (P,) triangles; per view the indices (K,) of the points it sees and their pixels (K, 2)
+    returns: (P, 3) points; (P,) triangles; per view the indices (K,) of the points it sees and their pixels
+        (K, 2)
     """
     points, triangles = sample_surface(world, num_points, rng)
     seen, pixels = [], []
     for view in views:
         at, _ = project(view, points)
         inside = np.flatnonzero(in_image(view, at))
-        clear = ~world.hidden(np.broadcast_to(view.centre, (len(inside), 3)), points[inside] - view.centre, far=0.9998)
+        clear = ~world.hidden(
+            np.broadcast_to(view.centre, (len(inside), 3)), points[inside] - view.centre, far=0.9998
+        )
         seen.append(inside[clear])
         pixels.append(at[inside[clear]])
     counts = np.bincount(np.concatenate(seen), minlength=len(points))
     rank = np.cumsum(counts >= 3) - 1
-    observations = [(rank[index[counts[index] >= 3]], at[counts[index] >= 3]) for index, at in zip(seen, pixels)]
+    observations = [
+        (rank[index[counts[index] >= 3]], at[counts[index] >= 3]) for index, at in zip(seen, pixels)
+    ]
     return points[counts >= 3], triangles[counts >= 3], observations
 
 
 def _seen_from_above(world: World, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """(N,) bool: something above can see the point: straight up, or one of 24 directions 60, 40 and 20 degrees above the horizon."""
+    """(N,) bool: something above can see the point: straight up, or one of 24 directions 60, 40 and 20
+    degrees above the horizon.
+    """
     normals = world.normals(triangles)
     leaf = world.ints[triangles, 0] == LEAF  # seen from both sides
     visible = np.zeros(len(points), bool)
     directions = [np.array([0.0, 0.0, 1.0])]
     for turn, elevation in enumerate(np.radians([60, 40, 20])):
         for azimuth in 2 * np.pi * (np.arange(8) + turn / 3) / 8:
-            directions.append(np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]))
+            directions.append(
+                np.array(
+                    [
+                        np.cos(azimuth) * np.cos(elevation),
+                        np.sin(azimuth) * np.cos(elevation),
+                        np.sin(elevation),
+                    ]
+                )
+            )
     for direction in directions:
         facing = leaf | (normals @ direction > 0.02)
         rest = np.flatnonzero(~visible & facing)
         if len(rest):
-            visible[rest] = ~world.hidden(points[rest] + LIFT * direction, np.broadcast_to(direction, (len(rest), 3)))
+            visible[rest] = ~world.hidden(
+                points[rest] + LIFT * direction, np.broadcast_to(direction, (len(rest), 3))
+            )
     return visible

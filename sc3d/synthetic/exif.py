@@ -10,7 +10,8 @@ from PIL.TiffImagePlugin import IFDRational
 
 from sc3d.synthetic.flight import FOCAL_35MM
 
-REFERENCE = (-37.9042, 144.9886, 20.0)  # latitude, longitude (degrees) and ellipsoid height (m) of the world's origin; x east, y north
+# latitude, longitude (degrees) and ellipsoid height (m) of the world's origin; x east, y north
+REFERENCE = (-37.9042, 144.9886, 20.0)
 
 
 def geodetic(centres: np.ndarray) -> np.ndarray:
@@ -28,9 +29,18 @@ def drone_exif(position: np.ndarray, number: int) -> Image.Exif:
     detail[Base.DateTimeOriginal] = f"2025:06:21 11:{number * 3 // 60 % 60:02d}:{number * 3 % 60:02d}"
     gps = exif.get_ifd(IFD.GPSInfo)
     gps[GPS.GPSVersionID] = b"\x02\x03\x00\x00"
-    gps[GPS.GPSLatitudeRef], gps[GPS.GPSLatitude] = "N" if position[0] >= 0 else "S", _sexagesimal(position[0])
-    gps[GPS.GPSLongitudeRef], gps[GPS.GPSLongitude] = "E" if position[1] >= 0 else "W", _sexagesimal(position[1])
-    gps[GPS.GPSAltitudeRef], gps[GPS.GPSAltitude] = b"\x00" if position[2] >= 0 else b"\x01", IFDRational(round(abs(position[2]) * 1000), 1000)
+    gps[GPS.GPSLatitudeRef], gps[GPS.GPSLatitude] = (
+        "N" if position[0] >= 0 else "S",
+        _sexagesimal(position[0]),
+    )
+    gps[GPS.GPSLongitudeRef], gps[GPS.GPSLongitude] = (
+        "E" if position[1] >= 0 else "W",
+        _sexagesimal(position[1]),
+    )
+    gps[GPS.GPSAltitudeRef], gps[GPS.GPSAltitude] = (
+        b"\x00" if position[2] >= 0 else b"\x01",
+        IFDRational(round(abs(position[2]) * 1000), 1000),
+    )
     return exif
 
 

@@ -17,14 +17,20 @@ def focal_length(width: int, height: int) -> float:
 
 
 def fly(settings: Synthesize) -> list[View]:
-    """True cameras, `settings.views` of them: names view_000.jpg ..., pinhole, world = site centre, z up, metres."""
+    """True cameras, `settings.views` of them: names view_000.jpg ..., pinhole, world = site centre, z up,
+    metres.
+    """
     rng = np.random.default_rng([settings.seed, 2])
     num_nadir = settings.views if settings.views < 8 else round(0.6 * settings.views)
     num_ring = settings.views - num_nadir
     num_low = num_ring // 2 if num_ring >= 10 else 0
     poses = _nadir_poses(num_nadir, settings, rng)
-    poses += _ring_poses(num_ring - num_low, (0.40 * settings.extent, 0.80 * settings.altitude, 0.0), 0.0, rng)
-    poses += _ring_poses(num_low, (0.42 * settings.extent, 0.58 * settings.altitude, 0.12 * settings.extent), 0.5, rng)
+    poses += _ring_poses(
+        num_ring - num_low, (0.40 * settings.extent, 0.80 * settings.altitude, 0.0), 0.0, rng
+    )
+    poses += _ring_poses(
+        num_low, (0.42 * settings.extent, 0.58 * settings.altitude, 0.12 * settings.extent), 0.5, rng
+    )
     digits = max(3, len(str(settings.views - 1)))
     size = (settings.width, settings.height)
     focal = focal_length(*size)
@@ -51,8 +57,12 @@ def _nadir_poses(num: int, settings: Synthesize, rng: np.random.Generator) -> li
     return poses
 
 
-def _ring_poses(num: int, ring: tuple[float, float, float], phase: float, rng: np.random.Generator) -> list[np.ndarray]:
-    """Photos from a circle (radius, height, distance of the target from the middle towards the camera; m), looking inwards and down."""
+def _ring_poses(
+    num: int, ring: tuple[float, float, float], phase: float, rng: np.random.Generator
+) -> list[np.ndarray]:
+    """Photos from a circle (radius, height, distance of the target from the middle towards the camera; m),
+    looking inwards and down.
+    """
     radius, height, near = ring
     poses = []
     for i in range(num):

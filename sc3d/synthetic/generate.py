@@ -32,21 +32,37 @@ from sc3d.synthetic.world import World, build_world
 logger = logging.getLogger(__name__)
 
 CLASSES = [
-    {"id": 1, "name": "building", "color": [214, 60, 60], "prompts": ["building", "house", "roof"], "asprs": 6},
+    {
+        "id": 1,
+        "name": "building",
+        "color": [214, 60, 60],
+        "prompts": ["building", "house", "roof"],
+        "asprs": 6,
+    },
     {"id": 2, "name": "tree", "color": [40, 150, 60], "prompts": ["tree", "bush"], "asprs": 5},
-    {"id": 3, "name": "road", "color": [150, 150, 160], "prompts": ["road", "street", "parking lot"], "asprs": 11},
+    {
+        "id": 3,
+        "name": "road",
+        "color": [150, 150, 160],
+        "prompts": ["road", "street", "parking lot"],
+        "asprs": 11,
+    },
     {"id": 4, "name": "grass", "color": [170, 220, 110], "prompts": ["grass", "lawn"], "asprs": 3},
 ]
 FOLDERS = ("images", "depth", "truth", "masks", "confidence")
 NUM_SPARSE = 16_000  # candidates for sparse points; those seen by three views are kept
 
 
-def synthesize(scene_path: Path, settings: Synthesize, progress: Callable[[float, str], None] | None = None) -> dict:
+def synthesize(
+    scene_path: Path, settings: Synthesize, progress: Callable[[float, str], None] | None = None
+) -> dict:
     """Write a complete scene folder.
 
-    Writes images/, depth/<stem>.npy (float32 z, m), truth/, masks/, confidence/, sparse/0, truth.ply, truth_mesh.ply and classes.json.
+    Writes images/, depth/<stem>.npy (float32 z, m), truth/, masks/, confidence/, sparse/0, truth.ply,
+    truth_mesh.ply and classes.json.
     progress: called with the finished share (0..1) and what is being done; None = silent
-    returns: summary: num_views, num_triangles, num_buildings, mask_accuracy (over pixels with truth != 0), num_sparse_points, seconds_per_view
+    returns: summary: num_views, num_triangles, num_buildings, mask_accuracy (over pixels with truth != 0),
+        num_sparse_points, seconds_per_view
     """
     report = progress or (lambda share, text: None)
     _clear(scene_path)
@@ -57,10 +73,14 @@ def synthesize(scene_path: Path, settings: Synthesize, progress: Callable[[float
     for number, view in enumerate(views):
         report(0.05 + 0.85 * number / len(views), view.name)
         photo = photograph(world, view)
-        mask, confidence = noisy_mask(photo.label, settings.mask_noise, np.random.default_rng([settings.seed, 4, number]))
+        mask, confidence = noisy_mask(
+            photo.label, settings.mask_noise, np.random.default_rng([settings.seed, 4, number])
+        )
         right += int(((mask == photo.label) & (photo.label != OTHER)).sum())
         labelled += int((photo.label != OTHER).sum())
-        _write_view(scene_path, Path(view.name), photo, (mask, confidence), drone_exif(positions[number], number))
+        _write_view(
+            scene_path, Path(view.name), photo, (mask, confidence), drone_exif(positions[number], number)
+        )
     seconds = (time.perf_counter() - started) / len(views)
     report(0.9, "sparse points")
     num_sparse = _write_sparse(scene_path / "sparse" / "0", world, views, settings)
@@ -71,14 +91,22 @@ def synthesize(scene_path: Path, settings: Synthesize, progress: Callable[[float
     write_geometry(scene_path / "truth_mesh.ply", _mesh(world))
     write_json(scene_path / "classes.json", CLASSES)
     report(1.0, "done")
-    summary = {"num_views": len(views), "num_triangles": len(world.corners), "num_buildings": len(world.buildings),
-               "mask_accuracy": right / max(labelled, 1), "num_sparse_points": num_sparse, "seconds_per_view": round(seconds, 3)}
+    summary = {
+        "num_views": len(views),
+        "num_triangles": len(world.corners),
+        "num_buildings": len(world.buildings),
+        "mask_accuracy": right / max(labelled, 1),
+        "num_sparse_points": num_sparse,
+        "seconds_per_view": round(seconds, 3),
+    }
     logger.info("synthetic scene in %s: %s", scene_path, summary)
     return summary
 
 
 def _clear(scene_path: Path) -> None:
-    """Remove the photos of an earlier synthetic scene; InputError if there are others, which must not be mixed or lost."""
+    """Remove the photos of an earlier synthetic scene; InputError if there are others, which must not be
+    mixed or lost.
+    """
     files = [file for folder in FOLDERS for file in (scene_path / folder).glob("[!.]*")]
     for file in files:
         if not re.fullmatch(r"view_\d{3,}\.(jpg|png|npy)", file.name):
@@ -90,10 +118,14 @@ def _clear(scene_path: Path) -> None:
 def _measured_centres(views: list[View], settings: Synthesize) -> np.ndarray:
     """(N, 3) camera centres as the GPS gives them."""
     centres = np.stack([view.centre for view in views])
-    return centres + np.random.default_rng([settings.seed, 6]).normal(0, 1, centres.shape) * settings.gps_noise
+    return (
+        centres + np.random.default_rng([settings.seed, 6]).normal(0, 1, centres.shape) * settings.gps_noise
+    )
 
 
-def _write_view(scene_path: Path, name: Path, photo: Photo, segmented: tuple[np.ndarray, np.ndarray], exif: Image.Exif) -> None:
+def _write_view(
+    scene_path: Path, name: Path, photo: Photo, segmented: tuple[np.ndarray, np.ndarray], exif: Image.Exif
+) -> None:
     with atomic_path(scene_path / "images" / name) as temporary:
         Image.fromarray(photo.color).save(temporary, quality=95, subsampling=0, exif=exif)
     with atomic_path(scene_path / "depth" / f"{name.stem}.npy") as temporary:
@@ -105,18 +137,27 @@ def _write_view(scene_path: Path, name: Path, photo: Photo, segmented: tuple[np.
 def _mesh(world: World) -> o3d.t.geometry.TriangleMesh:
     """All triangles of the world, also those outside the site."""
     corners = world.corners.reshape(-1, 3)
-    return o3d.t.geometry.TriangleMesh(o3d.core.Tensor(corners), o3d.core.Tensor(np.arange(len(corners), dtype=np.int32).reshape(-1, 3)))
+    return o3d.t.geometry.TriangleMesh(
+        o3d.core.Tensor(corners), o3d.core.Tensor(np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
+    )
 
 
 def _write_sparse(path: Path, world: World, views: list[View], settings: Synthesize) -> int:
     """Write the true cameras and points with tracks as a COLMAP model; returns the number of points."""
-    points, triangles, observations = find_tracks(world, views, NUM_SPARSE, np.random.default_rng([settings.seed, 7]))
+    points, triangles, observations = find_tracks(
+        world, views, NUM_SPARSE, np.random.default_rng([settings.seed, 7])
+    )
     colors = display(world.light(points.astype(np.float32), triangles, np.full(len(points), 0.1, np.float32)))
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera_in_model(views[0]))
     tracks = [pycolmap.Track() for _ in points]
     for number, (view, (index, pixels)) in enumerate(zip(views, observations), start=1):
-        image = pycolmap.Image(name=view.name, camera_id=1, image_id=number, points2D=pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels]))
+        image = pycolmap.Image(
+            name=view.name,
+            camera_id=1,
+            image_id=number,
+            points2D=pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels]),
+        )
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_world[:3]))
         for position, point in enumerate(index):
             tracks[point].add_element(number, position)

@@ -13,7 +13,8 @@ from sc3d.synthetic.mesh import GRASS, GROUND, MeshBuilder
 HALF_ROAD = 3.0  # carriageway, m from the centre line
 HALF_PAVED = 4.5  # including pavements
 RASTER_STEP = 0.5
-RIM, EDGE = 15.0, 3.0  # m inside of level edges: the hills end over the first, whatever is left (pads, kerbs) over the second
+# m inside of level edges: the hills end over the first, whatever is left (pads, kerbs) over the second
+RIM, EDGE = 15.0, 3.0
 DRIVEWAY, PARKING = 0, 1
 
 
@@ -22,9 +23,11 @@ class Ground:
     """The ground surface as functions of x, y.
 
     extent: side of the square site, centred on the origin, m
-    rasters: (2 * roads, n, n) float32: offset to the left of each centre line and length along it, m; [row = y, column = x]
+    rasters: (2 * roads, n, n) float32: offset to the left of each centre line and length along it, m; [row =
+        y, column = x]
     half: half the side of the rasters, m
-    rects: (R, 7) float64 paved rectangles: x, y, cos yaw, sin yaw, half length, half width, DRIVEWAY or PARKING
+    rects: (R, 7) float64 paved rectangles: x, y, cos yaw, sin yaw, half length, half width, DRIVEWAY or
+        PARKING
     pads: levelled building plots: x, y, yaw, half length, half width, height
     level_edges: the ground comes down to height 0 at the edges of the site, so that sites fit together
     """
@@ -67,9 +70,12 @@ class Ground:
         profiles: list[tuple[np.ndarray, np.ndarray]] = []
         for line in self.centre_lines:
             profile = self._hill_height(line)
-            for j, (lengths, level) in enumerate(profiles):  # a later road takes the level of an earlier one where they cross
+            # a later road takes the level of an earlier one where they cross
+            for j, (lengths, level) in enumerate(profiles):
                 other, where = self._sample(2 * j, line)
-                profile += _fade(np.abs(other), HALF_PAVED + 1.0, 18.0) * (np.interp(where, lengths, level) - profile)
+                profile += _fade(np.abs(other), HALF_PAVED + 1.0, 18.0) * (
+                    np.interp(where, lengths, level) - profile
+                )
             profiles.append((_lengths(line), profile))
         return profiles
 
@@ -89,7 +95,7 @@ class Ground:
         fx, fy = (cell - low).T
         column, row = low.T
         out = []
-        for raster in self.rasters[layer:layer + 2].astype(np.float64):
+        for raster in self.rasters[layer : layer + 2].astype(np.float64):
             top = raster[row, column] * (1 - fx) + raster[row, column + 1] * fx
             bottom = raster[row + 1, column] * (1 - fx) + raster[row + 1, column + 1] * fx
             out.append(top * (1 - fy) + bottom * fy)
@@ -107,8 +113,15 @@ def plan_ground(extent: float, rng: np.random.Generator, level_edges: bool = Fal
     straight = np.stack([cross - np.sin(turn) * x, np.cos(turn) * x], 1)
     angles = rng.uniform(0, 2 * np.pi, 6)
     wave_lengths = np.geomspace(160.0, 28.0, 6)
-    hills = np.stack([np.cos(angles) * 2 * np.pi / wave_lengths, np.sin(angles) * 2 * np.pi / wave_lengths,
-                      rng.uniform(0, 2 * np.pi, 6), 0.009 * wave_lengths], 1)
+    hills = np.stack(
+        [
+            np.cos(angles) * 2 * np.pi / wave_lengths,
+            np.sin(angles) * 2 * np.pi / wave_lengths,
+            rng.uniform(0, 2 * np.pi, 6),
+            0.009 * wave_lengths,
+        ],
+        1,
+    )
     half = extent
     lines = [curved, straight]
     ticks = np.arange(-half, half + RASTER_STEP / 2, RASTER_STEP)
@@ -133,7 +146,9 @@ def add_ground(builder: MeshBuilder, ground: Ground) -> None:
 
 
 def rect_distance(xy: np.ndarray, rect: tuple[float, ...] | np.ndarray) -> np.ndarray:
-    """(N,) distance of (N, 2) points to a rectangle (x, y, cos yaw, sin yaw, half length, half width, ...); negative inside, m."""
+    """(N,) distance of (N, 2) points to a rectangle (x, y, cos yaw, sin yaw, half length, half width, ...);
+    negative inside, m.
+    """
     x, y, cos, sin, half_length, half_width = rect[:6]
     dx, dy = xy[:, 0] - x, xy[:, 1] - y
     along, across = np.abs(cos * dx + sin * dy) - half_length, np.abs(cos * dy - sin * dx) - half_width

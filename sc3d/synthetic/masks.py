@@ -1,6 +1,8 @@
-"""Mask errors as a segmenter makes them: shifted boundaries, filled gaps, missed and confused segments, hopeful confidences.
+"""Mask errors as a segmenter makes them: shifted boundaries, filled gaps, missed and confused segments,
+hopeful confidences.
 
-All random numbers are drawn whatever the strength, so a stronger setting makes the same errors larger and adds others.
+All random numbers are drawn whatever the strength, so a stronger setting makes the same errors larger and
+adds others.
 """
 
 from __future__ import annotations
@@ -14,19 +16,29 @@ from sc3d.synthetic.mesh import BUILDING, GRASS, OTHER, ROAD, TREE
 NUM_LABELS = 5
 MISSED, CONFUSED = 0.05, 0.12  # shares of segments at strength 1
 BLEED = 3.5  # standard deviation of boundary shifts at strength 1, px of an 800 px wide image
-CONFUSIONS = {BUILDING: ((ROAD, 0.8), (GRASS, 0.2)), TREE: ((GRASS, 0.75), (BUILDING, 0.25)),
-              ROAD: ((GRASS, 0.55), (BUILDING, 0.45)), GRASS: ((ROAD, 0.5), (TREE, 0.5))}
+CONFUSIONS = {
+    BUILDING: ((ROAD, 0.8), (GRASS, 0.2)),
+    TREE: ((GRASS, 0.75), (BUILDING, 0.25)),
+    ROAD: ((GRASS, 0.55), (BUILDING, 0.45)),
+    GRASS: ((ROAD, 0.5), (TREE, 0.5)),
+}
 
 
 def noisy_mask(label: np.ndarray, strength: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """A segmenter-like mask of a true label map.
 
     label: (H, W) uint8 truth; strength: 0 = no errors, 1 = about 77 % of the labelled pixels right
-    returns: (H, W) uint8 mask; (H, W) uint8 confidence, 255 = sure: lower near mask edges and, with overlap, for wrong segments
+    returns: (H, W) uint8 mask; (H, W) uint8 confidence, 255 = sure: lower near mask edges and, with overlap,
+        for wrong segments
     """
     field = _displacement(label.shape, rng)
     segments, num_segments = _segments(label, rng)
-    fate, choice, quality, hope = rng.random(num_segments), rng.random(num_segments), rng.normal(size=num_segments), rng.random(num_segments)
+    fate, choice, quality, hope = (
+        rng.random(num_segments),
+        rng.random(num_segments),
+        rng.normal(size=num_segments),
+        rng.random(num_segments),
+    )
     grain = rng.normal(size=label.shape).astype(np.float32)
     if strength <= 0:
         return label.copy(), np.full(label.shape, 255, np.uint8)
@@ -35,7 +47,10 @@ def noisy_mask(label: np.ndarray, strength: float, rng: np.random.Generator) -> 
     wrong = np.minimum(strength * (MISSED + CONFUSED), 0.95)
     missed = fate < wrong * MISSED / (MISSED + CONFUSED)
     confused = (fate < wrong) & ~missed
-    segments, whole = _warp(segments, BLEED * strength * scale * field), _warp(whole, BLEED * strength * scale * field)
+    segments, whole = (
+        _warp(segments, BLEED * strength * scale * field),
+        _warp(whole, BLEED * strength * scale * field),
+    )
     table = np.tile(np.arange(NUM_LABELS, dtype=np.uint8), (num_segments, 1))
     table[missed] = OTHER
     for source, targets in CONFUSIONS.items():
@@ -57,17 +72,24 @@ def _displacement(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarra
 
 
 def _segments(label: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, int]:
-    """Segment ids (H, W) int32: whole buildings and, elsewhere, Voronoi cells on a jittered grid; and their number."""
+    """Segment ids (H, W) int32: whole buildings and, elsewhere, Voronoi cells on a jittered grid; and their
+    number.
+    """
     height, width = label.shape
     step = width / 11
-    ticks = np.stack(np.meshgrid(np.arange(-0.5, width / step + 1), np.arange(-0.5, height / step + 1)), -1).reshape(-1, 2)
+    ticks = np.stack(
+        np.meshgrid(np.arange(-0.5, width / step + 1), np.arange(-0.5, height / step + 1)), -1
+    ).reshape(-1, 2)
     seeds = (ticks + rng.uniform(-0.5, 0.5, ticks.shape)) * step
     grid = np.stack(np.meshgrid(np.arange(0, width, 4), np.arange(0, height, 4)), -1).astype(np.float64)
     cells = cKDTree(seeds).query(grid.reshape(-1, 2))[1].reshape(grid.shape[:2]).astype(np.int32)
     cells = np.kron(cells, np.ones((4, 4), np.int32))[:height, :width]
     whole = _fill_gaps(label, width / 800)
-    segments = cells * NUM_LABELS + np.where(whole == OTHER, GRASS, whole)  # each class of a cell errs by itself
-    closed = cv2.morphologyEx((whole == BUILDING).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    # each class of a cell errs by itself
+    segments = cells * NUM_LABELS + np.where(whole == OTHER, GRASS, whole)
+    closed = cv2.morphologyEx(
+        (whole == BUILDING).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)
+    )
     num_buildings, building = cv2.connectedComponents(closed)
     most = len(seeds) * NUM_LABELS
     segments = np.where(building > 0, most + building, segments)
@@ -81,9 +103,11 @@ def _fill_gaps(label: np.ndarray, scale: float) -> np.ndarray:
     ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     crowns = cv2.morphologyEx((label == TREE).astype(np.uint8), cv2.MORPH_CLOSE, ellipse)
     whole[(crowns > 0) & (label != BUILDING)] = TREE
-    small = _small_objects(label, 3500 * scale ** 2)
+    small = _small_objects(label, 3500 * scale**2)
     if small.any() and (whole != OTHER).any():
-        nearest, ids = cv2.distanceTransformWithLabels((small | (whole == OTHER)).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+        nearest, ids = cv2.distanceTransformWithLabels(
+            (small | (whole == OTHER)).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
         seeds = np.zeros(ids.max() + 1, np.uint8)
         known = nearest == 0
         seeds[ids[known]] = whole[known]
@@ -107,12 +131,20 @@ def _warp(image: np.ndarray, field: np.ndarray) -> np.ndarray:
     return image[rows, columns]
 
 
-def _confidence(mask: np.ndarray, mean: np.ndarray, strength: float, scale: float, grain: np.ndarray, hope: np.ndarray) -> np.ndarray:
-    """Confidence from the segment's quality and the distance to the mask's edges; a tenth of the segments is overrated."""
+def _confidence(
+    mask: np.ndarray, mean: np.ndarray, strength: float, scale: float, grain: np.ndarray, hope: np.ndarray
+) -> np.ndarray:
+    """Confidence from the segment's quality and the distance to the mask's edges; a tenth of the segments is
+    overrated.
+    """
     edges = np.zeros(mask.shape, np.uint8)
     edges[:, 1:] |= mask[:, 1:] != mask[:, :-1]
     edges[1:] |= mask[1:] != mask[:-1]
     distance = cv2.distanceTransform(1 - edges, cv2.DIST_L2, 5)
-    value = np.where(hope < 0.1, np.maximum(mean, 0.85), mean) * (0.45 + 0.55 * (1 - np.exp(-distance / (5.0 * scale)))) + 0.02 * grain
+    value = (
+        np.where(hope < 0.1, np.maximum(mean, 0.85), mean)
+        * (0.45 + 0.55 * (1 - np.exp(-distance / (5.0 * scale))))
+        + 0.02 * grain
+    )
     value = 1.0 - min(strength, 1.0) * (1.0 - np.clip(value, 0.05, 1.0))
     return np.where(mask == OTHER, 0, np.round(255 * value)).astype(np.uint8)

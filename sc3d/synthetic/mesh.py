@@ -8,7 +8,14 @@ GROUND, WALL, TILES, FLAT_ROOF, LEAF, BARK, PAINT, GLASS, PLAIN, BRICK = range(1
 OTHER, BUILDING, TREE, ROAD, GRASS = range(5)  # labels
 
 # columns of the per-triangle float table
-ORIGIN, AXIS_U, AXIS_V, NORMAL, TINT, SIZE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15), slice(15, 17)
+ORIGIN, AXIS_U, AXIS_V, NORMAL, TINT, SIZE = (
+    slice(0, 3),
+    slice(3, 6),
+    slice(6, 9),
+    slice(9, 12),
+    slice(12, 15),
+    slice(15, 17),
+)
 NUM_COLUMNS = 17
 
 
@@ -31,8 +38,15 @@ class MeshBuilder:
         self.num_objects += 1
         return self.num_objects
 
-    def add(self, corners: np.ndarray, kind: tuple[int, int, int], tint: np.ndarray, frame: np.ndarray | None = None,
-            size: tuple[float, float] = (0.0, 0.0), normals: np.ndarray | None = None) -> None:
+    def add(
+        self,
+        corners: np.ndarray,
+        kind: tuple[int, int, int],
+        tint: np.ndarray,
+        frame: np.ndarray | None = None,
+        size: tuple[float, float] = (0.0, 0.0),
+        normals: np.ndarray | None = None,
+    ) -> None:
         """Add triangles.
 
         corners: (F, 3, 3) world, counter-clockwise seen from outside
@@ -44,7 +58,9 @@ class MeshBuilder:
         """
         corners = np.asarray(corners, np.float64)
         floats = np.zeros((len(corners), NUM_COLUMNS))
-        floats[:, 0:9] = (np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) if frame is None else np.asarray(frame)).reshape(-1)
+        floats[:, 0:9] = (
+            np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) if frame is None else np.asarray(frame)
+        ).reshape(-1)
         floats[:, NORMAL] = face_normals(corners) if normals is None else normals
         floats[:, TINT] = tint
         floats[:, SIZE] = size
@@ -53,7 +69,9 @@ class MeshBuilder:
         self._ints.append(np.tile(np.asarray(kind, np.int32), (len(corners), 1)))
 
     def polygon(self, points: np.ndarray, kind: tuple[int, int, int], tint: np.ndarray) -> None:
-        """Add a convex planar polygon (N, 3), counter-clockwise from outside; u runs along its first edge, v up its plane."""
+        """Add a convex planar polygon (N, 3), counter-clockwise from outside; u runs along its first edge, v
+        up its plane.
+        """
         points = np.asarray(points, np.float64)
         fan = np.stack([np.stack([points[0], points[i], points[i + 1]]) for i in range(1, len(points) - 1)])
         axis_u = points[1] - points[0]
@@ -61,10 +79,19 @@ class MeshBuilder:
         axis_v = np.cross(face_normals(fan[:1])[0], axis_u)
         local = (points - points[0]) @ np.stack([axis_u, axis_v]).T
         origin = points[0] + local[:, 0].min() * axis_u
-        self.add(fan, kind, tint, np.stack([origin, axis_u, axis_v]), (np.ptp(local[:, 0]), np.ptp(local[:, 1])))
+        self.add(
+            fan, kind, tint, np.stack([origin, axis_u, axis_v]), (np.ptp(local[:, 0]), np.ptp(local[:, 1]))
+        )
 
-    def box(self, pose: np.ndarray, low: tuple[float, float, float], high: tuple[float, float, float], kind: tuple[int, int, int],
-            tint: np.ndarray, top: bool = True) -> None:
+    def box(
+        self,
+        pose: np.ndarray,
+        low: tuple[float, float, float],
+        high: tuple[float, float, float],
+        kind: tuple[int, int, int],
+        tint: np.ndarray,
+        top: bool = True,
+    ) -> None:
         """Add an upright box from `low` to `high` in the frame of `pose` (4, 4); its bottom is left out."""
         (x0, y0, z0), (x1, y1, z1) = low, high
         ground = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
@@ -75,9 +102,14 @@ class MeshBuilder:
             self.polygon(placed(pose, np.c_[ground, np.full(4, z1)]), kind, tint)
 
     def finish(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(T, 3, 3) float32 corners, (T, 17) float32 columns of this module, (T, 3) int32 material, label and object."""
-        return (np.concatenate(self._corners).astype(np.float32), np.concatenate(self._floats).astype(np.float32),
-                np.concatenate(self._ints).astype(np.int32))
+        """(T, 3, 3) float32 corners, (T, 17) float32 columns of this module, (T, 3) int32 material, label and
+        object.
+        """
+        return (
+            np.concatenate(self._corners).astype(np.float32),
+            np.concatenate(self._floats).astype(np.float32),
+            np.concatenate(self._ints).astype(np.int32),
+        )
 
 
 def face_normals(corners: np.ndarray) -> np.ndarray:

@@ -16,7 +16,9 @@ SAMPLES_PER_BAND = 2_000_000  # rows are rendered in bands: large photos must no
 
 @dataclass(frozen=True)
 class Photo:
-    """color (H, W, 3) uint8; depth (H, W) float32 z of the pixel centre's ray, m, 0 = nothing there; label (H, W) uint8 of the same ray."""
+    """color (H, W, 3) uint8; depth (H, W) float32 z of the pixel centre's ray, m, 0 = nothing there; label
+    (H, W) uint8 of the same ray.
+    """
 
     color: np.ndarray
     depth: np.ndarray
@@ -24,20 +26,25 @@ class Photo:
 
 
 def photograph(world: World, view: View) -> Photo:
-    """Render a view. Colours are means of 2 x 2 samples per pixel; depth and label belong to exactly the pixel's centre.
+    """Render a view. Colours are means of 2 x 2 samples per pixel; depth and label belong to exactly the
+    pixel's centre.
 
     Exposure and sensor noise are fixed by the world's seed and the view's name.
     """
     rng = np.random.default_rng([world.seed, 3, zlib.crc32(view.name.encode())])
     exposure = 1.0 + 0.06 * np.clip(rng.normal(), -2, 2)
     band = max(1, SAMPLES_PER_BAND // (4 * view.width))
-    parts = [_render_rows(world, view, row, min(row + band, view.height)) for row in range(0, view.height, band)]
+    parts = [
+        _render_rows(world, view, row, min(row + band, view.height)) for row in range(0, view.height, band)
+    ]
     light, depth, label = (np.concatenate(part) for part in zip(*parts))
     noise = 1.2 * rng.standard_normal(light.shape, dtype=np.float32)
     return Photo(display(light, exposure, noise), depth, label)
 
 
-def _render_rows(world: World, view: View, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _render_rows(
+    world: World, view: View, first: int, last: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Linear light (h, W, 3), depth and label (h, W) of the rows [first, last)."""
     shape = (last - first, view.width)
     centres = pixel_centres(*shape[::-1]) + [0.0, first]
@@ -52,7 +59,9 @@ def _render_rows(world: World, view: View, first: int, last: int) -> tuple[np.nd
         range_, triangles = world.cast(view.centre, directions)
         hit = triangles >= 0
         slope = np.abs((directions * world.floats[triangles, 9:12]).sum(1))
-        footprints = (np.where(hit, range_, 1.0) * 0.5 / view.focal / np.sqrt(np.maximum(slope, 0.1))).astype(np.float32)
+        footprints = (np.where(hit, range_, 1.0) * 0.5 / view.focal / np.sqrt(np.maximum(slope, 0.1))).astype(
+            np.float32
+        )
         light += 0.25 * world.light(_points(view.centre, directions, range_, hit), triangles, footprints)
     return light.reshape(*shape, 3), depth.reshape(shape), label.reshape(shape)
 

@@ -12,7 +12,9 @@ LEAF_SIDE = 0.36  # m
 
 
 def add_tree(builder: MeshBuilder, position: np.ndarray, radius: float, rng: np.random.Generator) -> None:
-    """A broad-leaved tree at `position` (3,) on the ground with a crown of `radius` m: lobes on an ellipsoid, leaves on the lobes."""
+    """A broad-leaved tree at `position` (3,) on the ground with a crown of `radius` m: lobes on an ellipsoid,
+    leaves on the lobes.
+    """
     object_id = builder.new_object()
     height = radius * rng.uniform(0.75, 1.0)  # vertical half axis of the crown
     stem = rng.uniform(1.6, 2.4) + 0.35 * radius
@@ -23,10 +25,14 @@ def add_tree(builder: MeshBuilder, position: np.ndarray, radius: float, rng: np.
     directions[:, 2] = 1.15 * np.abs(directions[:, 2]) - 0.35  # few lobes hang low
     lobes = crown + directions * [radius, radius, height] * rng.uniform(0.5, 0.72, (num_lobes, 1))
     sizes = radius * rng.uniform(0.3, 0.48, num_lobes)
-    num_leaves = int(330 * radius ** 2)
-    lobe = rng.choice(num_lobes, num_leaves, p=sizes ** 2 / (sizes ** 2).sum())
+    num_leaves = int(330 * radius**2)
+    lobe = rng.choice(num_lobes, num_leaves, p=sizes**2 / (sizes**2).sum())
     outward = _sphere(num_leaves, rng)
-    centres = lobes[lobe] + outward * (sizes[lobe] * rng.uniform(0.75, 1.08, num_leaves))[:, None] * [1, 1, 0.8]
+    centres = lobes[lobe] + outward * (sizes[lobe] * rng.uniform(0.75, 1.08, num_leaves))[:, None] * [
+        1,
+        1,
+        0.8,
+    ]
     depth = np.linalg.norm((centres - crown) / [radius, radius, height], axis=1)
     tint = linear(LEAF_TINTS[rng.integers(len(LEAF_TINTS))]) * rng.uniform(0.88, 1.12, 3)
     shade = (0.45 + 0.6 * np.clip(depth, 0, 1.1)) * rng.uniform(0.8, 1.2, num_lobes)[lobe]
@@ -38,20 +44,30 @@ def add_conifer(builder: MeshBuilder, position: np.ndarray, radius: float, rng: 
     object_id = builder.new_object()
     height = radius * rng.uniform(3.6, 4.6)
     _add_trunk(builder, position, 0.9 * height, 0.07 * radius + 0.06, object_id, rng)
-    num_leaves = int(420 * radius ** 2)
+    num_leaves = int(420 * radius**2)
     level = 1.0 - np.sqrt(rng.random(num_leaves))
     level = 0.5 * level + 0.5 * np.round(level * 9) / 9
     angle = rng.uniform(0, 2 * np.pi, num_leaves)
     spikes = 0.78 + 0.22 * np.sin(7 * angle + 9 * level)
     reach = radius * (1 - level) * spikes * rng.uniform(0.3, 1.0, num_leaves) ** 0.4
-    centres = position + np.stack([reach * np.cos(angle), reach * np.sin(angle), 0.9 + level * (height - 0.9) - 0.25 * reach], 1)
+    centres = position + np.stack(
+        [reach * np.cos(angle), reach * np.sin(angle), 0.9 + level * (height - 0.9) - 0.25 * reach], 1
+    )
     outward = np.stack([np.cos(angle), np.sin(angle), np.full(num_leaves, 0.6)], 1) / np.sqrt(1.36)
     shade = rng.uniform(0.7, 1.3, num_leaves) * (0.5 + 0.6 * reach / np.maximum(radius * (1 - level), 0.1))
     _add_leaves(builder, centres, outward, linear(CONIFER_TINT) * shade[:, None], object_id, rng)
 
 
-def add_bush(builder: MeshBuilder, position: np.ndarray, half: tuple[float, float, float], yaw: float, rng: np.random.Generator) -> None:
-    """A bush or a piece of hedge: leaves on a rounded box of half sizes `half` m, standing on `position` (3,)."""
+def add_bush(
+    builder: MeshBuilder,
+    position: np.ndarray,
+    half: tuple[float, float, float],
+    yaw: float,
+    rng: np.random.Generator,
+) -> None:
+    """A bush or a piece of hedge: leaves on a rounded box of half sizes `half` m, standing on `position`
+    (3,).
+    """
     object_id = builder.new_object()
     turn = upright_pose(np.zeros(3), yaw)[:3, :3]
     num_leaves = int(60 + 22 * (half[0] * half[1] + 2 * half[2] * (half[0] + half[1])))
@@ -65,23 +81,46 @@ def add_bush(builder: MeshBuilder, position: np.ndarray, half: tuple[float, floa
     _add_leaves(builder, centres, outward @ turn.T, tint * shade[:, None], object_id, rng)
 
 
-def _add_leaves(builder: MeshBuilder, centres: np.ndarray, outward: np.ndarray, tints: np.ndarray, object_id: int,
-                rng: np.random.Generator) -> None:
-    """Leaf triangles at `centres` (N, 3), roughly facing `outward`; shaded as parts of the crown, which is what they look like from above."""
+def _add_leaves(
+    builder: MeshBuilder,
+    centres: np.ndarray,
+    outward: np.ndarray,
+    tints: np.ndarray,
+    object_id: int,
+    rng: np.random.Generator,
+) -> None:
+    """Leaf triangles at `centres` (N, 3), roughly facing `outward`; shaded as parts of the crown, which is
+    what they look like from above.
+    """
     facing = outward + 0.8 * _sphere(len(centres), rng)
     facing /= np.linalg.norm(facing, axis=1, keepdims=True)
     side = np.cross(facing, _sphere(len(centres), rng))
     side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
     up = np.cross(facing, side)
     size = LEAF_SIDE * rng.uniform(0.7, 1.3, (len(centres), 1))
-    corners = np.stack([centres - 0.5 * size * side - 0.3 * size * up, centres + 0.5 * size * side - 0.3 * size * up,
-                        centres + 0.6 * size * up], 1)
+    corners = np.stack(
+        [
+            centres - 0.5 * size * side - 0.3 * size * up,
+            centres + 0.5 * size * side - 0.3 * size * up,
+            centres + 0.6 * size * up,
+        ],
+        1,
+    )
     normals = 0.7 * outward + 0.3 * face_normals(corners) + [0, 0, 0.25]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    builder.add(corners, (LEAF, TREE, object_id), tints * rng.uniform(0.75, 1.25, (len(centres), 1)), normals=normals)
+    builder.add(
+        corners, (LEAF, TREE, object_id), tints * rng.uniform(0.75, 1.25, (len(centres), 1)), normals=normals
+    )
 
 
-def _add_trunk(builder: MeshBuilder, position: np.ndarray, height: float, radius: float, object_id: int, rng: np.random.Generator) -> None:
+def _add_trunk(
+    builder: MeshBuilder,
+    position: np.ndarray,
+    height: float,
+    radius: float,
+    object_id: int,
+    rng: np.random.Generator,
+) -> None:
     """A six-sided tapering trunk that starts below the ground."""
     angle = np.arange(6) * np.pi / 3 + rng.uniform(0, 1)
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(6)], 1)

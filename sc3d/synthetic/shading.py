@@ -21,15 +21,28 @@ SUN = np.array([-0.48, -0.42, 0.77]) / np.linalg.norm([-0.48, -0.42, 0.77])  # d
 
 
 def display(light: np.ndarray, exposure: float = 1.0, noise: np.ndarray | float = 0.0) -> np.ndarray:
-    """uint8 display values of linear light, any shape; highlights slightly compressed; `noise` is added in display values."""
+    """uint8 display values of linear light, any shape; highlights slightly compressed; `noise` is added in
+    display values.
+    """
     light = np.maximum(exposure * light, 0.0)
-    return np.clip(np.round(255.0 * (light / (1.0 + 0.12 * light)) ** (1 / 2.2) + noise), 0, 255).astype(np.uint8)
+    return np.clip(np.round(255.0 * (light / (1.0 + 0.12 * light)) ** (1 / 2.2) + noise), 0, 255).astype(
+        np.uint8
+    )
 
 
 @njit(cache=True)
-def albedo(point: np.ndarray, column: np.ndarray, ints: np.ndarray, fp: float, half: float, rasters: np.ndarray,
-           rects: np.ndarray) -> tuple[float, float, float]:
-    """Linear RGB of one surface point; `column` is its triangle's float row, `fp` the footprint of the sample, m."""
+def albedo(
+    point: np.ndarray,
+    column: np.ndarray,
+    ints: np.ndarray,
+    fp: float,
+    half: float,
+    rasters: np.ndarray,
+    rects: np.ndarray,
+) -> tuple[float, float, float]:
+    """Linear RGB of one surface point; `column` is its triangle's float row, `fp` the footprint of the
+    sample, m.
+    """
     material, seed = ints[0], 1000 + 37 * ints[2]
     if material == GROUND:
         return ground_color(point[0], point[1], fp, half, rasters, rects)
@@ -57,11 +70,22 @@ def albedo(point: np.ndarray, column: np.ndarray, ints: np.ndarray, fp: float, h
 
 
 @njit(cache=True, parallel=True)
-def shade(points: np.ndarray, triangles: np.ndarray, lit: np.ndarray, footprints: np.ndarray, floats: np.ndarray, ints: np.ndarray, half: float,
-          rasters: np.ndarray, rects: np.ndarray, sun: np.ndarray) -> np.ndarray:
+def shade(
+    points: np.ndarray,
+    triangles: np.ndarray,
+    lit: np.ndarray,
+    footprints: np.ndarray,
+    floats: np.ndarray,
+    ints: np.ndarray,
+    half: float,
+    rasters: np.ndarray,
+    rects: np.ndarray,
+    sun: np.ndarray,
+) -> np.ndarray:
     """Linear light of surface points.
 
-    points: (N, 3) float32 world; triangles: (N,) int64 index, -1 = sky; lit: (N,) uint8, 1 = the sun is not hidden
+    points: (N, 3) float32 world; triangles: (N,) int64 index, -1 = sky; lit: (N,) uint8, 1 = the sun is not
+        hidden
     footprints: (N,) float32 size of a sample on the surface, m; floats, ints: tables of `MeshBuilder.finish`
     half, rasters, rects: of `Ground`; sun: (3,) direction to it
     returns: (N, 3) float32 RGB
@@ -86,9 +110,18 @@ def shade(points: np.ndarray, triangles: np.ndarray, lit: np.ndarray, footprints
 
 
 @njit(cache=True, parallel=True)
-def surface_labels(points: np.ndarray, triangles: np.ndarray, ints: np.ndarray, half: float, site: float, rasters: np.ndarray,
-                   rects: np.ndarray) -> np.ndarray:
-    """(N,) uint8 label of surface points: the object's, on the ground road or grass; 0 outside the site (half side `site`, m)."""
+def surface_labels(
+    points: np.ndarray,
+    triangles: np.ndarray,
+    ints: np.ndarray,
+    half: float,
+    site: float,
+    rasters: np.ndarray,
+    rects: np.ndarray,
+) -> np.ndarray:
+    """(N,) uint8 label of surface points: the object's, on the ground road or grass; 0 outside the site (half
+    side `site`, m).
+    """
     out = np.zeros(len(points), np.uint8)
     for n in prange(len(points)):
         t = triangles[n]

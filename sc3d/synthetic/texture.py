@@ -1,7 +1,9 @@
 """Procedural textures: value noise and patterns in surface coordinates, a function of world position only.
 
-Compiled by numba: one call per sample, no shared state, so results do not depend on the number of threads. Colours are linear RGB.
-Octaves finer than the sample's footprint fade out, which keeps distant surfaces from flickering between views.
+Compiled by numba: one call per sample, no shared state, so results do not depend on the number of threads.
+Colours are linear RGB.
+Octaves finer than the sample's footprint fade out, which keeps distant surfaces from flickering between
+views.
 """
 
 from __future__ import annotations
@@ -17,8 +19,11 @@ LAWN, CARRIAGEWAY, PAVEMENT, DRIVE, LOT = range(5)  # kinds of ground
 @njit(cache=True, inline="never")
 def random01(i: float, j: float, seed: int) -> float:
     """A fixed random number in [0, 1) for a lattice cell."""
-    h = (np.uint64(np.int64(i)) * np.uint64(0x9E3779B1) + np.uint64(np.int64(j)) * np.uint64(0x85EBCA77)
-         + np.uint64(np.int64(seed)) * np.uint64(0xC2B2AE3D)) & np.uint64(0xFFFFFFFF)
+    h = (
+        np.uint64(np.int64(i)) * np.uint64(0x9E3779B1)
+        + np.uint64(np.int64(j)) * np.uint64(0x85EBCA77)
+        + np.uint64(np.int64(seed)) * np.uint64(0xC2B2AE3D)
+    ) & np.uint64(0xFFFFFFFF)
     h = ((h ^ (h >> np.uint64(15))) * np.uint64(0x2C1B3C6D)) & np.uint64(0xFFFFFFFF)
     h = ((h ^ (h >> np.uint64(12))) * np.uint64(0x297A2D39)) & np.uint64(0xFFFFFFFF)
     h ^= h >> np.uint64(15)
@@ -66,8 +71,12 @@ def stripe(x: float, period: float, width: float, footprint: float) -> float:
 
 
 @njit(cache=True)
-def ground_kind(x: float, y: float, half: float, rasters: np.ndarray, rects: np.ndarray) -> tuple[int, float, float, bool]:
-    """What the ground is at a place: kind, offset and length along the road it belongs to (or place in its rectangle), clear of junctions."""
+def ground_kind(
+    x: float, y: float, half: float, rasters: np.ndarray, rects: np.ndarray
+) -> tuple[int, float, float, bool]:
+    """What the ground is at a place: kind, offset and length along the road it belongs to (or place in its
+    rectangle), clear of junctions.
+    """
     n = rasters.shape[1]
     column = min(max((x + half) / RASTER_STEP, 0.0), n - 1.001)
     row = min(max((y + half) / RASTER_STEP, 0.0), n - 1.001)
@@ -76,11 +85,15 @@ def ground_kind(x: float, y: float, half: float, rasters: np.ndarray, rects: np.
     best, second, offset, along = 1e9, 1e9, 0.0, 0.0
     for road in range(rasters.shape[0] // 2):
         o, s = rasters[2 * road], rasters[2 * road + 1]
-        d = (o[i, j] * (1 - fx) + o[i, j + 1] * fx) * (1 - fy) + (o[i + 1, j] * (1 - fx) + o[i + 1, j + 1] * fx) * fy
+        d = (o[i, j] * (1 - fx) + o[i, j + 1] * fx) * (1 - fy) + (
+            o[i + 1, j] * (1 - fx) + o[i + 1, j + 1] * fx
+        ) * fy
         if abs(d) < best:
             second = best
             best, offset = abs(d), d
-            along = (s[i, j] * (1 - fx) + s[i, j + 1] * fx) * (1 - fy) + (s[i + 1, j] * (1 - fx) + s[i + 1, j + 1] * fx) * fy
+            along = (s[i, j] * (1 - fx) + s[i, j + 1] * fx) * (1 - fy) + (
+                s[i + 1, j] * (1 - fx) + s[i + 1, j + 1] * fx
+            ) * fy
         else:
             second = min(second, abs(d))
     if best < HALF_ROAD:
@@ -108,7 +121,11 @@ def _lawn_color(x, y, fp):
 
 @njit(cache=True)
 def _asphalt_color(x, y, fp):
-    light = 0.13 * (1.0 + 0.22 * fractal_noise(x, y, 51, 7.0, 3, fp)) * (1.0 + 0.35 * fractal_noise(x, y, 61, 0.4, 3, fp))
+    light = (
+        0.13
+        * (1.0 + 0.22 * fractal_noise(x, y, 51, 7.0, 3, fp))
+        * (1.0 + 0.35 * fractal_noise(x, y, 61, 0.4, 3, fp))
+    )
     px, py = x + 0.6 * value_noise(x / 2.0, y / 2.0, 71), y + 0.6 * value_noise(x / 2.0, y / 2.0, 72)
     cell = random01(np.floor(px / 2.7), np.floor(py / 1.9), 73)
     if cell < 0.10:
@@ -121,8 +138,12 @@ def _asphalt_color(x, y, fp):
 
 
 @njit(cache=True)
-def ground_color(x: float, y: float, fp: float, half: float, rasters: np.ndarray, rects: np.ndarray) -> tuple[float, float, float]:
-    """Lawn, road, pavement or parking at a place; `fp` is the sample's footprint, the rest belongs to `Ground`."""
+def ground_color(
+    x: float, y: float, fp: float, half: float, rasters: np.ndarray, rects: np.ndarray
+) -> tuple[float, float, float]:
+    """Lawn, road, pavement or parking at a place; `fp` is the sample's footprint, the rest belongs to
+    `Ground`.
+    """
     kind, offset, along, clear = ground_kind(x, y, half, rasters, rects)
     if kind == LAWN:
         return _lawn_color(x, y, fp)
@@ -130,7 +151,9 @@ def ground_color(x: float, y: float, fp: float, half: float, rasters: np.ndarray
         slab = 1.25 if kind == PAVEMENT else 2.5
         light = 0.30 + 0.10 * random01(np.floor(along / slab), np.floor(offset / 1.5), 91)
         light *= 1.0 - 0.45 * max(stripe(along, slab, 0.06, fp), stripe(offset, 1.5, 0.06, fp))
-        light *= (1.0 + 0.25 * fractal_noise(x, y, 92, 3.0, 3, fp)) * (1.0 + 0.25 * fractal_noise(x, y, 96, 0.4, 2, fp))
+        light *= (1.0 + 0.25 * fractal_noise(x, y, 92, 3.0, 3, fp)) * (
+            1.0 + 0.25 * fractal_noise(x, y, 96, 0.4, 2, fp)
+        )
         if kind == PAVEMENT and abs(offset) < HALF_ROAD + 0.2:
             light *= 1.35  # kerb stone
         return light, 0.96 * light, 0.88 * light
@@ -138,7 +161,7 @@ def ground_color(x: float, y: float, fp: float, half: float, rasters: np.ndarray
     if kind == LOT:
         paint = stripe(offset, 2.5, 0.12, fp) if abs(along) > 2.6 else 0.0
     else:
-        wheel = np.exp(-((abs(abs(offset) - 1.5) - 0.75) / 0.3) ** 2)
+        wheel = np.exp(-(((abs(abs(offset) - 1.5) - 0.75) / 0.3) ** 2))
         r, g, b = r * (1.0 - 0.18 * wheel), g * (1.0 - 0.18 * wheel), b * (1.0 - 0.18 * wheel)
         dash = min(max((1.5 - abs(along - 9.0 * np.floor(along / 9.0) - 4.5)) / fp + 0.5, 0.0), 1.0)
         edge = min(max(0.5 + (0.06 - abs(abs(offset) - HALF_ROAD + 0.35)) / fp, 0.0), 1.0)
@@ -149,13 +172,19 @@ def ground_color(x: float, y: float, fp: float, half: float, rasters: np.ndarray
 
 
 @njit(cache=True)
-def wall_color(u: float, v: float, width: float, height: float, seed: int, tint: tuple[float, float, float], fp: float) -> tuple[float, float, float]:
-    """Plaster or brick with windows and doors; u along the wall and v above the ground, m, of a wall of width x height m."""
+def wall_color(
+    u: float, v: float, width: float, height: float, seed: int, tint: tuple[float, float, float], fp: float
+) -> tuple[float, float, float]:
+    """Plaster or brick with windows and doors; u along the wall and v above the ground, m, of a wall of width
+    x height m.
+    """
     light = (1.0 + 0.16 * fractal_noise(u, v, seed, 1.5, 4, fp)) * (1.0 - 0.25 * (1.0 - smooth(0.0, 1.2, v)))
     r, g, b = tint[0] * light, tint[1] * light, tint[2] * light
     if seed % 3 == 0:  # brick courses
         row = np.floor(v / 0.22)
-        light = 1.0 + 0.35 * (random01(np.floor(u / 0.45 + 0.5 * (row % 2)), row, seed) - 0.5) * smooth(0.4, 1.2, 0.45 / fp)
+        light = 1.0 + 0.35 * (random01(np.floor(u / 0.45 + 0.5 * (row % 2)), row, seed) - 0.5) * smooth(
+            0.4, 1.2, 0.45 / fp
+        )
         r, g, b = r * light, g * light, b * light
     columns = np.floor((width - 0.8) / 2.4)
     storey, column = np.floor(v / 2.8), np.floor((u - 0.5 * (width - 2.4 * columns)) / 2.4)
@@ -172,8 +201,12 @@ def wall_color(u: float, v: float, width: float, height: float, seed: int, tint:
 
 
 @njit(cache=True)
-def tile_color(u: float, v: float, width: float, height: float, seed: int, tint: tuple[float, float, float], fp: float) -> tuple[float, float, float]:
-    """Roof tiles with moss, roof windows and solar panels; u along the eaves and v up the slope, m, of a face of width x height m."""
+def tile_color(
+    u: float, v: float, width: float, height: float, seed: int, tint: tuple[float, float, float], fp: float
+) -> tuple[float, float, float]:
+    """Roof tiles with moss, roof windows and solar panels; u along the eaves and v up the slope, m, of a face
+    of width x height m.
+    """
     row = np.floor(v / 0.36)
     tile = random01(np.floor(u / 0.42 + 0.5 * (row % 2)), row, seed)
     light = (1.0 + 0.55 * (tile - 0.5) * smooth(0.5, 1.5, 0.5 / fp)) * (1.0 - 0.4 * stripe(v, 0.36, 0.07, fp))
@@ -196,9 +229,13 @@ def tile_color(u: float, v: float, width: float, height: float, seed: int, tint:
 
 
 @njit(cache=True)
-def flat_roof_color(u: float, v: float, seed: int, tint: tuple[float, float, float], fp: float) -> tuple[float, float, float]:
+def flat_roof_color(
+    u: float, v: float, seed: int, tint: tuple[float, float, float], fp: float
+) -> tuple[float, float, float]:
     """Roofing felt with gravel, seams, puddles and mended places; u and v in the roof, m."""
-    light = (1.0 + 0.35 * fractal_noise(u, v, seed, 0.35, 3, fp)) * (1.0 + 0.3 * fractal_noise(u, v, seed + 3, 3.5, 4, fp))
+    light = (1.0 + 0.35 * fractal_noise(u, v, seed, 0.35, 3, fp)) * (
+        1.0 + 0.3 * fractal_noise(u, v, seed + 3, 3.5, 4, fp)
+    )
     light *= 1.0 - 0.35 * max(stripe(v, 1.3, 0.07, fp), stripe(u, 7.0, 0.07, fp))
     light *= 1.0 - 0.45 * smooth(0.35, 0.6, fractal_noise(u, v, seed + 9, 5.0, 3, fp))  # puddles
     if random01(np.floor(u / 2.2), np.floor(v / 1.3), seed + 12) < 0.08:

@@ -19,7 +19,8 @@ from sc3d.synthetic.shading import SUN, shade, surface_labels
 class World:
     """A site centred on the origin, z up, metres.
 
-    corners: (T, 3, 3) float32 triangles; floats: (T, 17) float32 and ints: (T, 3) int32 as `MeshBuilder.finish` returns them
+    corners: (T, 3, 3) float32 triangles; floats: (T, 17) float32 and ints: (T, 3) int32 as
+        `MeshBuilder.finish` returns them
     """
 
     seed: int
@@ -31,10 +32,14 @@ class World:
     scene: o3d.t.geometry.RaycastingScene = field(repr=False)
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """First hits of rays (N, 3): (N,) float32 range in units of the direction, inf = none; (N,) int64 triangle, -1 = none."""
+        """First hits of rays (N, 3): (N,) float32 range in units of the direction, inf = none; (N,) int64
+        triangle, -1 = none.
+        """
         hits = self.scene.cast_rays(ray_tensor(origins, directions), nthreads=0)
         triangles = hits["primitive_ids"].numpy()
-        triangles = np.where(triangles == o3d.t.geometry.RaycastingScene.INVALID_ID, -1, triangles.astype(np.int64))
+        triangles = np.where(
+            triangles == o3d.t.geometry.RaycastingScene.INVALID_ID, -1, triangles.astype(np.int64)
+        )
         return hits["t_hit"].numpy(), triangles
 
     def hidden(self, origins: np.ndarray, directions: np.ndarray, far: float = float("inf")) -> np.ndarray:
@@ -42,18 +47,43 @@ class World:
         return self.scene.test_occlusions(ray_tensor(origins, directions), tnear=0.0, tfar=far).numpy()
 
     def labels(self, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-        """(N,) uint8 labels of surface points (N, 3) on triangles (N,); 0 = other objects, sky, anything outside the site."""
-        return surface_labels(points, triangles, self.ints, self.ground.half, self.ground.extent / 2, self.ground.rasters, self.ground.rects)
+        """(N,) uint8 labels of surface points (N, 3) on triangles (N,); 0 = other objects, sky, anything
+        outside the site.
+        """
+        return surface_labels(
+            points,
+            triangles,
+            self.ints,
+            self.ground.half,
+            self.ground.extent / 2,
+            self.ground.rasters,
+            self.ground.rects,
+        )
 
     def light(self, points: np.ndarray, triangles: np.ndarray, footprints: np.ndarray) -> np.ndarray:
-        """(N, 3) float32 linear RGB of surface points (N, 3) float32 in sun and shadow; `footprints` (N,) float32 sample sizes, m."""
+        """(N, 3) float32 linear RGB of surface points (N, 3) float32 in sun and shadow; `footprints` (N,)
+        float32 sample sizes, m.
+        """
         offset = 0.02 * SUN + 0.01 * self.floats[triangles, 9:12]
         lit = ~self.hidden(points + offset, np.broadcast_to(SUN, points.shape))
         ground = self.ground
-        return shade(points, triangles, lit.view(np.uint8), footprints, self.floats, self.ints, ground.half, ground.rasters, ground.rects, SUN)
+        return shade(
+            points,
+            triangles,
+            lit.view(np.uint8),
+            footprints,
+            self.floats,
+            self.ints,
+            ground.half,
+            ground.rasters,
+            ground.rects,
+            SUN,
+        )
 
     def normals(self, triangles: np.ndarray) -> np.ndarray:
-        """(N, 3) outward unit normals of triangles (N,); leaves have two sides, theirs point out of the crown."""
+        """(N, 3) outward unit normals of triangles (N,); leaves have two sides, theirs point out of the
+        crown.
+        """
         normals = face_normals(self.corners[triangles].astype(np.float64))
         leaf = self.ints[triangles, 0] == LEAF
         inward = (normals * self.floats[triangles, 9:12]).sum(1) < 0
@@ -62,7 +92,9 @@ class World:
 
 
 def build_world(settings: Synthesize, level_edges: bool = False) -> World:
-    """Build the site of `settings.seed` and `settings.extent`: ground, roads, buildings, plants, cars. level_edges: as in `Ground`."""
+    """Build the site of `settings.seed` and `settings.extent`: ground, roads, buildings, plants, cars.
+    level_edges: as in `Ground`.
+    """
     streams = np.random.default_rng([settings.seed, 1]).spawn(6)
     ground = plan_ground(settings.extent, streams[0], level_edges)
     buildings = place_buildings(ground, streams[1])
@@ -75,7 +107,10 @@ def build_world(settings: Synthesize, level_edges: bool = False) -> World:
     build_fences(builder, ground, buildings, streams[5])
     corners, floats, ints = builder.finish()
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(corners.reshape(-1, 3)), o3d.core.Tensor(np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)))
+    scene.add_triangles(
+        o3d.core.Tensor(corners.reshape(-1, 3)),
+        o3d.core.Tensor(np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)),
+    )
     return World(settings.seed, ground, buildings, corners, floats, ints, scene)
 
 

@@ -1,4 +1,5 @@
-"""Clouds larger than memory, tile by tile: the same results as in one piece, whatever the number of tiles and of workers.
+"""Clouds larger than memory, tile by tile: the same results as in one piece, whatever the number of tiles and
+of workers.
 
     files     clouds and meshes in chunks, as tables of records
     store     the points of a cloud by tile; a tile is read with a margin of its neighbours' points

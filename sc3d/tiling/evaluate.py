@@ -1,4 +1,6 @@
-"""What photos see of a labelled cloud that does not fit into memory: the row of the cloud's point that each judged pixel shows."""
+"""What photos see of a labelled cloud that does not fit into memory: the row of the cloud's point that each
+judged pixel shows.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ BYTES = 260  # of a point while pixels look for the nearest one
 
 @dataclass(frozen=True)
 class LookJob:
-    """What the task of a tile needs to know. truth: file of the truth mask of each view; reach: largest distance of a pixel's point, world units"""
+    """What the task of a tile needs to know. truth: file of the truth mask of each view; reach: largest
+    distance of a pixel's point, world units
+    """
 
     scene: Path
     truth: dict[str, Path]
@@ -49,7 +53,9 @@ class TiledSurface:
     parts: Parts
 
     def rows(self, view: View, size: tuple[int, int], wanted: np.ndarray) -> tuple[np.ndarray, FirstSurface]:
-        """(H, W) int64 row of the cloud at each wanted pixel, -1 = nothing near; the first surface. size: (width, height) of the truth mask."""
+        """(H, W) int64 row of the cloud at each wanted pixel, -1 = nothing near; the first surface. size:
+        (width, height) of the truth mask.
+        """
         rows, job = np.full(size[0] * size[1], -1, np.int64), self.job
         for tile in job.store.tiles:
             name = f"seen{job.maps.numbers[view.name]}"
@@ -63,26 +69,53 @@ def look_by_tiles(scene: Scene, settings: Evaluate, cloud: CloudFile, tasks: Tas
     """Find the cloud's point at all pixels that have truth, tile by tile."""
     truth = scene.mask_files(settings.truth or scene.truth, scene.class_table())
     views = [view for view in scene.model.views if view.name in truth]
-    parts = Parts(settings.output or scene.metrics, "evaluate", [scene.sparse, scene.mesh, settings.truth or scene.truth, cloud.path], settings)
+    parts = Parts(
+        settings.output or scene.metrics,
+        "evaluate",
+        [scene.sparse, scene.mesh, settings.truth or scene.truth, cloud.path],
+        settings,
+    )
     survey = Survey.of(cloud)
-    store = TileStore.build(cloud, survey.grid(max_points(settings, BYTES), REACH * survey.spacing), parts.subfolder("tiles"))
+    store = TileStore.build(
+        cloud, survey.grid(max_points(settings, BYTES), REACH * survey.spacing), parts.subfolder("tiles")
+    )
     spacing, _ = sample_spacing(store, survey)
     origin = local_origin(scene.model.views)
-    mesh = split_mesh(scene.mesh, parts.subfolder("surface"), origin, memory_of(settings)) if scene.mesh.exists() else \
-        split_surfels(store, spacing, parts.subfolder("surface"), origin)
+    mesh = (
+        split_mesh(scene.mesh, parts.subfolder("surface"), origin, memory_of(settings))
+        if scene.mesh.exists()
+        else split_surfels(store, spacing, parts.subfolder("surface"), origin)
+    )
     maps = RangeMaps(parts.subfolder("ranges"), {view.name: number for number, view in enumerate(views)})
-    compute_ranges(RangeJob(scene.path, mesh, maps, {view.name: image_size(truth[view.name]) for view in views}), tasks)
+    compute_ranges(
+        RangeJob(scene.path, mesh, maps, {view.name: image_size(truth[view.name]) for view in views}), tasks
+    )
     results = Results(parts.subfolder("results"), store)
-    job = LookJob(scene.path, {view.name: truth[view.name] for view in views}, survey.extent.low, store, results, maps, REACH * spacing)
+    job = LookJob(
+        scene.path,
+        {view.name: truth[view.name] for view in views},
+        survey.extent.low,
+        store,
+        results,
+        maps,
+        REACH * spacing,
+    )
     tasks.run("looking", partial(look_at_tile, job), store.tiles)
     return TiledSurface(job, parts)
 
 
 def look_at_tile(job: LookJob, tile: int) -> None:
-    """Pixels whose first surface lies in the tile, and the nearest point of each: (2, K) int64 pixel and row of the cloud, for every view."""
+    """Pixels whose first surface lies in the tile, and the nearest point of each: (2, K) int64 pixel and row
+    of the cloud, for every view.
+    """
     window = job.store.window(tile, job.reach)
     points = positions(window.gather(job.store.records))
-    low, high, index, views = points.min(axis=0) - job.reach, points.max(axis=0) + job.reach, NeighborIndex(points, job.extent_low), views_of(job.scene)
+    low, high, index, views = (
+        points.min(axis=0) - job.reach,
+        points.max(axis=0) + job.reach,
+        NeighborIndex(points, job.extent_low),
+        views_of(job.scene),
+    )
     for name, file in job.truth.items():
         if not may_see(views[name], low, high):
             continue
@@ -96,7 +129,9 @@ def look_at_tile(job: LookJob, tile: int) -> None:
             nearest, distance = index.nearest(hits[mine], 1)
             near = distance[:, 0] <= job.reach
             pixels = (rows * truth.shape[1] + columns)[mine][near]
-            job.results.write(tile, **{f"seen{job.maps.numbers[name]}": np.stack([pixels, window.rows[nearest[near, 0]]])})
+            job.results.write(
+                tile, **{f"seen{job.maps.numbers[name]}": np.stack([pixels, window.rows[nearest[near, 0]]])}
+            )
 
 
 def read_labels(cloud: CloudFile) -> Labels:
@@ -104,7 +139,9 @@ def read_labels(cloud: CloudFile) -> Labels:
     names = {"label": np.uint8, "confidence": np.float32, "state": np.uint8, "num_views": np.int32}
     missing = [name for name in names if name not in cloud.dtype.names]
     if missing:
-        raise InputError(f"{cloud.path} has no attribute {missing[0]!r}: it was not written by `sc3d propagate`")
+        raise InputError(
+            f"{cloud.path} has no attribute {missing[0]!r}: it was not written by `sc3d propagate`"
+        )
     columns = {name: np.empty(cloud.num_points, kind) for name, kind in names.items()}
     for start, records in cloud.chunks():
         for name, column in columns.items():

@@ -1,7 +1,9 @@
 """Where the work on tiles and views runs: in this process, or on Dask workers.
 
-A task is a function at the top of a module and an item; both go to the workers, and what they need beside lies in files that all of them see.
-Its result is small; what is large it writes to a file of its own. A task that is run twice writes the same, so a lost worker costs time only.
+A task is a function at the top of a module and an item; both go to the workers, and what they need beside
+lies in files that all of them see.
+Its result is small; what is large it writes to a file of its own. A task that is run twice writes the same,
+so a lost worker costs time only.
 """
 
 from __future__ import annotations
@@ -24,15 +26,21 @@ RETRIES = 3  # of a task whose worker is lost; more, and the task itself is what
 
 
 class Tasks(Protocol):
-    """Runs a function on items; the results come in the order of the items. needs: what a Dask worker must offer for one task, such as {"GPU": 1}"""
+    """Runs a function on items; the results come in the order of the items. needs: what a Dask worker must
+    offer for one task, such as {"GPU": 1}
+    """
 
-    def run(self, name: str, function: Callable, items: Sequence, needs: dict[str, float] | None = None) -> list: ...
+    def run(
+        self, name: str, function: Callable, items: Sequence, needs: dict[str, float] | None = None
+    ) -> list: ...
 
 
 class Here:
     """One after another in this process."""
 
-    def run(self, name: str, function: Callable, items: Sequence, needs: dict[str, float] | None = None) -> list:
+    def run(
+        self, name: str, function: Callable, items: Sequence, needs: dict[str, float] | None = None
+    ) -> list:
         return [function(item) for item in tqdm(items, desc=name, disable=None)]
 
 
@@ -42,12 +50,21 @@ class OnDask:
     def __init__(self, client: object) -> None:
         self._client = client
 
-    def run(self, name: str, function: Callable, items: Sequence, needs: dict[str, float] | None = None) -> list:
+    def run(
+        self, name: str, function: Callable, items: Sequence, needs: dict[str, float] | None = None
+    ) -> list:
         from distributed import as_completed
         from distributed.scheduler import KilledWorker
 
-        if needs and not any(set(needs) <= set(worker["resources"]) for worker in self._client.scheduler_info()["workers"].values()):
-            logger.warning("%s: no worker offers %s; waiting for one", name, " ".join(f"{key}={value:g}" for key, value in needs.items()))
+        if needs and not any(
+            set(needs) <= set(worker["resources"])
+            for worker in self._client.scheduler_info()["workers"].values()
+        ):
+            logger.warning(
+                "%s: no worker offers %s; waiting for one",
+                name,
+                " ".join(f"{key}={value:g}" for key, value in needs.items()),
+            )
         futures = self._client.map(function, list(items), pure=False, retries=RETRIES, resources=needs)
         try:
             for future in tqdm(as_completed(futures), desc=name, total=len(futures), disable=None):
@@ -61,7 +78,9 @@ class OnDask:
 
 @contextmanager
 def open_tasks(resources: Workers) -> Iterator[Tasks]:
-    """Here, or the workers that the options ask for. InputError if Dask is missing or the scheduler does not answer."""
+    """Here, or the workers that the options ask for. InputError if Dask is missing or the scheduler does not
+    answer.
+    """
     if not resources.cluster and resources.workers < 1:
         yield Here()
         return
@@ -80,8 +99,15 @@ def open_tasks(resources: Workers) -> Iterator[Tasks]:
         return
     threads = max(1, (os.cpu_count() or 1) // resources.workers)
     environment = {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
-    cluster = partial(LocalCluster, n_workers=resources.workers, threads_per_worker=1, memory_limit=None, host="127.0.0.1", dashboard_address="127.0.0.1:0",
-                      resources={"GPU": 1})  # how many of them a GPU can feed is for the user to say
+    cluster = partial(
+        LocalCluster,
+        n_workers=resources.workers,
+        threads_per_worker=1,
+        memory_limit=None,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+        resources={"GPU": 1},
+    )  # how many of them a GPU can feed is for the user to say
     before = {name: os.environ.get(name) for name in environment}
     os.environ.update(environment)
     try:

@@ -1,4 +1,6 @@
-"""`label` for clouds that do not fit into memory: the votes of a voxel need its own points only, so every tile votes for itself."""
+"""`label` for clouds that do not fit into memory: the votes of a voxel need its own points only, so every
+tile votes for itself.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +31,16 @@ from sc3d.tiling.voxel_file import write_field
 BYTES = 420  # of a point while its tile votes
 VOXEL = 2.2  # of a label voxel, in point spacings, while neither is known exactly
 SAMPLE_MARGIN = 20.0  # around a tile whose spacing is measured, point spacings
-BLOCKS = 2  # margin of a tile: the rest of a block that its border cuts, and the block beyond, which verification looks at
+# margin of a tile: the rest of a block that its border cuts, and the block beyond, which verification looks
+# at
+BLOCKS = 2
 
 
 @dataclass(frozen=True)
 class LabelJob:
-    """What the task of a tile needs to know. settings: with the voxel size; maps: None = no occlusion test; confidence: folder of confidence maps or None"""
+    """What the task of a tile needs to know. settings: with the voxel size; maps: None = no occlusion test;
+    confidence: folder of confidence maps or None
+    """
 
     scene: Path
     settings: Label
@@ -49,14 +55,32 @@ class LabelJob:
         return BLOCKS * BLOCK * self.settings.voxel_size
 
 
-def label_tiles(scene: Scene, settings: Label, cloud: CloudFile, tasks: Tasks) -> tuple[np.ndarray, Label, int]:
-    """Label a cloud tile by tile and write it; returns the number of points in each state, the settings with the voxel size, and the number of views."""
+def label_tiles(
+    scene: Scene, settings: Label, cloud: CloudFile, tasks: Tasks
+) -> tuple[np.ndarray, Label, int]:
+    """Label a cloud tile by tile and write it; returns the number of points in each state, the settings with
+    the voxel size, and the number of views.
+    """
     if settings.surface == "voxels" and settings.depth_filter:
-        raise InputError("--surface voxels needs the cloud in memory as a whole: take surfels, or allow more with --max-memory")
+        raise InputError(
+            "--surface voxels needs the cloud in memory as a whole: take surfels, or allow more with --max-memory"
+        )
     confidence = best_confidence(scene) if settings.use_confidence else None
     masks = Masks.of(scene, confidence)
     output = settings.output or scene.seeds
-    parts = Parts(output, "label", [scene.sparse, scene.classes, scene.masks, *([confidence] if confidence else []), scene.mesh, cloud.path], settings)
+    parts = Parts(
+        output,
+        "label",
+        [
+            scene.sparse,
+            scene.classes,
+            scene.masks,
+            *([confidence] if confidence else []),
+            scene.mesh,
+            cloud.path,
+        ],
+        settings,
+    )
     survey = Survey.of(cloud)
     margin = BLOCKS * BLOCK * (settings.voxel_size or VOXEL * survey.spacing)
     store = TileStore.build(cloud, survey.grid(max_points(settings, BYTES), margin), parts.subfolder("tiles"))
@@ -64,7 +88,15 @@ def label_tiles(scene: Scene, settings: Label, cloud: CloudFile, tasks: Tasks) -
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=voxel_size_for(spacing, sample, masks))
     maps = _ranges(scene, masks, store, spacing, settings, parts, tasks) if settings.depth_filter else None
-    job = LabelJob(scene.path, settings, survey.extent, store, Results(parts.subfolder("results"), store), maps, confidence)
+    job = LabelJob(
+        scene.path,
+        settings,
+        survey.extent,
+        store,
+        Results(parts.subfolder("results"), store),
+        maps,
+        confidence,
+    )
     tasks.run("voting", partial(label_tile, job), store.tiles)
     write_field(job.results, store.tiles, settings.voxel_size, scene.votes_of(settings.output))
     counts = _write(output, cloud, job, scene.class_table().num_ids)
@@ -72,20 +104,33 @@ def label_tiles(scene: Scene, settings: Label, cloud: CloudFile, tasks: Tasks) -
     return counts, settings, len(masks.views)
 
 
-def _ranges(scene: Scene, masks: Masks, store: TileStore, spacing: float, settings: Label, parts: Parts, tasks: Tasks) -> RangeMaps:
+def _ranges(
+    scene: Scene, masks: Masks, store: TileStore, spacing: float, settings: Label, parts: Parts, tasks: Tasks
+) -> RangeMaps:
     origin = local_origin(masks.views)
     if scene.mesh.exists() and settings.surface == "auto":
         mesh = split_mesh(scene.mesh, parts.subfolder("surface"), origin, memory_of(settings))
     elif {"nx", "ny", "nz"} <= set(store.dtype.names):
         mesh = split_surfels(store, spacing, parts.subfolder("surface"), origin)
     else:
-        raise InputError("the cloud has neither normals nor a mesh beside it, and does not fit into --max-memory: allow more, or give it normals")
-    maps = RangeMaps(parts.subfolder("ranges"), {view.name: number for number, view in enumerate(masks.views)})
-    return compute_ranges(RangeJob(scene.path, mesh, maps, {view.name: image_size(masks.files[view.name]) for view in masks.views}), tasks)
+        raise InputError(
+            "the cloud has neither normals nor a mesh beside it, and does not fit into --max-memory: allow more, or give it normals"
+        )
+    maps = RangeMaps(
+        parts.subfolder("ranges"), {view.name: number for number, view in enumerate(masks.views)}
+    )
+    return compute_ranges(
+        RangeJob(
+            scene.path, mesh, maps, {view.name: image_size(masks.files[view.name]) for view in masks.views}
+        ),
+        tasks,
+    )
 
 
 def sample_spacing(store: TileStore, survey: Survey) -> tuple[float, np.ndarray]:
-    """Sampling distance as `labelled.spacing_of` has it, and the points (S, 3) by which `default_voxel_size` measures mask pixels."""
+    """Sampling distance as `labelled.spacing_of` has it, and the points (S, 3) by which `default_voxel_size`
+    measures mask pixels.
+    """
     rows, distances, footprint_rows, footprints = [], [], [], []
     num_points = sum(store.counts.values())
     for tile in store.tiles:
@@ -93,38 +138,64 @@ def sample_spacing(store: TileStore, survey: Survey) -> tuple[float, np.ndarray]
         points = positions(window.gather(store.records))
         mine = window.core & (window.rows % max(1, num_points // SPACING_SAMPLE) == 0)
         rows.append(window.rows[mine])
-        distances.append(NeighborIndex(points, survey.extent.low).nearest(points[mine], SPACING_NEIGHBORS + 1)[1])
+        distances.append(
+            NeighborIndex(points, survey.extent.low).nearest(points[mine], SPACING_NEIGHBORS + 1)[1]
+        )
         mine = window.core & (window.rows % max(1, num_points // FOOTPRINT_SAMPLE) == 0)
         footprint_rows.append(window.rows[mine])
         footprints.append(points[mine])
-    ordered = [np.concatenate(values)[np.argsort(np.concatenate(keys))] for keys, values in ((rows, distances), (footprint_rows, footprints))]
+    ordered = [
+        np.concatenate(values)[np.argsort(np.concatenate(keys))]
+        for keys, values in ((rows, distances), (footprint_rows, footprints))
+    ]
     return point_spacing(ordered[0]) or 1.0, ordered[1]
 
 
 def label_tile(job: LabelJob, tile: int) -> None:
-    """Fuse the masks on one tile and write its labels, votes and part of the voxel field; a finished tile is left alone."""
+    """Fuse the masks on one tile and write its labels, votes and part of the voxel field; a finished tile is
+    left alone.
+    """
     if job.results.has(tile, "field"):
         return
     scene, store = Scene(job.scene), job.store
     window = store.window(tile, job.margin)
     records = window.gather(store.records)
     points, masks = positions(records), Masks.of(scene, job.confidence)
-    normals = unit_normals(columns(records, ("nx", "ny", "nz")), points, np.array([view.centre for view in masks.views]), job.extent.low)
+    normals = unit_normals(
+        columns(records, ("nx", "ny", "nz")),
+        points,
+        np.array([view.centre for view in masks.views]),
+        job.extent.low,
+    )
     origin = voxel_origin(job.extent.low, job.settings.voxel_size)
     density = point_density(scene, points, job.settings.voxel_size, origin) if job.settings.density else None
-    fusion = fuse(Cloud(points, normals, density, job.extent), masks.views, masks.read, job.maps, scene.class_table().num_ids, job.settings)
+    fusion = fuse(
+        Cloud(points, normals, density, job.extent),
+        masks.views,
+        masks.read,
+        job.maps,
+        scene.class_table().num_ids,
+        job.settings,
+    )
     core = window.core
     labels = fusion.labels
     job.results.write(
-        tile, label=labels.label[core], confidence=labels.confidence[core], state=labels.state[core],
-        num_views=labels.num_views[core].astype(np.int32), votes=fusion.votes[core], normals=normals[core],
+        tile,
+        label=labels.label[core],
+        confidence=labels.confidence[core],
+        state=labels.state[core],
+        num_views=labels.num_views[core].astype(np.int32),
+        votes=fusion.votes[core],
+        normals=normals[core],
     )
     keys, votes = _blocks(fusion, points, core)
     job.results.write(tile, keys=keys, field=votes)
 
 
 def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (B, 3) int32 and counts of the field's blocks whose first point, by row, lies in the tile: each block belongs to one tile."""
+    """Positions (B, 3) int32 and counts of the field's blocks whose first point, by row, lies in the tile:
+    each block belongs to one tile.
+    """
     field = fusion.field
     sorting = sort_by_voxel(points, field.voxel_size, field.origin)
     blocks, first_voxel = np.unique(sorting.keys // VOXELS, return_index=True)
@@ -134,9 +205,19 @@ def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.nd
 
 def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndarray:
     """The cloud with the labels of its tiles; returns the number of points in each state."""
-    added = [("label", "u1"), ("confidence", "f4"), ("state", "u1"), ("num_views", "i4"), *((f"{VOTES}{label}", "f4") for label in range(num_ids))]
+    added = [
+        ("label", "u1"),
+        ("confidence", "f4"),
+        ("state", "u1"),
+        ("num_views", "i4"),
+        *((f"{VOTES}{label}", "f4") for label in range(num_ids)),
+    ]
     names = {name for name, _ in added} | {"nx", "ny", "nz"}
-    kept = [(name, cloud.dtype[name].str[1:]) for name in cloud.dtype.names if name not in names and not name.startswith(VOTES)]
+    kept = [
+        (name, cloud.dtype[name].str[1:])
+        for name in cloud.dtype.names
+        if name not in names and not name.startswith(VOTES)
+    ]
     dtype = np.dtype([*kept, ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), *added])
     counts = np.zeros(8, np.int64)
 

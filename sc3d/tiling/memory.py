@@ -30,9 +30,12 @@ def memory_of(resources: Resources) -> int:
         total = int(float(found[1]) * UNITS[found[2].upper()])
     else:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
-    share = total // max(resources.workers + 1, 1) if not resources.cluster else total  # this process is there beside its workers
+    # this process is there beside its workers
+    share = total // max(resources.workers + 1, 1) if not resources.cluster else total
     if share <= BASE + (100 << 20):
-        raise InputError(f"--max-memory: {total >> 20} MiB are too little for {resources.workers + 1} processes of at least {(BASE >> 20) + 100} MiB")
+        raise InputError(
+            f"--max-memory: {total >> 20} MiB are too little for {resources.workers + 1} processes of at least {(BASE >> 20) + 100} MiB"
+        )
     return share
 
 
@@ -62,12 +65,22 @@ def mesh_triangles(path: Path) -> int:
 
 
 class Parts:
-    """A folder for what a stage has finished, beside its output: hidden, named after all that decides its content, and removed with the last output."""
+    """A folder for what a stage has finished, beside its output: hidden, named after all that decides its
+    content, and removed with the last output.
+    """
 
     def __init__(self, output: Path, stage: str, inputs: list[Path], settings: object) -> None:
         ignored = {field.name for field in fields(Resources)}
-        decisive = [sorted((name, str(value)) for name, value in asdict(settings).items() if name not in ignored | {"output"})]
-        state = hashlib.sha256(repr((stage, decisive, [_identity(path) for path in inputs])).encode()).hexdigest()[:12]
+        decisive = [
+            sorted(
+                (name, str(value))
+                for name, value in asdict(settings).items()
+                if name not in ignored | {"output"}
+            )
+        ]
+        state = hashlib.sha256(
+            repr((stage, decisive, [_identity(path) for path in inputs])).encode()
+        ).hexdigest()[:12]
         self.folder = output.absolute().parent / f".{output.name}.{state}.parts"
         for other in self.folder.parent.glob(f".{output.name}.*.parts"):
             if other != self.folder:
@@ -86,4 +99,6 @@ class Parts:
 def _identity(path: Path) -> tuple:
     """Of a file, or of all files of a folder: names, sizes and times."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    return str(path), tuple((str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file())
+    return str(path), tuple(
+        (str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file()
+    )

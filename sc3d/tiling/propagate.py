@@ -1,8 +1,11 @@
 """`propagate` for clouds that do not fit into memory, tile by tile, in passes.
 
-Mean field looks a few edges far in each round, so a tile with a margin as wide gives what the whole cloud would. What is learned of the classes, the
-ground below and which points hang together concern the whole: each pass ends with sums, minima or links over all tiles.
-`geometry` and `knn` see no farther than the margin, too; there a point farther from any seed may come out otherwise than in one piece.
+Mean field looks a few edges far in each round, so a tile with a margin as wide gives what the whole cloud
+would. What is learned of the classes, the
+ground below and which points hang together concern the whole: each pass ends with sums, minima or links over
+all tiles.
+`geometry` and `knn` see no farther than the margin, too; there a point farther from any seed may come out
+otherwise than in one piece.
 """
 
 from __future__ import annotations
@@ -55,7 +58,9 @@ HOPS = STEPS + 3  # how far a round of mean field looks, and what the edges at t
 
 @dataclass(frozen=True)
 class Summary:
-    """Of a finished cloud: points, those with a label, those that got it here, and the sum of the labelled points' confidences."""
+    """Of a finished cloud: points, those with a label, those that got it here, and the sum of the labelled
+    points' confidences.
+    """
 
     num_points: int
     labelled: int
@@ -67,7 +72,11 @@ def propagate_tiles(scene: Scene, settings: Propagate, cloud: CloudFile, tasks: 
     """Complete the labels of a cloud that `label` wrote, and write it."""
     output = settings.output or scene.labelled
     num_ids = sum(name.startswith(VOTES) for name in cloud.dtype.names)
-    missing = [name for name in ("nx", "label", "confidence", "state", "num_views", f"{VOTES}0") if name not in cloud.dtype.names]
+    missing = [
+        name
+        for name in ("nx", "label", "confidence", "state", "num_views", f"{VOTES}0")
+        if name not in cloud.dtype.names
+    ]
     if missing:
         raise InputError(f"{cloud.path} has no attribute {missing[0]!r}: it was not written by `sc3d label`")
     parts = Parts(output, "propagate", [cloud.path], settings)
@@ -75,7 +84,15 @@ def propagate_tiles(scene: Scene, settings: Propagate, cloud: CloudFile, tasks: 
     grid = survey.grid(max_points(settings, BYTES), HOPS * EDGE * survey.spacing)
     store = TileStore.build(cloud, grid, parts.subfolder("tiles"))
     margin = HOPS * EDGE * sample_spacing(store, survey)[0]
-    job = PropagateJob(settings, survey.extent, store, Results(parts.subfolder("results"), store), margin, num_ids, parts.subfolder("shared"))
+    job = PropagateJob(
+        settings,
+        survey.extent,
+        store,
+        Results(parts.subfolder("results"), store),
+        margin,
+        num_ids,
+        parts.subfolder("shared"),
+    )
     _solve(job, tasks, cloud.path)
     summary = _write(output, cloud, job)
     parts.remove()
@@ -86,17 +103,28 @@ def _solve(job: PropagateJob, tasks: Tasks, path: Path) -> None:
     """All passes; leaves arrays `label`, `confidence` and `state` of every tile."""
     tiles = job.store.tiles
     looks = tasks.run("graph", partial(_graph_task, job), tiles)
-    offered, least = sum(look.seeds for look in looks) > 0, views_to_agree(sum(look.agreement for look in looks))
+    offered, least = (
+        sum(look.seeds for look in looks) > 0,
+        views_to_agree(sum(look.agreement for look in looks)),
+    )
     if not offered.any():
-        raise InputError(f"{path} has no labelled point to start from: check that masks and cloud belong together, or lower --consensus in label")
-    lesson = _learn(job, tasks, Lean.total([look.lean for look in looks]), least) if needs_raters(job.settings) else None
+        raise InputError(
+            f"{path} has no labelled point to start from: check that masks and cloud belong together, or lower --consensus in label"
+        )
+    lesson = (
+        _learn(job, tasks, Lean.total([look.lean for look in looks]), least)
+        if needs_raters(job.settings)
+        else None
+    )
     source = "once"
     if job.settings.method == "map" and lesson is not None:
         for turn in range(max(job.settings.rounds, 1)):
             if turn and (lesson[0].sum(axis=0) >= MIN_EXAMPLES).sum() < 2:
                 break
             source = f"round{turn}"
-            lesson = added(tasks.run(f"round {turn + 1}", partial(_turn_task, job, offered, lesson, turn), tiles))
+            lesson = added(
+                tasks.run(f"round {turn + 1}", partial(_turn_task, job, offered, lesson, turn), tiles)
+            )
     else:
         tasks.run("labels", partial(_once_task, job, offered, lesson), tiles)
     reached = _reached(job, tasks) if job.settings.method == "map" else None
@@ -105,7 +133,9 @@ def _solve(job: PropagateJob, tasks: Tasks, path: Path) -> None:
 
 @dataclass(frozen=True)
 class Look:
-    """First look at a tile. seeds: (C,) int64 of each class; agreement: as `Evidence.agreement`; lean: of its surfaces"""
+    """First look at a tile. seeds: (C,) int64 of each class; agreement: as `Evidence.agreement`; lean: of its
+    surfaces
+    """
 
     seeds: np.ndarray
     agreement: np.ndarray
@@ -115,16 +145,30 @@ class Look:
 def _graph_task(job: PropagateJob, tile: int) -> Look:
     part = Part.load(job, tile)
     core, start = part.core, part.known.start
-    return Look(np.bincount(start[core], minlength=job.num_ids)[1 : job.num_ids], part.known.agreement(core), Lean.of(part.graph.normals[core], part.graph.spacings[core]))
+    return Look(
+        np.bincount(start[core], minlength=job.num_ids)[1 : job.num_ids],
+        part.known.agreement(core),
+        Lean.of(part.graph.normals[core], part.graph.spacings[core]),
+    )
 
 
 def _learn(job: PropagateJob, tasks: Tasks, lean: Lean, least: int) -> Lesson | None:
     """What the agreed points of all tiles teach, if that does well on points held out."""
     tiles, terrain = job.store.tiles, Terrain.over(lean, job.extent.low, job.extent.high)
-    for window, ground in zip(WINDOWS, terrain.grounds(tasks.run("ground", partial(_lowest_task, job, terrain), tiles)), strict=True):
+    for window, ground in zip(
+        WINDOWS, terrain.grounds(tasks.run("ground", partial(_lowest_task, job, terrain), tiles)), strict=True
+    ):
         np.save(job.shared / f"ground{window}.npy", ground)
-    counts = [Counts.total(list(parts)) for parts in zip(*tasks.run("relief", partial(_relief_task, job, terrain), tiles), strict=True)]
-    halves = [added(list(parts)) for parts in zip(*tasks.run("examples", partial(_lesson_task, job, counts, least), tiles), strict=True)]
+    counts = [
+        Counts.total(list(parts))
+        for parts in zip(*tasks.run("relief", partial(_relief_task, job, terrain), tiles), strict=True)
+    ]
+    halves = [
+        added(list(parts))
+        for parts in zip(
+            *tasks.run("examples", partial(_lesson_task, job, counts, least), tiles), strict=True
+        )
+    ]
     errors = tasks.run("held-out errors", partial(_error_task, job, halves, least), tiles)
     wrong = [None if None in fold else sum(fold) for fold in zip(*errors, strict=True)]
     lesson = added(halves)
@@ -141,21 +185,33 @@ def _relief_task(job: PropagateJob, terrain: Terrain, tile: int) -> list[Counts]
     grounds = [np.load(job.shared / f"ground{window}.npy", allow_pickle=False) for window in WINDOWS]
     relief = terrain.features(part.graph, part.known.points, grounds)
     job.results.write(tile, relief=part.own(relief))
-    return feature_counts(relief[part.core], None if part.known.colors is None else part.known.colors[part.core])
+    return feature_counts(
+        relief[part.core], None if part.known.colors is None else part.known.colors[part.core]
+    )
 
 
 def _lesson_task(job: PropagateJob, counts: list[Counts], least: int, tile: int) -> tuple[Lesson, Lesson]:
     part = Part.load(job, tile)
     raters = Raters.over(part.own_in_order(job.results.read(tile, "relief")), part.known.colors, counts)
     job.results.write(tile, cells=part.own(cells_of(raters)))
-    examples, folds = part.known.agreed_by(least) & part.core, folds_of(part.known.points, job.extent.low, job.extent.high)
-    return tuple(raters.lesson(part.known.start, examples & (folds == fold), part.known.num_classes) for fold in (0, 1))
+    examples, folds = (
+        part.known.agreed_by(least) & part.core,
+        folds_of(part.known.points, job.extent.low, job.extent.high),
+    )
+    return tuple(
+        raters.lesson(part.known.start, examples & (folds == fold), part.known.num_classes) for fold in (0, 1)
+    )
 
 
-def _error_task(job: PropagateJob, halves: list[Lesson], least: int, tile: int) -> tuple[int | None, int | None]:
+def _error_task(
+    job: PropagateJob, halves: list[Lesson], least: int, tile: int
+) -> tuple[int | None, int | None]:
     part = Part.load(job, tile)
     raters, start = part.raters(job), part.known.start
-    examples, folds = part.known.agreed_by(least) & part.core, folds_of(part.known.points, job.extent.low, job.extent.high)
+    examples, folds = (
+        part.known.agreed_by(least) & part.core,
+        folds_of(part.known.points, job.extent.low, job.extent.high),
+    )
     return tuple(raters.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1))
 
 
@@ -169,8 +225,16 @@ def _turn_task(job: PropagateJob, offered: np.ndarray, lesson: Lesson, turn: int
         examples = examples_in(belief, known)
         label, confidence = decided(part.graph, evidence, belief)
         names = (f"round{turn}_label", f"round{turn}_confidence", f"round{turn}_examples")
-        job.results.write(tile, **{name: part.own(values) for name, values in zip(names, (label, confidence, examples), strict=True)})
-    label, examples = (part.own_in_order(job.results.read(tile, f"round{turn}_{name}")) for name in ("label", "examples"))
+        job.results.write(
+            tile,
+            **{
+                name: part.own(values)
+                for name, values in zip(names, (label, confidence, examples), strict=True)
+            },
+        )
+    label, examples = (
+        part.own_in_order(job.results.read(tile, f"round{turn}_{name}")) for name in ("label", "examples")
+    )
     return raters.lesson(label, examples & part.core, known.num_classes)
 
 
@@ -178,7 +242,9 @@ def _once_task(job: PropagateJob, offered: np.ndarray, lesson: Lesson | None, ti
     """map without raters, geometry or knn, within the margin."""
     part = Part.load(job, tile)
     if job.settings.method == "map":
-        label, confidence = decided(part.graph, *unrated_belief(part.graph, part.known, offered, job.settings))
+        label, confidence = decided(
+            part.graph, *unrated_belief(part.graph, part.known, offered, job.settings)
+        )
     else:
         start = _start(job, part, lesson)
         label, confidence = spread(part.graph, part.known.points, start, job.settings)
@@ -188,11 +254,17 @@ def _once_task(job: PropagateJob, offered: np.ndarray, lesson: Lesson | None, ti
 def _start(job: PropagateJob, part: Part, lesson: Lesson | None) -> np.ndarray:
     """The labels of the seeds; for geometry and knn without those that look like another class."""
     start = part.known.start
-    return start if lesson is None or job.settings.method == "map" else verified(start, part.raters(job).rate(lesson, start))
+    return (
+        start
+        if lesson is None or job.settings.method == "map"
+        else verified(start, part.raters(job).rate(lesson, start))
+    )
 
 
 def _reached(job: PropagateJob, tasks: Tasks) -> dict[int, np.ndarray]:
-    """Per tile, (K,) bool: the connected groups of its points from which some path, through whatever tiles, leads to a seed."""
+    """Per tile, (K,) bool: the connected groups of its points from which some path, through whatever tiles,
+    leads to a seed.
+    """
     tiles = job.store.tiles
     sizes = np.cumsum([0, *tasks.run("connections", partial(_component_task, job), tiles)])
     first = dict(zip(tiles, sizes[:-1].tolist(), strict=True))
@@ -202,41 +274,61 @@ def _reached(job: PropagateJob, tasks: Tasks) -> dict[int, np.ndarray]:
     group, seeded = connected_components(graph, directed=False)[1], np.zeros(sizes[-1], bool)
     seeded[np.concatenate([with_seed for _, with_seed in found])] = True
     reached = np.bincount(group, seeded)[group] > 0
-    return {tile: reached[first[tile] : first[tile] + size] for tile, size in zip(tiles, np.diff(sizes), strict=True)}
+    return {
+        tile: reached[first[tile] : first[tile] + size]
+        for tile, size in zip(tiles, np.diff(sizes), strict=True)
+    }
 
 
 def _component_task(job: PropagateJob, tile: int) -> int:
-    """Number the connected groups of a part's points over the edges of the tile's own points; returns how many there are."""
+    """Number the connected groups of a part's points over the edges of the tile's own points; returns how
+    many there are.
+    """
     part = Part.load(job, tile)
     graph, count = part.graph, len(part.core)
     rows = np.repeat(part.core, np.diff(graph.starts))
     starts = np.append(0, np.cumsum(np.where(part.core, np.diff(graph.starts), 0)))
-    edges = csr_matrix((np.ones(int(rows.sum()), np.int8), graph.neighbors[rows], starts), shape=(count, count))
+    edges = csr_matrix(
+        (np.ones(int(rows.sum()), np.int8), graph.neighbors[rows], starts), shape=(count, count)
+    )
     number, group = connected_components(edges, directed=False)
     job.results.write(tile, group=part.own(group.astype(np.int32)), all_groups=group.astype(np.int32))
     return number
 
 
 def _link_task(job: PropagateJob, first: dict[int, int], tile: int) -> tuple[np.ndarray, np.ndarray]:
-    """(L, 2) pairs of groups, numbered over all tiles, that share a point, and (S,) groups of the tile that hold a seed."""
+    """(L, 2) pairs of groups, numbered over all tiles, that share a point, and (S,) groups of the tile that
+    hold a seed.
+    """
     part = Part.load(job, tile)
     mine = job.results.read(tile, "all_groups").astype(np.int64) + first[tile]
-    others = part.window.gather(lambda other: job.results.read(other, "group", mapped=True).astype(np.int64) + first[other])[part.graph.order]
+    others = part.window.gather(
+        lambda other: job.results.read(other, "group", mapped=True).astype(np.int64) + first[other]
+    )[part.graph.order]
     pairs = np.unique(np.stack([mine[~part.core], others[~part.core]], axis=1), axis=0)
     return pairs, np.unique(mine[part.core & (part.known.start > 0)])
 
 
-def _state_task(job: PropagateJob, source: str, reached: dict[int, np.ndarray] | None, lesson: Lesson | None, tile: int) -> None:
+def _state_task(
+    job: PropagateJob, source: str, reached: dict[int, np.ndarray] | None, lesson: Lesson | None, tile: int
+) -> None:
     part = Part.load(job, tile)
     label, confidence = (part.around(job, f"{source}_{name}") for name in ("label", "confidence"))
     if reached is not None:
-        groups = part.window.gather(lambda other: reached[other][job.results.read(other, "group", mapped=True)])
+        groups = part.window.gather(
+            lambda other: reached[other][job.results.read(other, "group", mapped=True)]
+        )
         label = np.where(groups[part.graph.order], label, 0)
     if job.settings.fill and (label == 0).any() and (label > 0).any():
         filled, filled_confidence = vote_nearest(part.known.points, label.astype(np.uint8), 1)
-        label, confidence = np.where(label == 0, filled, label), np.where(label == 0, 0.5 * filled_confidence, confidence)
+        label, confidence = (
+            np.where(label == 0, filled, label),
+            np.where(label == 0, 0.5 * filled_confidence, confidence),
+        )
     final = final_labels(part.known.seeds, _start(job, part, lesson), label, confidence, job.settings)
-    job.results.write(tile, label=part.own(final.label), confidence=part.own(final.confidence), state=part.own(final.state))
+    job.results.write(
+        tile, label=part.own(final.label), confidence=part.own(final.confidence), state=part.own(final.state)
+    )
 
 
 def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> Summary:
@@ -244,7 +336,9 @@ def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> Summary:
     counts, confidence = np.zeros(3, np.int64), [0.0]
 
     def chunks():
-        for (_, records), values in zip(cloud.chunks(), job.results.in_order(["label", "confidence", "state"]), strict=True):
+        for (_, records), values in zip(
+            cloud.chunks(), job.results.in_order(["label", "confidence", "state"]), strict=True
+        ):
             result = np.empty(len(records), np.dtype(kept))
             for name, _ in kept:
                 result[name] = values[name] if name in values else records[name]

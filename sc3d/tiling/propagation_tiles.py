@@ -1,4 +1,6 @@
-"""What `propagate` keeps of each tile between its passes: the neighbour graph of the tile and its margin, and arrays of the tile's own points."""
+"""What `propagate` keeps of each tile between its passes: the neighbour graph of the tile and its margin, and
+arrays of the tile's own points.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,15 @@ from sc3d.settings.labels import Propagate
 from sc3d.tiling.store import Results, TileStore, Window
 
 GRAPH = tuple(field.name for field in fields(Graph))
-KNOWN = ("points", "votes", *(field.name for field in fields(Labels)), "colors")  # of Evidence, in the order of the graph
+# of Evidence, in the order of the graph
+KNOWN = ("points", "votes", *(field.name for field in fields(Labels)), "colors")
 
 
 @dataclass(frozen=True)
 class PropagateJob:
-    """What the task of a tile needs to know. margin: world units; num_ids: channels of the votes; shared: folder for what all tiles read"""
+    """What the task of a tile needs to know. margin: world units; num_ids: channels of the votes; shared:
+    folder for what all tiles read
+    """
 
     settings: Propagate
     extent: Extent
@@ -83,7 +88,9 @@ class Part:
 def raters_of(cells: np.ndarray) -> Raters:
     """Raters from the cells (N, G) int32 that `cells_of` gives."""
     relief = Cells(cells[:, -1], (RELIEF_BINS,) * NUM_FEATURES, RELIEF_BLUR)
-    return Raters((relief,) if cells.shape[1] == 1 else (Cells(cells[:, 0], (COLOR_BINS,) * 3, COLOR_BLUR), relief))
+    return Raters(
+        (relief,) if cells.shape[1] == 1 else (Cells(cells[:, 0], (COLOR_BINS,) * 3, COLOR_BLUR), relief)
+    )
 
 
 def cells_of(raters: Raters) -> np.ndarray:
@@ -94,9 +101,16 @@ def cells_of(raters: Raters) -> np.ndarray:
 def _build(job: PropagateJob, tile: int, window: Window) -> None:
     evidence, normals = _evidence(job, window)
     colors, box = evidence.colors if job.settings.color else None, (job.extent.low, job.extent.high)
-    graph = build_graph(evidence.points, normals, job.settings.num_neighbors, colors, tie_breakers(evidence, normals), box)
+    graph = build_graph(
+        evidence.points, normals, job.settings.num_neighbors, colors, tie_breakers(evidence, normals), box
+    )
     known = evidence.ordered(graph.order)
-    values = (known.points, known.votes, *(getattr(known.seeds, field.name) for field in fields(Labels)), known.colors if job.colored else np.empty(0))
+    values = (
+        known.points,
+        known.votes,
+        *(getattr(known.seeds, field.name) for field in fields(Labels)),
+        known.colors if job.colored else np.empty(0),
+    )
     for names, arrays in ((GRAPH, [getattr(graph, name) for name in GRAPH]), (KNOWN, values)):
         job.results.write(tile, **{f"part_{name}": array for name, array in zip(names, arrays, strict=True)})
 
@@ -108,7 +122,18 @@ def _mapped(job: PropagateJob, tile: int, names: tuple[str, ...]) -> list[np.nda
 def _evidence(job: PropagateJob, window: Window) -> tuple[Evidence, np.ndarray]:
     """What is known of the window's points, by row, and their normals."""
     records = window.gather(job.store.records)
-    labels = Labels(*(records[name].astype(kind) for name, kind in
-                      (("label", np.uint8), ("confidence", np.float32), ("state", np.uint8), ("num_views", np.int32))))
+    labels = Labels(
+        *(
+            records[name].astype(kind)
+            for name, kind in (
+                ("label", np.uint8),
+                ("confidence", np.float32),
+                ("state", np.uint8),
+                ("num_views", np.int32),
+            )
+        )
+    )
     votes = columns(records, [f"{VOTES}{label}" for label in range(job.num_ids)])
-    return Evidence(positions(records), labels, votes, columns(records, ("red", "green", "blue"))), columns(records, ("nx", "ny", "nz"))
+    return Evidence(positions(records), labels, votes, columns(records, ("red", "green", "blue"))), columns(
+        records, ("nx", "ny", "nz")
+    )

@@ -1,4 +1,5 @@
-"""First surfaces through a mesh that need not fit into memory: it is cut into parts, and the nearest hit over all parts counts.
+"""First surfaces through a mesh that need not fit into memory: it is cut into parts, and the nearest hit over
+all parts counts.
 
 The minimum does not care about the order of the parts, so the ranges are those of the whole mesh.
 """
@@ -25,15 +26,21 @@ SLACK = 1e-5  # of the box around a part, and of a range: rays that only just re
 
 @dataclass(frozen=True)
 class MeshParts:
-    """Triangles by tile of the ground plane: folder/<part>.bin, (T, 9) float32 corners less `origin` (3,); boxes: {part: (2, 3) float64 their box, same frame}."""
+    """Triangles by tile of the ground plane: folder/<part>.bin, (T, 9) float32 corners less `origin` (3,);
+    boxes: {part: (2, 3) float64 their box, same frame}.
+    """
 
     folder: Path
     origin: np.ndarray
     boxes: dict[int, np.ndarray]
 
     @classmethod
-    def split(cls, triangles: Iterable[np.ndarray], grid: Grid, folder: Path, origin: np.ndarray) -> MeshParts:
-        """triangles: chunks (T, 3, 3) float64 world. Each triangle goes to the tile of its first corner. Parts that are there already are taken as they are."""
+    def split(
+        cls, triangles: Iterable[np.ndarray], grid: Grid, folder: Path, origin: np.ndarray
+    ) -> MeshParts:
+        """triangles: chunks (T, 3, 3) float64 world. Each triangle goes to the tile of its first corner.
+        Parts that are there already are taken as they are.
+        """
         index = folder / "boxes.npz"
         if not index.exists():
             for old in folder.iterdir():
@@ -49,22 +56,45 @@ class MeshParts:
                     with (folder / f"{tile}.bin").open("ab") as file:
                         file.write(np.ascontiguousarray(mine))
             with atomic_path(index) as temporary:
-                np.savez(temporary, parts=np.array(sorted(boxes), np.int64), boxes=np.array([boxes[part] for part in sorted(boxes)]).reshape(-1, 2, 3))
+                np.savez(
+                    temporary,
+                    parts=np.array(sorted(boxes), np.int64),
+                    boxes=np.array([boxes[part] for part in sorted(boxes)]).reshape(-1, 2, 3),
+                )
         stored = np.load(index, allow_pickle=False)
-        return cls(folder, np.asarray(origin, np.float64), dict(zip(stored["parts"].tolist(), stored["boxes"], strict=True)))
+        return cls(
+            folder,
+            np.asarray(origin, np.float64),
+            dict(zip(stored["parts"].tolist(), stored["boxes"], strict=True)),
+        )
 
     def surface(self, part: int) -> Surface:
         corners = np.fromfile(self.folder / f"{part}.bin", np.float32).reshape(-1, 3)
-        return Surface(Surface.from_mesh(corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3), np.zeros(3)).scene, self.origin)
+        return Surface(
+            Surface.from_mesh(
+                corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3), np.zeros(3)
+            ).scene,
+            self.origin,
+        )
 
 
 def read_triangles(path: Path) -> Iterator[np.ndarray]:
-    """Corners (T, 3, 3) float64, world, of the triangles of a binary PLY, in chunks; the vertices stay on disk."""
+    """Corners (T, 3, 3) float64, world, of the triangles of a binary PLY, in chunks; the vertices stay on
+    disk.
+    """
     header = check_ply(path)
     vertex, face = header.element("vertex"), header.element("face")
     corners = next((entry for entry in face.properties if entry.count), None) if face is not None else None
-    if not header.order or vertex is None or vertex.has_lists or corners is None or [element.name for element in header.elements] != ["vertex", "face"]:
-        raise InputError(f"{path} does not fit into --max-memory, and can be read in parts as binary PLY of vertices and triangles only: write it anew")
+    if (
+        not header.order
+        or vertex is None
+        or vertex.has_lists
+        or corners is None
+        or [element.name for element in header.elements] != ["vertex", "face"]
+    ):
+        raise InputError(
+            f"{path} does not fit into --max-memory, and can be read in parts as binary PLY of vertices and triangles only: write it anew"
+        )
     table = np.dtype([(entry.name, header.order + entry.dtype) for entry in vertex.properties])
     row = np.dtype([field for entry in face.properties for field in _fields(entry, corners, header.order)])
     start = header.size + table.itemsize * vertex.rows
@@ -72,9 +102,12 @@ def read_triangles(path: Path) -> Iterator[np.ndarray]:
         count = min(CHUNK, face.rows - first)
         faces = np.fromfile(path, row, count, offset=start + first * row.itemsize)
         if len(faces) < count or (faces["count"] != 3).any():
-            raise InputError(f"{path} has faces that are not triangles: cut them into triangles, or allow more --max-memory")
+            raise InputError(
+                f"{path} has faces that are not triangles: cut them into triangles, or allow more --max-memory"
+            )
         used, inverse = np.unique(faces["corners"], return_inverse=True)
-        vertices = positions(np.memmap(path, table, "r", header.size, (vertex.rows,))[used])  # mapped anew each time, so that its pages can go
+        # mapped anew each time, so that its pages can go
+        vertices = positions(np.memmap(path, table, "r", header.size, (vertex.rows,))[used])
         yield vertices[inverse.reshape(-1, 3)]
 
 
@@ -86,12 +119,22 @@ def _fields(entry, corners, order: str) -> list[tuple]:
     return [(entry.name, order + entry.dtype)]
 
 
-def _cast(parts: MeshParts, part: int, surface: Surface, view: View, directions: np.ndarray, nearest: np.ndarray) -> None:
+def _cast(
+    parts: MeshParts, part: int, surface: Surface, view: View, directions: np.ndarray, nearest: np.ndarray
+) -> None:
     """Lower `nearest` (H * W,) to the hits in one part."""
     low, high = parts.boxes[part]
     slack = SLACK * (1 + np.abs(view.centre - parts.origin).max() + (high - low).max())
     reached = np.empty(len(nearest), np.bool_)
-    _reach(directions, view.cam_from_world, view.centre - parts.origin, low - slack, high + slack, nearest, reached)
+    _reach(
+        directions,
+        view.cam_from_world,
+        view.centre - parts.origin,
+        low - slack,
+        high + slack,
+        nearest,
+        reached,
+    )
     pixels = np.flatnonzero(reached)
     if len(pixels):
         nearest[pixels] = np.minimum(nearest[pixels], surface.cast(view, directions[pixels])[0])
@@ -104,7 +147,10 @@ def _reach(directions, cam_from_world, start, low, high, nearest, reached):
         enter, leave = 0.0, np.inf
         for axis in range(3):
             slope = np.float64(directions[k, 0]) * cam_from_world[0, axis]
-            slope += np.float64(directions[k, 1]) * cam_from_world[1, axis] + np.float64(directions[k, 2]) * cam_from_world[2, axis]
+            slope += (
+                np.float64(directions[k, 1]) * cam_from_world[1, axis]
+                + np.float64(directions[k, 2]) * cam_from_world[2, axis]
+            )
             if abs(slope) < 1e-12:
                 if start[axis] < low[axis] or start[axis] > high[axis]:
                     leave = -1.0
@@ -116,7 +162,9 @@ def _reach(directions, cam_from_world, start, low, high, nearest, reached):
 
 @dataclass(frozen=True)
 class RangeMaps:
-    """Ranges that are computed already, as a `RayTarget`: folder/<number of the view>.npy; numbers: {name of the view: number}."""
+    """Ranges that are computed already, as a `RayTarget`: folder/<number of the view>.npy; numbers: {name of
+    the view: number}.
+    """
 
     folder: Path
     numbers: dict[str, int]
@@ -137,7 +185,9 @@ class RangeMaps:
 
 
 def write_ranges(parts: MeshParts, views: list[View], maps: RangeMaps) -> None:
-    """Ranges of a group of views, sized as they shall be; a part of the mesh is loaded once for all of them. Memory: one part and the maps of the group."""
+    """Ranges of a group of views, sized as they shall be; a part of the mesh is loaded once for all of them.
+    Memory: one part and the maps of the group.
+    """
     views = [view for view in views if not maps.path(view).exists()]
     rays_of = {view.name: np.full(view.height * view.width, np.inf, np.float32) for view in views}
     for part, (low, high) in parts.boxes.items():

@@ -1,4 +1,5 @@
-"""The points of a cloud sorted into square tiles of the ground plane, on disk; a tile is read with a margin of its neighbours' points.
+"""The points of a cloud sorted into square tiles of the ground plane, on disk; a tile is read with a margin
+of its neighbours' points.
 
 Memory: one chunk while sorting; one tile with its margin, and one neighbour, while reading.
 """
@@ -23,7 +24,9 @@ MAX_TILES = 4096
 
 @dataclass(frozen=True)
 class Grid:
-    """Square tiles. low: (2,) corner of the first; size: side, world units; shape: tiles along both axes; axes: the two world axes of the ground plane."""
+    """Square tiles. low: (2,) corner of the first; size: side, world units; shape: tiles along both axes;
+    axes: the two world axes of the ground plane.
+    """
 
     low: np.ndarray
     size: float
@@ -32,11 +35,16 @@ class Grid:
 
     def tile_of(self, points: np.ndarray) -> np.ndarray:
         """(N,) int32 tile of each (N, 3) point; points outside belong to the nearest."""
-        cells = [np.clip((points[:, axis] - self.low[k]) // self.size, 0, self.shape[k] - 1).astype(np.int32) for k, axis in enumerate(self.axes)]
+        cells = [
+            np.clip((points[:, axis] - self.low[k]) // self.size, 0, self.shape[k] - 1).astype(np.int32)
+            for k, axis in enumerate(self.axes)
+        ]
         return cells[0] * self.shape[1] + cells[1]
 
     def box(self, tile: int) -> tuple[np.ndarray, np.ndarray]:
-        """(2,) lower and (2,) upper corner of a tile, along `axes`; the outer sides lie at infinity, as `tile_of` has it."""
+        """(2,) lower and (2,) upper corner of a tile, along `axes`; the outer sides lie at infinity, as
+        `tile_of` has it.
+        """
         cell = np.array(divmod(tile, self.shape[1]))
         low = np.where(cell == 0, -np.inf, self.low + cell * self.size)
         high = np.where(cell == np.array(self.shape) - 1, np.inf, self.low + (cell + 1) * self.size)
@@ -50,15 +58,26 @@ class Grid:
 
     def neighbors(self, tile: int, margin: float) -> list[int]:
         """The tiles that the margin around a tile reaches into, itself first."""
-        reach, (row, column) = int(np.ceil(margin / self.size)) if margin > 0 else 0, divmod(tile, self.shape[1])
-        around = [(i, j) for i in range(row - reach, row + reach + 1) for j in range(column - reach, column + reach + 1)]
-        inside = [i * self.shape[1] + j for i, j in around if 0 <= i < self.shape[0] and 0 <= j < self.shape[1]]
+        reach, (row, column) = (
+            int(np.ceil(margin / self.size)) if margin > 0 else 0,
+            divmod(tile, self.shape[1]),
+        )
+        around = [
+            (i, j)
+            for i in range(row - reach, row + reach + 1)
+            for j in range(column - reach, column + reach + 1)
+        ]
+        inside = [
+            i * self.shape[1] + j for i, j in around if 0 <= i < self.shape[0] and 0 <= j < self.shape[1]
+        ]
         return [tile, *(other for other in inside if other != tile)]
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What one pass over a cloud tells: its box and median, and points per cell of a raster over the ground plane (RASTER, RASTER) int64."""
+    """What one pass over a cloud tells: its box and median, and points per cell of a raster over the ground
+    plane (RASTER, RASTER) int64.
+    """
 
     extent: Extent
     axes: tuple[int, int]
@@ -81,12 +100,15 @@ class Survey:
 
     @property
     def spacing(self) -> float:
-        """About the distance between points, world units: from the cells that hold any, so too large for clouds with gaps smaller than a cell."""
+        """About the distance between points, world units: from the cells that hold any, so too large for
+        clouds with gaps smaller than a cell.
+        """
         side = float((self.extent.high - self.extent.low)[list(self.axes)].max()) / RASTER
         return side * float(np.sqrt((self.counts > 0).sum() / max(self.counts.sum(), 1)))
 
     def grid(self, max_points: int, margin: float = 0.0) -> Grid:
-        """The largest tiles such that none holds more than about `max_points`, the margin around it (world units) included.
+        """The largest tiles such that none holds more than about `max_points`, the margin around it (world
+        units) included.
 
         InputError if the margin would be wider than the tile.
         """
@@ -95,9 +117,22 @@ class Survey:
         for parts in range(1, int(MAX_TILES**0.5) + 1):
             side, around = RASTER / parts, margin / extent * RASTER
             if parts > 1 and around > side:
-                raise InputError(f"--max-memory leaves room for tiles of {extent / parts:g} only, too little beside margins of {margin:g}: allow more memory")
-            low, high = (np.clip(edges, 0, RASTER).astype(int) for edges in (np.arange(parts) * side - around, np.ceil((np.arange(parts) + 1) * side + around)))
-            held = sums[np.ix_(high, high)] - sums[np.ix_(low, high)] - sums[np.ix_(high, low)] + sums[np.ix_(low, low)]
+                raise InputError(
+                    f"--max-memory leaves room for tiles of {extent / parts:g} only, too little beside margins of {margin:g}: allow more memory"
+                )
+            low, high = (
+                np.clip(edges, 0, RASTER).astype(int)
+                for edges in (
+                    np.arange(parts) * side - around,
+                    np.ceil((np.arange(parts) + 1) * side + around),
+                )
+            )
+            held = (
+                sums[np.ix_(high, high)]
+                - sums[np.ix_(low, high)]
+                - sums[np.ix_(high, low)]
+                + sums[np.ix_(low, low)]
+            )
             if held.max() <= max_points:
                 break
         return _square_grid(self.extent, self.axes, parts)
@@ -107,12 +142,18 @@ def _square_grid(extent: Extent, axes: tuple[int, int], parts: int) -> Grid:
     """So many tiles along the longer side; along the shorter, as many as are needed."""
     sides = (extent.high - extent.low)[list(axes)]
     size = float(sides.max()) / parts or 1.0
-    return Grid(extent.low[list(axes)], size, tuple(int(count) for count in np.clip(np.ceil(sides / size - 1e-9), 1, parts)), axes)
+    return Grid(
+        extent.low[list(axes)],
+        size,
+        tuple(int(count) for count in np.clip(np.ceil(sides / size - 1e-9), 1, parts)),
+        axes,
+    )
 
 
 @dataclass(frozen=True)
 class Window:
-    """A tile and the points around it, by row. parts: (tile, which of its points) in turn; order: (N,) that sorts them; rows: (N,) int64 sorted rows in the
+    """A tile and the points around it, by row. parts: (tile, which of its points) in turn; order: (N,) that
+    sorts them; rows: (N,) int64 sorted rows in the
     cloud; core: (N,) bool, points of the tile itself."""
 
     parts: list[tuple[int, np.ndarray | slice]]
@@ -127,7 +168,9 @@ class Window:
 
 @dataclass(frozen=True)
 class TileStore:
-    """Records by tile. folder/<tile>.bin: records; folder/<tile>.row: their rows in the cloud, rising, int64; counts: points of each tile, empty ones left out."""
+    """Records by tile. folder/<tile>.bin: records; folder/<tile>.row: their rows in the cloud, rising, int64;
+    counts: points of each tile, empty ones left out.
+    """
 
     folder: Path
     grid: Grid
@@ -136,7 +179,9 @@ class TileStore:
 
     @classmethod
     def build(cls, cloud: CloudFile, grid: Grid, folder: Path) -> TileStore:
-        """Sort a cloud into tiles. A store that is there already is taken as it is: the folder's name says what it holds."""
+        """Sort a cloud into tiles. A store that is there already is taken as it is: the folder's name says
+        what it holds.
+        """
         index = folder / "index.json"
         if not index.exists():
             folder.mkdir(parents=True, exist_ok=True)
@@ -153,9 +198,16 @@ class TileStore:
                     _append(folder / f"{tile}.row", start + rows)
                 counts += found
             temporary = folder / ".index.tmp"
-            temporary.write_text(json.dumps({int(tile): int(counts[tile]) for tile in np.flatnonzero(counts)}))
+            temporary.write_text(
+                json.dumps({int(tile): int(counts[tile]) for tile in np.flatnonzero(counts)})
+            )
             temporary.replace(index)
-        return cls(folder, grid, cloud.dtype, {int(tile): count for tile, count in json.loads(index.read_text()).items()})
+        return cls(
+            folder,
+            grid,
+            cloud.dtype,
+            {int(tile): count for tile, count in json.loads(index.read_text()).items()},
+        )
 
     @property
     def tiles(self) -> list[int]:
@@ -168,17 +220,24 @@ class TileStore:
         return np.memmap(self.folder / f"{tile}.row", np.int64, "r")
 
     def window(self, tile: int, margin: float) -> Window:
-        """The points of a tile, and those less than `margin` (world units) around it; which these are is remembered in a file."""
+        """The points of a tile, and those less than `margin` (world units) around it; which these are is
+        remembered in a file.
+        """
         file = self.folder / f"{tile}.margin-{margin:.9g}.npz"
         if not file.exists():
             around = {}
             for other in self.grid.neighbors(tile, margin)[1:]:
                 if other in self.counts:
-                    around[str(other)] = np.flatnonzero(self.grid.within(positions(self.records(other)), tile, margin)).astype(np.int32)
+                    around[str(other)] = np.flatnonzero(
+                        self.grid.within(positions(self.records(other)), tile, margin)
+                    ).astype(np.int32)
             with atomic_path(file) as temporary:
                 np.savez(temporary, **around)
         with np.load(file, allow_pickle=False) as around:
-            parts = [(tile, slice(None)), *((int(other), around[other]) for other in around.files if len(around[other]))]
+            parts = [
+                (tile, slice(None)),
+                *((int(other), around[other]) for other in around.files if len(around[other])),
+            ]
         rows = np.concatenate([self.rows(other)[kept] for other, kept in parts])
         order = np.argsort(rows)
         core = np.zeros(len(rows), bool)

@@ -24,7 +24,9 @@ SURFEL_MARGIN = 8.0  # of a tile, in point spacings: room for the neighbours of 
 
 @dataclass(frozen=True)
 class RangeJob:
-    """What a task needs to know: where the scene and the parts of its surface are, and the size of each view (width, height)."""
+    """What a task needs to know: where the scene and the parts of its surface are, and the size of each view
+    (width, height).
+    """
 
     scene: Path
     parts: MeshParts
@@ -34,8 +36,14 @@ class RangeJob:
 
 def compute_ranges(job: RangeJob, tasks: Tasks) -> RangeMaps:
     """Ranges of all views in `job.sizes`; those that are there already are kept."""
-    names = [name for name in _by_place(job) if not (job.maps.folder / f"{job.maps.numbers[name]}.npy").exists()]
-    tasks.run("first surfaces", partial(_range_task, job), [names[start : start + GROUP] for start in range(0, len(names), GROUP)])
+    names = [
+        name for name in _by_place(job) if not (job.maps.folder / f"{job.maps.numbers[name]}.npy").exists()
+    ]
+    tasks.run(
+        "first surfaces",
+        partial(_range_task, job),
+        [names[start : start + GROUP] for start in range(0, len(names), GROUP)],
+    )
     return job.maps
 
 
@@ -49,7 +57,9 @@ def _by_place(job: RangeJob) -> list[str]:
     views = views_of(job.scene)
     names = sorted(job.sizes)
     centres = np.array([views[name].centre for name in names])
-    cells = ((centres - centres.min(axis=0)) / max(float(np.ptp(centres, axis=0).max()), 1e-9) * 7.999).astype(int)
+    cells = (
+        (centres - centres.min(axis=0)) / max(float(np.ptp(centres, axis=0).max()), 1e-9) * 7.999
+    ).astype(int)
     return [names[row] for row in np.lexsort((cells[:, 1], cells[:, 0]))]
 
 
@@ -62,7 +72,8 @@ def views_of(scene: Path) -> dict[str, View]:
 def split_mesh(path: Path, folder: Path, origin: np.ndarray, memory: int) -> MeshParts:
     """Parts of a mesh file small enough for `memory` bytes."""
     vertices = CloudFile.open(path)
-    grid = Survey.of(vertices).grid(max((memory - BASE) // TRIANGLE // 2, 1000))  # about two triangles for each vertex
+    # about two triangles for each vertex
+    grid = Survey.of(vertices).grid(max((memory - BASE) // TRIANGLE // 2, 1000))
     return MeshParts.split(read_triangles(path), grid, folder, origin)
 
 
@@ -75,5 +86,7 @@ def _surfel_triangles(store: TileStore, spacing: float, origin: np.ndarray) -> I
     for tile in store.tiles:
         window = store.window(tile, SURFEL_MARGIN * spacing)
         records = window.gather(store.records)
-        vertices, triangles = surfels(positions(records) - origin, columns(records, ("nx", "ny", "nz")), spacing, window.core)
+        vertices, triangles = surfels(
+            positions(records) - origin, columns(records, ("nx", "ny", "nz")), spacing, window.core
+        )
         yield vertices[triangles] + origin

@@ -1,4 +1,6 @@
-"""The voxel field of a whole cloud from those of its tiles, in the file that Open3D's `VoxelBlockGrid` reads, without holding it in memory."""
+"""The voxel field of a whole cloud from those of its tiles, in the file that Open3D's `VoxelBlockGrid` reads,
+without holding it in memory.
+"""
 
 from __future__ import annotations
 
@@ -16,22 +18,41 @@ BLOCKS = 2048  # held at a time
 
 
 def write_field(results: Results, tiles: list[int], voxel_size: float, path: Path) -> None:
-    """The blocks of all tiles (`keys` (B, 3) and `field` of each), sorted by position, as one `VoxelBlockGrid` npz."""
+    """The blocks of all tiles (`keys` (B, 3) and `field` of each), sorted by position, as one
+    `VoxelBlockGrid` npz.
+    """
     keys = [results.read(tile, "keys") for tile in tiles]
-    owner, row = np.repeat(np.arange(len(tiles)), [len(part) for part in keys]), np.concatenate([np.arange(len(part)) for part in keys])
+    owner, row = (
+        np.repeat(np.arange(len(tiles)), [len(part) for part in keys]),
+        np.concatenate([np.arange(len(part)) for part in keys]),
+    )
     joined = np.concatenate(keys)
     order = np.lexsort(joined.T[::-1])
     shape = results.read(tiles[0], "field", mapped=True).shape[1:]
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
-        _array(archive, "value_000", (len(joined), *shape), np.int32, _sorted(results, tiles, owner[order], row[order], shape))
+        _array(
+            archive,
+            "value_000",
+            (len(joined), *shape),
+            np.int32,
+            _sorted(results, tiles, owner[order], row[order], shape),
+        )
         _array(archive, "key", joined.shape, np.int32, [joined[order]])
-        for name, value in (("attr_name_votes", np.zeros(1, np.int32)), ("CPU:0", np.uint8(0)),
-                            ("block_resolution", np.array([BLOCK], np.int64)), ("voxel_size", np.array([voxel_size], np.float32))):
+        for name, value in (
+            ("attr_name_votes", np.zeros(1, np.int32)),
+            ("CPU:0", np.uint8(0)),
+            ("block_resolution", np.array([BLOCK], np.int64)),
+            ("voxel_size", np.array([voxel_size], np.float32)),
+        ):
             _array(archive, name, value.shape, value.dtype, [value])
 
 
-def _sorted(results: Results, tiles: list[int], owner: np.ndarray, row: np.ndarray, shape: tuple[int, ...]) -> Iterator[np.ndarray]:
-    """Counts of BLOCKS blocks at a time; owner: (B,) place of each block's tile in `tiles`; row: (B,) its row there."""
+def _sorted(
+    results: Results, tiles: list[int], owner: np.ndarray, row: np.ndarray, shape: tuple[int, ...]
+) -> Iterator[np.ndarray]:
+    """Counts of BLOCKS blocks at a time; owner: (B,) place of each block's tile in `tiles`; row: (B,) its row
+    there.
+    """
     for start in range(0, len(owner), BLOCKS):
         part = slice(start, start + BLOCKS)
         values = np.empty((len(owner[part]), *shape), np.int32)
@@ -41,8 +62,14 @@ def _sorted(results: Results, tiles: list[int], owner: np.ndarray, row: np.ndarr
         yield values
 
 
-def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: type, parts: Iterable[np.ndarray]) -> None:
-    with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as file:  # without a date, so that equal fields are equal files
-        np.lib.format.write_array_header_1_0(file, {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape})
+def _array(
+    archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: type, parts: Iterable[np.ndarray]
+) -> None:
+    # without a date, so that equal fields are equal files
+    with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as file:
+        np.lib.format.write_array_header_1_0(
+            file,
+            {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape},
+        )
         for part in parts:
             file.write(np.ascontiguousarray(part, dtype).tobytes())

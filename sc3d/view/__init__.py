@@ -6,6 +6,13 @@ from sc3d.view.viewpoints import aerial_view
 from sc3d.view.window import show
 
 __all__ = [
-    "COLOURINGS", "STATES", "PointImage", "Style",
-    "aerial_view", "color_points", "draw_points", "screenshot", "show",
+    "COLOURINGS",
+    "STATES",
+    "PointImage",
+    "Style",
+    "aerial_view",
+    "color_points",
+    "draw_points",
+    "screenshot",
+    "show",
 ]

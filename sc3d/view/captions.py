@@ -10,7 +10,9 @@ from sc3d.view.colors import ColorScale, Colouring, color_scale, legend_entries
 PAPER, INK = (255, 255, 255), (32, 34, 38)
 
 
-def add_legend(image: np.ndarray, by: Colouring, class_table: ClassTable | None, present: set[int] | None = None) -> np.ndarray:
+def add_legend(
+    image: np.ndarray, by: Colouring, class_table: ClassTable | None, present: set[int] | None = None
+) -> np.ndarray:
     """The picture with a legend strip below it; the picture itself stays as it is.
 
     image: (H, W, 3) uint8 RGB; present: ids to list, None = all
@@ -43,7 +45,11 @@ def _swatches(entries: list[tuple[str, tuple[int, int, int]]], width: int) -> np
     draw = ImageDraw.Draw(strip)
     for (name, color), (left, top) in zip(entries, places, strict=True):
         middle = top + line // 2
-        draw.rectangle((left, middle - size // 2, left + size, middle + size // 2), fill=tuple(color), outline=(120, 120, 120))
+        draw.rectangle(
+            (left, middle - size // 2, left + size, middle + size // 2),
+            fill=tuple(color),
+            outline=(120, 120, 120),
+        )
         draw.text((left + 1.6 * size, middle), name, font=font, fill=INK, anchor="lm")
     return np.asarray(strip)
 

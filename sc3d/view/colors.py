@@ -1,4 +1,6 @@
-"""What a point's colour means: the photos, its class, its confidence, the way its label came about, or how much the photos disagree about it."""
+"""What a point's colour means: the photos, its class, its confidence, the way its label came about, or how
+much the photos disagree about it.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,13 @@ STATES = (  # by value of `state`; colours apart for the colour-blind too (Okabe
 CONTESTED = 0.5  # disagreement from which on the colour stays the same: no class has a majority there
 _AGREED_TO_CONTESTED = ((222, 226, 230), (244, 165, 60), (165, 15, 60))
 _LIGHT, _AMBIENT = (-0.5, 0.5, 0.7071), 0.45
-_ATTRIBUTES = {"photo": "colors", "label": "label", "confidence": "confidence", "state": "state", "disagreement": "votes_1"}
+_ATTRIBUTES = {
+    "photo": "colors",
+    "label": "label",
+    "confidence": "confidence",
+    "state": "state",
+    "disagreement": "votes_1",
+}
 _MAKERS = {
     "photo": "the cloud has no photo colours: `sc3d extract SCENE` makes them",
     "label": "the cloud has no labels: run `sc3d label SCENE` and `sc3d propagate SCENE`, or look at it with --by photo",
@@ -46,10 +54,13 @@ _MAKERS = {
 }
 
 
-def color_points(cloud: o3d.t.geometry.PointCloud, by: Colouring, class_table: ClassTable | None = None) -> np.ndarray:
+def color_points(
+    cloud: o3d.t.geometry.PointCloud, by: Colouring, class_table: ClassTable | None = None
+) -> np.ndarray:
     """Colours that show one attribute of a cloud, or of the vertices of a mesh.
 
-    by: "photo" (colors), "label" (class colours), "confidence" (viridis, 0 dark to 1 bright), "state" (see STATES) or "disagreement" (of the votes)
+    by: "photo" (colors), "label" (class colours), "confidence" (viridis, 0 dark to 1 bright), "state" (see
+        STATES) or "disagreement" (of the votes)
     class_table: needed for "label"
     returns: (N, 3) uint8 RGB
     Raises InputError that names the stage if the attribute is missing.
@@ -66,7 +77,9 @@ def color_points(cloud: o3d.t.geometry.PointCloud, by: Colouring, class_table: C
     if by == "confidence":
         return confidence_colors(values)
     if by == "state":
-        palette = np.array([STATES[value if value < len(STATES) else 0].color for value in range(256)], np.uint8)
+        palette = np.array(
+            [STATES[value if value < len(STATES) else 0].color for value in range(256)], np.uint8
+        )
     elif class_table is None:
         raise InputError("class colours need the class table (classes.json)")
     else:
@@ -79,7 +92,9 @@ def can_color(cloud: o3d.t.geometry.PointCloud, by: Colouring) -> bool:
     return _ATTRIBUTES[by] in _attributes(cloud)
 
 
-def _attributes(geometry: o3d.t.geometry.PointCloud | o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TensorMap:
+def _attributes(
+    geometry: o3d.t.geometry.PointCloud | o3d.t.geometry.TriangleMesh,
+) -> o3d.t.geometry.TensorMap:
     return geometry.point if hasattr(geometry, "point") else geometry.vertex
 
 
@@ -96,10 +111,14 @@ def disagreement(votes: np.ndarray) -> np.ndarray:
 
 
 def disagreement_colors(values: np.ndarray) -> np.ndarray:
-    """(N, 3) uint8 RGB of (N,) disagreements: light grey where all agree, over orange to dark red from CONTESTED on; grey like unseen points where NaN."""
+    """(N, 3) uint8 RGB of (N,) disagreements: light grey where all agree, over orange to dark red from
+    CONTESTED on; grey like unseen points where NaN.
+    """
     stops = np.linspace(0, CONTESTED, len(_AGREED_TO_CONTESTED))
     known = np.nan_to_num(np.asarray(values, np.float64))
-    colors = np.stack([np.interp(known, stops, channel) for channel in np.transpose(_AGREED_TO_CONTESTED)], axis=-1)
+    colors = np.stack(
+        [np.interp(known, stops, channel) for channel in np.transpose(_AGREED_TO_CONTESTED)], axis=-1
+    )
     return np.where(np.isnan(values)[..., None], STATES[0].color, np.round(colors)).astype(np.uint8)
 
 
@@ -107,17 +126,26 @@ def confidence_colors(confidence: np.ndarray) -> np.ndarray:
     """(N, 3) uint8 RGB, viridis, of (N,) or (N, 1) confidences from 0 to 1; not finite counts as 0."""
     values = np.nan_to_num(np.asarray(confidence, np.float64).reshape(-1), nan=0.0, posinf=0.0, neginf=0.0)
     levels = np.round(np.clip(values, 0.0, 1.0) * 255).astype(np.uint8)
-    viridis = cv2.applyColorMap(np.arange(256, dtype=np.uint8).reshape(-1, 1), cv2.COLORMAP_VIRIDIS).reshape(256, 3)[:, ::-1]
+    viridis = cv2.applyColorMap(np.arange(256, dtype=np.uint8).reshape(-1, 1), cv2.COLORMAP_VIRIDIS).reshape(
+        256, 3
+    )[:, ::-1]
     return viridis[levels]
 
 
-def legend_entries(by: Colouring, class_table: ClassTable | None, present: set[int] | None = None) -> list[tuple[str, tuple[int, int, int]]]:
-    """Names and RGB colours that explain a colouring; empty for photo colours and for confidence and disagreement, which have a scale.
+def legend_entries(
+    by: Colouring, class_table: ClassTable | None, present: set[int] | None = None
+) -> list[tuple[str, tuple[int, int, int]]]:
+    """Names and RGB colours that explain a colouring; empty for photo colours and for confidence and
+    disagreement, which have a scale.
 
     present: ids that occur; None = list all classes or states
     """
     if by == "state":
-        return [(state.name, state.color) for value, state in enumerate(STATES) if present is None or value in present]
+        return [
+            (state.name, state.color)
+            for value, state in enumerate(STATES)
+            if present is None or value in present
+        ]
     if by != "label" or class_table is None:
         return []
     entries = [(entry.name, entry.color) for entry in class_table if present is None or entry.id in present]
@@ -144,9 +172,11 @@ def color_scale(by: Colouring) -> ColorScale | None:
 
 
 def shaded(colors: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Colours in light from the north-west and above, as maps shade hills, so that shapes show where a whole class has one colour.
+    """Colours in light from the north-west and above, as maps shade hills, so that shapes show where a whole
+    class has one colour.
 
-    colors: (N, 3) uint8 RGB; normals: (N, 3) towards the outside; returns: (N, 3) uint8 RGB, the given colours on level ground
+    colors: (N, 3) uint8 RGB; normals: (N, 3) towards the outside; returns: (N, 3) uint8 RGB, the given
+        colours on level ground
     """
     lengths = np.linalg.norm(normals, axis=1)
     cosine = normals @ np.float32(_LIGHT) / np.where(lengths > 0, lengths, 1)

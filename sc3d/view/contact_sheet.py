@@ -27,8 +27,12 @@ _SOFT, _WARNING = (100, 107, 117), (190, 70, 0)
 _EMPTY = (60, 62, 66)  # where nothing is
 
 
-def write_training_sheet(path: Path, result: TrainResult, data: TrainingData, settings: TrainSettings) -> None:
-    """Write the contact sheet of a training, a picture of 1600 px width; its title says how long and how well."""
+def write_training_sheet(
+    path: Path, result: TrainResult, data: TrainingData, settings: TrainSettings
+) -> None:
+    """Write the contact sheet of a training, a picture of 1600 px width; its title says how long and how
+    well.
+    """
     from sc3d.view.splat_images import training_rows
 
     title = f"{settings.iterations:,} iterations, {len(result.gaussians):,} Gaussians"
@@ -50,14 +54,30 @@ def contact_sheet(rows: Sequence[Comparison], title: str, width: int = 1600) -> 
     font, size = caption_font(width)
     cell = (width - 2 * _MARGIN - 3 * _GAP) // 4
     near_far = depth_range([row.depth for row in rows])
-    panels = [[_fitted(panel, cell) for panel in (row.photo, row.rendered, depth_colors(row.depth, near_far), normal_colors(row.normals))]
-              for row in rows]
+    panels = [
+        [
+            _fitted(panel, cell)
+            for panel in (
+                row.photo,
+                row.rendered,
+                depth_colors(row.depth, near_far),
+                normal_colors(row.normals),
+            )
+        ]
+        for row in rows
+    ]
     line = round(1.6 * size)
     top = _MARGIN + 3 * line
     height = top + sum(line + _GAP + panel[0].shape[0] for panel in panels) + _MARGIN
     sheet = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(sheet)
-    draw.text((_MARGIN, _MARGIN + line // 2), _shortened(title, font, width - 2 * _MARGIN), font=font, fill=INK, anchor="lm")
+    draw.text(
+        (_MARGIN, _MARGIN + line // 2),
+        _shortened(title, font, width - 2 * _MARGIN),
+        font=font,
+        fill=INK,
+        anchor="lm",
+    )
     lefts = [_MARGIN + column * (cell + _GAP) for column in range(4)]
     _heads(sheet, lefts, _MARGIN + 2 * line, cell, near_far)
     for row, panel in zip(rows, panels, strict=True):
@@ -70,7 +90,9 @@ def contact_sheet(rows: Sequence[Comparison], title: str, width: int = 1600) -> 
 
 
 def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Nearest and farthest depth that the colours tell apart: 1st and 99th percentile of all; (1, 1) if all are empty."""
+    """Nearest and farthest depth that the colours tell apart: 1st and 99th percentile of all; (1, 1) if all
+    are empty.
+    """
     found = np.concatenate([depth[depth > 0].ravel()[::7] for depth in depths])
     return tuple(np.quantile(found, [0.01, 0.99]).tolist()) if len(found) else (1.0, 1.0)
 
@@ -87,7 +109,9 @@ def depth_colors(depth: np.ndarray, near_far: tuple[float, float]) -> np.ndarray
 
 
 def normal_colors(normals: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 RGB (n + 1) / 2 of (H, W, 3) unit normals, so that up (+z) is light blue; dark grey where they are 0."""
+    """(H, W, 3) uint8 RGB (n + 1) / 2 of (H, W, 3) unit normals, so that up (+z) is light blue; dark grey
+    where they are 0.
+    """
     colors = np.round((np.clip(normals, -1, 1) + 1) * 127.5).astype(np.uint8)
     colors[(normals == 0).all(axis=2)] = _EMPTY
     return colors
@@ -110,11 +134,19 @@ def side_by_side(pictures: Sequence[np.ndarray], captions: Sequence[str]) -> np.
     for row, (image, caption) in enumerate(zip(pictures, captions, strict=True)):
         start = row * (width + _GAP)
         picture.paste(Image.fromarray(image), (start, 0))
-        draw.text((start + size // 2, height + size), _shortened(caption, font, width - size), font=font, fill=INK, anchor="lm")
+        draw.text(
+            (start + size // 2, height + size),
+            _shortened(caption, font, width - size),
+            font=font,
+            fill=INK,
+            anchor="lm",
+        )
     return np.asarray(picture)
 
 
-def _heads(sheet: Image.Image, lefts: list[int], middle: int, cell: int, near_far: tuple[float, float]) -> None:
+def _heads(
+    sheet: Image.Image, lefts: list[int], middle: int, cell: int, near_far: tuple[float, float]
+) -> None:
     """Names of the columns, with the colour bar of the depth and the colours of three directions."""
     from PIL import Image, ImageDraw
 
@@ -122,7 +154,10 @@ def _heads(sheet: Image.Image, lefts: list[int], middle: int, cell: int, near_fa
     for left, name in zip(lefts, ("photo", "rendering", "depth", "normals"), strict=True):
         draw.text((left, middle), name, font=font, fill=_SOFT, anchor="lm")
     near, far = (f"{value:.3g} m" for value in near_far)
-    start, end = lefts[2] + font.getlength(f"depth  {near}  "), lefts[2] + cell - size - font.getlength(f"  {far}")
+    start, end = (
+        lefts[2] + font.getlength(f"depth  {near}  "),
+        lefts[2] + cell - size - font.getlength(f"  {far}"),
+    )
     draw.text((start - font.getlength("  "), middle), near, font=font, fill=INK, anchor="rm")
     draw.text((lefts[2] + cell - size, middle), far, font=font, fill=INK, anchor="rm")
     levels = np.linspace(*near_far, max(2, round(end - start)))[None]
@@ -141,7 +176,9 @@ def _caption(draw: ImageDraw.ImageDraw, row: Comparison, middle: int, cell: int,
     left, text = _MARGIN + cell + _GAP, f"PSNR {row.psnr:.2f} dB"
     draw.text((left, middle), text, font=font, fill=INK, anchor="lm")
     if row.held_out:
-        draw.text((left + font.getlength(text + "   "), middle), "held out", font=font, fill=_WARNING, anchor="lm")
+        draw.text(
+            (left + font.getlength(text + "   "), middle), "held out", font=font, fill=_WARNING, anchor="lm"
+        )
 
 
 def _shortened(text: str, font, width: float) -> str:

@@ -12,7 +12,9 @@ from sc3d.errors import Sc3dError
 def check_display() -> None:
     """Raise Sc3dError that says what to do where no window can be opened."""
     if not has_display():
-        raise Sc3dError("no display to open a window on: `sc3d view SCENE --screenshot FILE` renders a picture without one, --web shows it in a browser")
+        raise Sc3dError(
+            "no display to open a window on: `sc3d view SCENE --screenshot FILE` renders a picture without one, --web shows it in a browser"
+        )
 
 
 def has_display() -> bool:

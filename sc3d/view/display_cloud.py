@@ -1,4 +1,6 @@
-"""What a viewer shows of a cloud: positions near zero, in an order whose beginnings thin it evenly, and its colours."""
+"""What a viewer shows of a cloud: positions near zero, in an order whose beginnings thin it evenly, and its
+colours.
+"""
 
 from __future__ import annotations
 
@@ -40,19 +42,37 @@ class ShownCloud:
     _colors: dict[tuple[str, bool], np.ndarray] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, cloud: o3d.t.geometry.PointCloud, origin: np.ndarray, class_table: ClassTable | None) -> ShownCloud:
+    def of(
+        cls, cloud: o3d.t.geometry.PointCloud, origin: np.ndarray, class_table: ClassTable | None
+    ) -> ShownCloud:
         """origin: (3,) world, near the cloud"""
         world = cloud.point.positions.cpu().numpy()
         rows = even_order(world)
         points = (world[rows].astype(np.float64) - origin).astype(np.float32)
-        label = cloud.point["label"].cpu().numpy().ravel().astype(np.uint8)[rows] if "label" in cloud.point else np.zeros(len(rows), np.uint8)
+        label = (
+            cloud.point["label"].cpu().numpy().ravel().astype(np.uint8)[rows]
+            if "label" in cloud.point
+            else np.zeros(len(rows), np.uint8)
+        )
         sample = points[:_SAMPLE]
-        return cls(cloud, origin, points, rows, label, spacing_of(sample) * np.sqrt(len(sample) / len(points)), class_table)
+        return cls(
+            cloud,
+            origin,
+            points,
+            rows,
+            label,
+            spacing_of(sample) * np.sqrt(len(sample) / len(points)),
+            class_table,
+        )
 
     @property
     def colourings(self) -> tuple[Colouring, ...]:
         """What the cloud can be coloured by."""
-        return tuple(by for by in COLOURINGS if can_color(self.cloud, by) and (by != "label" or self.class_table is not None))
+        return tuple(
+            by
+            for by in COLOURINGS
+            if can_color(self.cloud, by) and (by != "label" or self.class_table is not None)
+        )
 
     @property
     def has_relief(self) -> bool:
@@ -60,12 +80,16 @@ class ShownCloud:
         return "normals" in self.cloud.point
 
     def colors(self, by: Colouring, relief: bool = False) -> np.ndarray:
-        """(N, 3) uint8 RGB; kept once made. relief: shaded by the normals, but for the colours of the photos, which have light and shade"""
+        """(N, 3) uint8 RGB; kept once made. relief: shaded by the normals, but for the colours of the photos,
+        which have light and shade
+        """
         if relief and (by == "photo" or not self.has_relief):
             return self.colors(by)
         if (by, relief) not in self._colors:
             if relief:
-                self._colors[by, True] = shaded(self.colors(by), self.cloud.point.normals.cpu().numpy()[self.rows])
+                self._colors[by, True] = shaded(
+                    self.colors(by), self.cloud.point.normals.cpu().numpy()[self.rows]
+                )
             else:
                 self._colors[by, False] = color_points(self.cloud, by, self.class_table)[self.rows]
         return self._colors[by, relief]
@@ -97,7 +121,9 @@ class ShownCloud:
 
 
 def class_ids(class_table: ClassTable | None, names: tuple[str, ...]) -> set[int] | None:
-    """Ids of the named classes, "unlabelled" being 0; None without names, for all. InputError for a name that the table does not have."""
+    """Ids of the named classes, "unlabelled" being 0; None without names, for all. InputError for a name that
+    the table does not have.
+    """
     if not names:
         return None
     if class_table is None:
@@ -123,11 +149,17 @@ def only_classes(cloud: o3d.t.geometry.PointCloud, ids: set[int] | None) -> o3d.
     return cloud.select_by_mask(o3d.core.Tensor(chosen))
 
 
-def with_votes(cloud: o3d.t.geometry.PointCloud, seeds: o3d.t.geometry.PointCloud) -> o3d.t.geometry.PointCloud:
-    """The cloud with the votes that `label` left in the seeds it was made from; InputError if the seeds are other points."""
+def with_votes(
+    cloud: o3d.t.geometry.PointCloud, seeds: o3d.t.geometry.PointCloud
+) -> o3d.t.geometry.PointCloud:
+    """The cloud with the votes that `label` left in the seeds it was made from; InputError if the seeds are
+    other points.
+    """
     positions, others = (one.point.positions.cpu().numpy() for one in (cloud, seeds))
     if positions.shape != others.shape or not np.array_equal(positions, others):
-        raise InputError("the labelled cloud and seeds.ply hold different points: run `sc3d propagate SCENE --overwrite`, or pass --file")
+        raise InputError(
+            "the labelled cloud and seeds.ply hold different points: run `sc3d propagate SCENE --overwrite`, or pass --file"
+        )
     result = cloud.clone()
     for name in [name for name in seeds.point if name.startswith(VOTES)]:
         result.point[name] = seeds.point[name]

@@ -1,4 +1,6 @@
-"""The Gaussians of a scene as a viewer needs them: with their labels where there are any, and painted by them."""
+"""The Gaussians of a scene as a viewer needs them: with their labels where there are any, and painted by
+them.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ SPLAT_COLOURINGS: tuple[Colouring, ...] = ("photo", "label", "confidence")
 
 @dataclass(frozen=True)
 class ShownSplats:
-    """N Gaussians in the frame shifted by `origin` (3,), and their labels where `sc3d export --format splats` has found them.
+    """N Gaussians in the frame shifted by `origin` (3,), and their labels where `sc3d export --format splats`
+    has found them.
 
     label: (N,) uint8 ids, 0 = none; confidence: (N,) float32, 0 to 1; both None for gaussians.ply
     """
@@ -42,11 +45,15 @@ class ShownSplats:
         return painted(self.gaussians, self.colors(by, table) / 255)
 
     def colors(self, by: Colouring, table: ClassTable | None) -> np.ndarray:
-        """(N, 3) uint8 RGB; of the photos: the mean over all directions of view, without what changes with them."""
+        """(N, 3) uint8 RGB; of the photos: the mean over all directions of view, without what changes with
+        them.
+        """
         if by == "photo":
             from sc3d.splatting.gaussians import SH_C0
 
-            return np.round(np.clip(0.5 + SH_C0 * self.gaussians.sh[:, 0].numpy(), 0, 1) * 255).astype(np.uint8)
+            return np.round(np.clip(0.5 + SH_C0 * self.gaussians.sh[:, 0].numpy(), 0, 1) * 255).astype(
+                np.uint8
+            )
         if by not in SPLAT_COLOURINGS:
             raise InputError(f"splats have no {by}: choose --by photo, label or confidence")
         if self.label is None or table is None:
@@ -58,7 +65,9 @@ class ShownSplats:
         if ids is None:
             return self
         if self.label is None:
-            raise InputError("--classes needs labels, and the splats have none: run `sc3d export SCENE --format splats`")
+            raise InputError(
+                "--classes needs labels, and the splats have none: run `sc3d export SCENE --format splats`"
+            )
         chosen = np.isin(self.label, sorted(ids))
         if not chosen.any():
             raise InputError("no splat has one of the chosen classes: nothing to show")
@@ -68,21 +77,31 @@ class ShownSplats:
         """The centres as a cloud: positions (world), colors, and label and confidence where there are labels."""
         import open3d as o3d
 
-        cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(self.gaussians.means.numpy().astype(np.float64) + self.origin))
+        cloud = o3d.t.geometry.PointCloud(
+            o3d.core.Tensor(self.gaussians.means.numpy().astype(np.float64) + self.origin)
+        )
         cloud.point.colors = o3d.core.Tensor(self.colors("photo", None))
         if self.label is not None:
-            cloud.point["label"], cloud.point["confidence"] = o3d.core.Tensor(self.label[:, None]), o3d.core.Tensor(self.confidence[:, None])
+            cloud.point["label"], cloud.point["confidence"] = (
+                o3d.core.Tensor(self.label[:, None]),
+                o3d.core.Tensor(self.confidence[:, None]),
+            )
         return cloud
 
     def most_visible(self, count: int) -> ShownSplats:
         """At most `count` splats: those with the largest area times opacity, in their order."""
         if len(self.gaussians) <= count:
             return self
-        area = np.sort(self.gaussians.scales.numpy(), axis=1)[:, 1:].prod(axis=1) * self.gaussians.opacities.numpy()
+        area = (
+            np.sort(self.gaussians.scales.numpy(), axis=1)[:, 1:].prod(axis=1)
+            * self.gaussians.opacities.numpy()
+        )
         return self[np.sort(np.argsort(-area, kind="stable")[:count])]
 
     def __getitem__(self, chosen: np.ndarray) -> ShownSplats:
-        label, confidence = (None if values is None else values[chosen] for values in (self.label, self.confidence))
+        label, confidence = (
+            None if values is None else values[chosen] for values in (self.label, self.confidence)
+        )
         return replace(self, gaussians=self.gaussians[chosen], label=label, confidence=confidence)
 
 
@@ -94,12 +113,16 @@ def trained_splats(scene: Scene) -> ShownSplats:
 
 
 def labelled_splats(scene: Scene, table: ClassTable) -> ShownSplats:
-    """What `sc3d export SCENE --format splats` wrote; InputError if it is missing or belongs to other cameras."""
+    """What `sc3d export SCENE --format splats` wrote; InputError if it is missing or belongs to other
+    cameras.
+    """
     from sc3d.exporters.splats import read_splats
 
     path = scene.export / "splats.ply"
     scene.require(path, hint=f"run `sc3d export {scene.path} --format splats` first")
     found = read_splats(path, table)
     if scene.sparse.is_dir() and np.abs(found.origin - local_origin(scene.model.views)).max() > 1e-3:
-        raise InputError(f"{path} belongs to other cameras than those in {scene.sparse}: run `sc3d export {scene.path} --format splats --overwrite`")
+        raise InputError(
+            f"{path} belongs to other cameras than those in {scene.sparse}: run `sc3d export {scene.path} --format splats --overwrite`"
+        )
     return ShownSplats(found.gaussians, found.origin, found.label, found.confidence)

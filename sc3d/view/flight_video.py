@@ -18,7 +18,9 @@ from sc3d.view.viewpoints import fitted
 FRAMES_PER_SECOND = 25
 
 
-def flight_path(views: Sequence[View], size: tuple[int, int], frames_per_view: int = 20, longest: int = 600) -> list[View]:
+def flight_path(
+    views: Sequence[View], size: tuple[int, int], frames_per_view: int = 20, longest: int = 600
+) -> list[View]:
     """Pinhole cameras of a smooth ride through the views in their order, at even speed.
 
     size: (width, height) px that the frames fit into; they have the first view's field of view and even sides

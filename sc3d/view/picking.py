@@ -1,4 +1,6 @@
-"""A point that was clicked: its label, how sure it is, how the photos voted, and which of them saw it. Needs no window."""
+"""A point that was clicked: its label, how sure it is, how the photos voted, and which of them saw it. Needs
+no window.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,10 @@ logger = logging.getLogger(__name__)
 class PickedPoint:
     """What is known of one point; None where the cloud does not have it.
 
-    row: in the cloud; position: (3,) float64 world; label: name of its class; confidence: 0 to 1; state: see `colors.STATES`
-    votes: by class name, in photos of full weight, largest first; photos: names of those that see it on their first surface
+    row: in the cloud; position: (3,) float64 world; label: name of its class; confidence: 0 to 1; state: see
+        `colors.STATES`
+    votes: by class name, in photos of full weight, largest first; photos: names of those that see it on their
+        first surface
     """
 
     row: int
@@ -44,8 +48,14 @@ class PickedPoint:
     def facts(self) -> list[tuple[str, str]]:
         """Names and values for people to read; photos not included."""
         found = [("position", " ".join(f"{value:.2f}" for value in self.position)), ("class", self.label)]
-        found += [("confidence", None if self.confidence is None else f"{self.confidence:.2f}"), ("state", self.state)]
-        found += [("votes", ", ".join(f"{name} {count:.1f}" for name, count in self.votes.items()) or None), ("seen by", f"{len(self.photos)} photos")]
+        found += [
+            ("confidence", None if self.confidence is None else f"{self.confidence:.2f}"),
+            ("state", self.state),
+        ]
+        found += [
+            ("votes", ", ".join(f"{name} {count:.1f}" for name, count in self.votes.items()) or None),
+            ("seen by", f"{len(self.photos)} photos"),
+        ]
         return [(name, value) for name, value in found if value is not None]
 
     def __str__(self) -> str:
@@ -54,14 +64,21 @@ class PickedPoint:
 
 
 class Inspector:
-    """Looks points of one cloud up; the search tree and the surface that hides them are made when they are first needed.
+    """Looks points of one cloud up; the search tree and the surface that hides them are made when they are
+    first needed.
 
-    views: photos that may have seen the points; mesh: file of the surface, surfels of the cloud if it does not exist
+    views: photos that may have seen the points; mesh: file of the surface, surfels of the cloud if it does
+        not exist
     voxel_size: of the labels, which is the tolerance of visibility, world units; None = 2 point spacings
     """
 
     def __init__(
-        self, cloud: o3d.t.geometry.PointCloud, views: Sequence[View], class_table: ClassTable | None, mesh: Path, voxel_size: float | None = None,
+        self,
+        cloud: o3d.t.geometry.PointCloud,
+        views: Sequence[View],
+        class_table: ClassTable | None,
+        mesh: Path,
+        voxel_size: float | None = None,
     ) -> None:
         self.cloud, self.views, self.class_table, self._mesh = cloud, list(views), class_table, mesh
         self._points = cloud.point.positions.cpu().numpy().astype(np.float64)
@@ -75,17 +92,41 @@ class Inspector:
     def look_up(self, row: int) -> PickedPoint:
         """All that is known of a point of the cloud."""
         attributes, table = self.cloud.point, self.class_table
-        value = {name: attributes[name][row].item() for name in ("label", "confidence", "state") if name in attributes}
-        label = None if "label" not in value else table.name(value["label"]) if table is not None else f"class {value['label']}"
-        state = None if "state" not in value else STATES[value["state"]].name if value["state"] < len(STATES) else f"state {value['state']}"
-        photos = photos_that_see(self._points[row], self._normal(row), self.views, self._surface, self._voxel_size) if self.views else []
-        return PickedPoint(row, self._points[row], label, value.get("confidence"), state, self._votes_of(row), tuple(photos))
+        value = {
+            name: attributes[name][row].item()
+            for name in ("label", "confidence", "state")
+            if name in attributes
+        }
+        label = (
+            None
+            if "label" not in value
+            else table.name(value["label"])
+            if table is not None
+            else f"class {value['label']}"
+        )
+        state = (
+            None
+            if "state" not in value
+            else STATES[value["state"]].name
+            if value["state"] < len(STATES)
+            else f"state {value['state']}"
+        )
+        photos = (
+            photos_that_see(self._points[row], self._normal(row), self.views, self._surface, self._voxel_size)
+            if self.views
+            else []
+        )
+        return PickedPoint(
+            row, self._points[row], label, value.get("confidence"), state, self._votes_of(row), tuple(photos)
+        )
 
     def _votes_of(self, row: int) -> dict[str, float]:
         votes = self._votes
         if votes is None:
             return {}
-        cast = [(float(votes[row, label]), label) for label in range(1, votes.shape[1]) if votes[row, label] > 0]
+        cast = [
+            (float(votes[row, label]), label) for label in range(1, votes.shape[1]) if votes[row, label] > 0
+        ]
         named = self.class_table.name if self.class_table is not None else "class {}".format
         return {named(label): count for count, label in sorted(cast, key=lambda entry: (-entry[0], entry[1]))}
 
@@ -95,7 +136,9 @@ class Inspector:
             normal = self.cloud.point.normals[row].cpu().numpy().astype(np.float64)
             if np.isfinite(normal).all() and normal.any():
                 return normal / np.linalg.norm(normal)
-        count, rows, _ = self._tree.search_knn_vector_3d(self._points[row] - self._points[0], NORMAL_NEIGHBORS)
+        count, rows, _ = self._tree.search_knn_vector_3d(
+            self._points[row] - self._points[0], NORMAL_NEIGHBORS
+        )
         point = self._points[row][None]
         if count < 3:
             return np.array([0.0, 0.0, 1.0])
@@ -121,10 +164,13 @@ class Inspector:
         return read_surface(self._mesh, self._points, normals, local_origin(self.views))
 
 
-def photos_that_see(point: np.ndarray, normal: np.ndarray, views: Sequence[View], surface: RayTarget, voxel_size: float) -> list[str]:
+def photos_that_see(
+    point: np.ndarray, normal: np.ndarray, views: Sequence[View], surface: RayTarget, voxel_size: float
+) -> list[str]:
     """Names of the photos in which a point lies on the first surface, by the rule that fusion uses.
 
-    point, normal: (3,) world, the normal towards the outside; voxel_size: tolerance, world units. One ray is cast per photo.
+    point, normal: (3,) world, the normal towards the outside; voxel_size: tolerance, world units. One ray is
+        cast per photo.
     """
     return [view.name for view in views if _sees(view, point[None], normal[None], surface, voxel_size)]
 
@@ -133,16 +179,21 @@ def _sees(view: View, points: np.ndarray, normals: np.ndarray, surface: RayTarge
     pixels, _ = project(view, points)
     if not in_image(view, pixels)[0]:
         return False
-    directions, ray_z = rays(view, np.floor(pixels) + 0.5)  # of the pixel's centre, as in a picture of the whole surface
+    # of the pixel's centre, as in a picture of the whole surface
+    directions, ray_z = rays(view, np.floor(pixels) + 0.5)
     distance, incidence = surface.cast(view, (directions @ view.cam_from_world[:3, :3].T).astype(np.float32))
-    everywhere = (np.broadcast_to(values[:1].astype(np.float32), (view.height, view.width)) for values in (distance, incidence, ray_z))
+    everywhere = (
+        np.broadcast_to(values[:1].astype(np.float32), (view.height, view.width))
+        for values in (distance, incidence, ray_z)
+    )
     return len(see_points(view, points, normals, FirstSurface(*everywhere), voxel_size).points) > 0
 
 
 def point_on_ray(points: np.ndarray, origin: np.ndarray, direction: np.ndarray, size: float) -> int | None:
     """Row of the point that a click shows: the one nearest to the ray among the first points that it passes.
 
-    points: (N, 3); origin, direction: (3,) in the same frame; size: side of a drawn point, in the units of the points
+    points: (N, 3); origin, direction: (3,) in the same frame; size: side of a drawn point, in the units of
+        the points
     returns: None if the ray passes no point within `size`
     """
     direction = np.asarray(direction, np.float64) / np.linalg.norm(direction)
@@ -156,10 +207,14 @@ def point_on_ray(points: np.ndarray, origin: np.ndarray, direction: np.ndarray, 
     return int(first[np.argmin(across[first])])
 
 
-def position_at(depth: np.ndarray, pixel: tuple[int, int], view_matrix: np.ndarray, projection: np.ndarray) -> np.ndarray | None:
-    """(3,) position of what a pixel of a rendered view shows, in the frame of the view's scene; None for the background.
+def position_at(
+    depth: np.ndarray, pixel: tuple[int, int], view_matrix: np.ndarray, projection: np.ndarray
+) -> np.ndarray | None:
+    """(3,) position of what a pixel of a rendered view shows, in the frame of the view's scene; None for the
+    background.
 
-    depth: (H, W), either z (inf = background) or, as Open3D before 0.20 has it, the depth buffer (0 = near plane, 1 = far plane and background)
+    depth: (H, W), either z (inf = background) or, as Open3D before 0.20 has it, the depth buffer (0 = near
+        plane, 1 = far plane and background)
     pixel: column, row; view_matrix, projection: (4, 4) of OpenGL, camera looking along -z
     """
     column, row = pixel
@@ -174,5 +229,10 @@ def position_at(depth: np.ndarray, pixel: tuple[int, int], view_matrix: np.ndarr
         return None
     else:
         clip_z, clip_w = 2 * value - 1, 1.0
-    found = np.linalg.inv(projection @ np.asarray(view_matrix, np.float64)) @ [right * clip_w, up * clip_w, clip_z, clip_w]
+    found = np.linalg.inv(projection @ np.asarray(view_matrix, np.float64)) @ [
+        right * clip_w,
+        up * clip_w,
+        clip_z,
+        clip_w,
+    ]
     return found[:3] / found[3]

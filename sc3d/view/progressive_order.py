@@ -8,10 +8,13 @@ _BITS = 21  # per axis; three of them fit into 63 bits
 
 
 def even_order(points: np.ndarray) -> np.ndarray:
-    """Rows of the points so that the first K of them, for any K, thin the cloud evenly and keep its relative densities.
+    """Rows of the points so that the first K of them, for any K, thin the cloud evenly and keep its relative
+    densities.
 
-    The points are sorted along a Z-order curve, which neighbours share, and then taken in the order of the van der Corput sequence,
-    whose every beginning is spread evenly over the curve. Nothing is random, and copies of a cloud in another order give the same points.
+    The points are sorted along a Z-order curve, which neighbours share, and then taken in the order of the
+    van der Corput sequence,
+    whose every beginning is spread evenly over the curve. Nothing is random, and copies of a cloud in another
+    order give the same points.
 
     points: (N, 3) finite; returns: (N,) int64, a permutation
     """
@@ -33,7 +36,13 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
 
 def _spread(values: np.ndarray) -> np.ndarray:
     """Two zero bits between any two of the 21 bits of (N,) uint64."""
-    for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
         values = (values | values << np.uint64(shift)) & np.uint64(mask)
     return values
 

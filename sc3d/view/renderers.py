@@ -1,9 +1,12 @@
-"""Open3D's two renderers behind one function: Filament on Vulkan, and the OpenGL visualizer through EGL. Neither needs a display.
+"""Open3D's two renderers behind one function: Filament on Vulkan, and the OpenGL visualizer through EGL.
+Neither needs a display.
 
 Known failures, and what is done about them (Open3D 0.20):
-- no Vulkan driver: the process aborts instead of raising, and after a failed start the OpenGL visualizer fails too: so another process tries first;
+- no Vulkan driver: the process aborts instead of raising, and after a failed start the OpenGL visualizer
+    fails too: so another process tries first;
 - two living OffscreenRenderers abort: each dies in the function that made it;
-- the OpenGL visualizer ignores the principal point and fx != fy: it draws a larger centred picture, from which the view is cut.
+- the OpenGL visualizer ignores the principal point and fx != fy: it draws a larger centred picture, from
+    which the view is cut.
 """
 
 from __future__ import annotations
@@ -46,7 +49,9 @@ class Drawing:
     line_color: tuple[int, int, int] = (240, 160, 20)
 
 
-def render(drawing: Drawing, view: View, background: tuple[int, int, int], renderer: str = "auto") -> np.ndarray:
+def render(
+    drawing: Drawing, view: View, background: tuple[int, int, int], renderer: str = "auto"
+) -> np.ndarray:
     """Draw through a pinhole view.
 
     view: without distortion, in the frame of `drawing`; renderer: "auto", "vulkan" or "egl"
@@ -67,7 +72,9 @@ def vulkan_works() -> bool:
     except (OSError, subprocess.TimeoutExpired):
         return False
     if probe.returncode:
-        logger.info("Open3D's Vulkan renderer does not work here (`apt install libvulkan1 mesa-vulkan-drivers`), OpenGL is used")
+        logger.info(
+            "Open3D's Vulkan renderer does not work here (`apt install libvulkan1 mesa-vulkan-drivers`), OpenGL is used"
+        )
     return probe.returncode == 0
 
 
@@ -102,9 +109,12 @@ def _tensor_geometries(drawing: Drawing) -> dict:
     points = tensor(np.ascontiguousarray(drawing.points, dtype=np.float32))
     geometries = {}
     if drawing.triangles is not None and len(drawing.triangles):
-        mesh = o3d.t.geometry.TriangleMesh(points, tensor(np.ascontiguousarray(drawing.triangles, dtype=np.int32)))
+        mesh = o3d.t.geometry.TriangleMesh(
+            points, tensor(np.ascontiguousarray(drawing.triangles, dtype=np.int32))
+        )
         mesh.vertex.colors = colors
-        mesh.vertex.normals = tensor(np.tile(np.float32([0, 0, 1]), (len(drawing.points), 1)))  # unused, but asked for
+        # unused, but asked for
+        mesh.vertex.normals = tensor(np.tile(np.float32([0, 0, 1]), (len(drawing.points), 1)))
         geometries["mesh"] = mesh
     elif drawing.triangles is None and len(drawing.points):
         cloud = o3d.t.geometry.PointCloud(points)
@@ -119,7 +129,9 @@ def _line_set(drawing: Drawing) -> object:
     import open3d as o3d
 
     ends = np.asarray(drawing.lines, np.float64).reshape(-1, 3)
-    lines = o3d.geometry.LineSet(o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(np.arange(len(ends)).reshape(-1, 2)))
+    lines = o3d.geometry.LineSet(
+        o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(np.arange(len(ends)).reshape(-1, 2))
+    )
     lines.paint_uniform_color(np.array(drawing.line_color) / 255.0)
     return lines
 
@@ -156,7 +168,9 @@ def _render_egl(drawing: Drawing, view: View, background: tuple[int, int, int]) 
 
 
 def _centred_canvas(view: View) -> tuple[View, np.ndarray, np.ndarray]:
-    """A view with square pixels and centred principal point that holds `view`, and the canvas rows (H,) and columns (W,) of its pixels."""
+    """A view with square pixels and centred principal point that holds `view`, and the canvas rows (H,) and
+    columns (W,) of its pixels.
+    """
     (focal_x, _, centre_x), (_, focal_y, centre_y) = view.matrix[:2]
     focal = max(focal_x, focal_y)
     half_width = int(np.ceil(max(centre_x, view.width - centre_x) * focal / focal_x))
@@ -181,9 +195,14 @@ def _depth_range(drawing: Drawing, view: View) -> tuple[float, float]:
 def _legacy_geometries(drawing: Drawing) -> list:
     import open3d as o3d
 
-    points, colors = o3d.utility.Vector3dVector(drawing.points.astype(np.float64)), o3d.utility.Vector3dVector(drawing.colors / 255.0)
+    points, colors = (
+        o3d.utility.Vector3dVector(drawing.points.astype(np.float64)),
+        o3d.utility.Vector3dVector(drawing.colors / 255.0),
+    )
     if drawing.triangles is not None:
-        geometry = o3d.geometry.TriangleMesh(points, o3d.utility.Vector3iVector(drawing.triangles.astype(np.int32)))
+        geometry = o3d.geometry.TriangleMesh(
+            points, o3d.utility.Vector3iVector(drawing.triangles.astype(np.int32))
+        )
         geometry.vertex_colors = colors
     else:
         geometry = o3d.geometry.PointCloud(points)

@@ -83,7 +83,8 @@ def screenshot(
 ) -> np.ndarray:
     """A picture of a cloud or mesh, drawn without a display.
 
-    view: a photo's camera, of which the undistorted (pinhole) form is drawn; None = an aerial view that holds everything
+    view: a photo's camera, of which the undistorted (pinhole) form is drawn; None = an aerial view that holds
+        everything
     size: (width, height) px; with a view, its longest side is the longer of the two
     returns: (H, W, 3) uint8 RGB; a legend adds rows below
     Raises InputError for an empty geometry or a missing attribute, Sc3dError where no renderer works.
@@ -95,7 +96,9 @@ def screenshot(
     if not style.legend:
         return image
     labels = geometry.point[style.by].cpu().numpy() if style.by in ("label", "state") else None
-    return add_legend(image, style.by, class_table, None if labels is None else set(np.unique(labels).tolist()))
+    return add_legend(
+        image, style.by, class_table, None if labels is None else set(np.unique(labels).tolist())
+    )
 
 
 def draw_points(points: np.ndarray, view: View | None, size: tuple[int, int], style: Style) -> PointImage:
@@ -107,36 +110,63 @@ def draw_points(points: np.ndarray, view: View | None, size: tuple[int, int], st
     canvas, lines, factor = _canvas(points[finite], view, size, style)
     chosen = finite[_visible_sample(points[finite], canvas, style)]
     origin = local_origin([canvas])
-    codes = np.arange(len(chosen) + 1)  # every point is drawn in a colour of its own: its number, 24 bits; the last stands for lines
+    # every point is drawn in a colour of its own: its number, 24 bits; the last stands for lines
+    codes = np.arange(len(chosen) + 1)
     colors = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=1).astype(np.uint8)
-    drawing = Drawing((points[chosen] - origin).astype(np.float32), colors[:-1], _point_size(points[chosen], canvas),
-                      lines=(lines - origin).astype(np.float32), line_color=tuple(colors[-1].tolist()))
+    drawing = Drawing(
+        (points[chosen] - origin).astype(np.float32),
+        colors[:-1],
+        _point_size(points[chosen], canvas),
+        lines=(lines - origin).astype(np.float32),
+        line_color=tuple(colors[-1].tolist()),
+    )
     image = render(drawing, canvas.shifted(origin), (255, 255, 255), style.renderer).astype(np.int32)
     codes = image[..., 0] << 16 | image[..., 1] << 8 | image[..., 2]
     depth = points[chosen] @ canvas.cam_from_world[2, :3] + canvas.cam_from_world[2, 3]
     code = np.minimum(codes, len(chosen) + 1)
-    rows, depth = np.append(chosen, [-2, -1]).astype(np.int32), np.append(depth, [np.inf, np.inf]).astype(np.float32)
+    rows, depth = (
+        np.append(chosen, [-2, -1]).astype(np.int32),
+        np.append(depth, [np.inf, np.inf]).astype(np.float32),
+    )
     return PointImage(rows[code], depth[code], factor)
 
 
-def _mesh_picture(mesh: o3d.t.geometry.TriangleMesh, view: View | None, size: tuple[int, int], style: Style) -> np.ndarray:
+def _mesh_picture(
+    mesh: o3d.t.geometry.TriangleMesh, view: View | None, size: tuple[int, int], style: Style
+) -> np.ndarray:
     """A mesh in its own colours, grey without."""
     if "indices" not in mesh.triangle or not len(mesh.triangle.indices):
         raise InputError("the mesh has no triangles, nothing to draw")
     points = mesh.vertex.positions.cpu().numpy().astype(np.float64)
-    colors = as_uint8(mesh.vertex.colors.cpu().numpy()) if "colors" in mesh.vertex else np.full((len(points), 3), 170, np.uint8)
+    colors = (
+        as_uint8(mesh.vertex.colors.cpu().numpy())
+        if "colors" in mesh.vertex
+        else np.full((len(points), 3), 170, np.uint8)
+    )
     canvas, lines, factor = _canvas(points, view, size, style)
     origin = local_origin([canvas])
     triangles, lines = mesh.triangle.indices.cpu().numpy(), (lines - origin).astype(np.float32)
-    drawing = Drawing((points - origin).astype(np.float32), colors, triangles=triangles, lines=lines, line_color=LINE_COLOR)
+    drawing = Drawing(
+        (points - origin).astype(np.float32), colors, triangles=triangles, lines=lines, line_color=LINE_COLOR
+    )
     return _shrunk(render(drawing, canvas.shifted(origin), style.background, style.renderer), factor)
 
 
-def _canvas(points: np.ndarray, view: View | None, size: tuple[int, int], style: Style) -> tuple[View, np.ndarray, int]:
-    """The view that is drawn, supersampled; line ends of the frusta (L, 2, 3) world; pixels per picture pixel along each side."""
-    lines = frusta(style.cameras, frustum_depth(style.cameras, points)) if len(style.cameras) else np.empty((0, 2, 3))
+def _canvas(
+    points: np.ndarray, view: View | None, size: tuple[int, int], style: Style
+) -> tuple[View, np.ndarray, int]:
+    """The view that is drawn, supersampled; line ends of the frusta (L, 2, 3) world; pixels per picture pixel
+    along each side.
+    """
+    lines = (
+        frusta(style.cameras, frustum_depth(style.cameras, points))
+        if len(style.cameras)
+        else np.empty((0, 2, 3))
+    )
     if view is None:
-        view = aerial_view(np.concatenate([without_outliers(points), lines.reshape(-1, 3)]), size, style.from_above)
+        view = aerial_view(
+            np.concatenate([without_outliers(points), lines.reshape(-1, 3)]), size, style.from_above
+        )
     else:
         view = undistorted(view, max(size))
     factor = max(1, min(style.supersampling, _LARGEST_CANVAS // max(view.width, view.height)))
@@ -144,9 +174,14 @@ def _canvas(points: np.ndarray, view: View | None, size: tuple[int, int], style:
 
 
 def _visible_sample(points: np.ndarray, view: View, style: Style) -> np.ndarray:
-    """Rows of the points before the camera and within the picture plus a margin, at most `max_points` of them, in order."""
+    """Rows of the points before the camera and within the picture plus a margin, at most `max_points` of
+    them, in order.
+    """
     points_cam = points @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
-    pixels = points_cam[:, :2] / np.maximum(points_cam[:, 2:], 1e-9) * np.diag(view.matrix)[:2] + view.matrix[:2, 2]
+    pixels = (
+        points_cam[:, :2] / np.maximum(points_cam[:, 2:], 1e-9) * np.diag(view.matrix)[:2]
+        + view.matrix[:2, 2]
+    )
     margin = 0.05 * max(view.width, view.height)
     inside = (pixels > -margin) & (pixels < [view.width + margin, view.height + margin])
     chosen = np.flatnonzero(inside.all(axis=1) & (points_cam[:, 2] > 1e-6))
@@ -162,7 +197,8 @@ def _point_size(points: np.ndarray, view: View) -> float:
     if len(sample) < 8:
         return 3.0 * max(1.0, view.width / 1600)
     queries = sample[:: max(1, len(sample) // 5000)]
-    spacing = NeighborIndex(sample).nearest(queries, 5)[1][:, 4] / np.sqrt(step)  # 4th neighbour: about 1 / sqrt(density) on surfaces
+    # 4th neighbour: about 1 / sqrt(density) on surfaces
+    spacing = NeighborIndex(sample).nearest(queries, 5)[1][:, 4] / np.sqrt(step)
     depth = queries @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
     apart = float(np.quantile(spacing / depth, 0.8)) * view.focal
     return float(np.clip(np.ceil(2.0 * apart), 1, max(3, view.width // 60)))
@@ -186,4 +222,6 @@ def _shade_edges(image: np.ndarray, depth: np.ndarray, strength: float, radius: 
 def _shrunk(image: np.ndarray, factor: int) -> np.ndarray:
     if factor == 1:
         return image
-    return cv2.resize(image, (image.shape[1] // factor, image.shape[0] // factor), interpolation=cv2.INTER_AREA)
+    return cv2.resize(
+        image, (image.shape[1] // factor, image.shape[0] // factor), interpolation=cv2.INTER_AREA
+    )

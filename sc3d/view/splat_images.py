@@ -42,30 +42,46 @@ class Comparison:
 
 @torch.no_grad()
 def rendered(gaussians: Gaussians, view: View, background: tuple[int, int, int] = (0, 0, 0)) -> np.ndarray:
-    """(H, W, 3) uint8 RGB of a pinhole view in the Gaussians' local frame; background: RGB uint8 where nothing is."""
+    """(H, W, 3) uint8 RGB of a pinhole view in the Gaussians' local frame; background: RGB uint8 where
+    nothing is.
+    """
     shade = torch.tensor(background, dtype=torch.float32) / 255
     return _as_uint8(render(gaussians, view, background=shade, geometry=False).color)
 
 
 @torch.no_grad()
 def compare(
-    gaussians: Gaussians, view: View, photo: np.ndarray, mask: np.ndarray | None = None, exposure: Sequence[float] | None = None,
+    gaussians: Gaussians,
+    view: View,
+    photo: np.ndarray,
+    mask: np.ndarray | None = None,
+    exposure: Sequence[float] | None = None,
 ) -> Comparison:
     """Render the view of a photo and put the two side by side.
 
-    view: pinhole, local frame; photo: (H, W, 3) uint8 RGB; mask: (H, W) bool, False does not count for the PSNR
+    view: pinhole, local frame; photo: (H, W, 3) uint8 RGB; mask: (H, W) bool, False does not count for the
+        PSNR
     exposure: a, b of the photo (`losses.apply_exposure`); None = what fits it best
     """
-    image, target = render(gaussians, view, geometry=False).color.cpu(), torch.from_numpy(np.ascontiguousarray(photo)).float() / 255
+    image, target = (
+        render(gaussians, view, geometry=False).color.cpu(),
+        torch.from_numpy(np.ascontiguousarray(photo)).float() / 255,
+    )
     used = torch.ones(photo.shape[:2], dtype=torch.bool) if mask is None else torch.from_numpy(mask)
-    fitted = losses.fit_exposure(image[used], target[used]) if exposure is None else torch.as_tensor(exposure, dtype=torch.float32)
+    fitted = (
+        losses.fit_exposure(image[used], target[used])
+        if exposure is None
+        else torch.as_tensor(exposure, dtype=torch.float32)
+    )
     image = losses.apply_exposure(image, fitted)
     depth, _, normals_cam = depth_map(gaussians, view)
     normals = normals_cam @ view.cam_from_world[:3, :3].astype(np.float32)
     return Comparison(view.name, photo, _as_uint8(image), depth, normals, psnr(image[used], target[used]))
 
 
-def training_rows(gaussians: Gaussians, data: TrainingData, settings: TrainSettings, exposures: np.ndarray) -> list[Comparison]:
+def training_rows(
+    gaussians: Gaussians, data: TrainingData, settings: TrainSettings, exposures: np.ndarray
+) -> list[Comparison]:
     """Up to six photos spread over the flight with what training made of them, held-out ones first.
 
     exposures: (V, 2) a, b per view as found by training; held-out photos get what fits them best
@@ -79,17 +95,25 @@ def training_rows(gaussians: Gaussians, data: TrainingData, settings: TrainSetti
 
 
 def chosen_views(num_views: int, settings: TrainSettings) -> list[tuple[int, bool]]:
-    """Index and whether it was held out, of the photos of a contact sheet: evenly spread, held-out ones first."""
+    """Index and whether it was held out, of the photos of a contact sheet: evenly spread, held-out ones
+    first.
+    """
     held_out = settings.held_out(num_views)
     trained = [index for index in range(num_views) if index not in held_out]
     first = _spread(held_out, NUM_ROWS - min(_TRAINED_ROWS, len(trained)))
-    return [(index, True) for index in first] + [(index, False) for index in _spread(trained, NUM_ROWS - len(first))]
+    return [(index, True) for index in first] + [
+        (index, False) for index in _spread(trained, NUM_ROWS - len(first))
+    ]
 
 
 def _spread(items: list[int], count: int) -> list[int]:
     """At most `count` items, evenly spread, the first and the last among them."""
     count = min(count, len(items))
-    return [items[position] for position in np.linspace(0, len(items) - 1, count).round().astype(int)] if count else []
+    return (
+        [items[position] for position in np.linspace(0, len(items) - 1, count).round().astype(int)]
+        if count
+        else []
+    )
 
 
 def _as_uint8(image: torch.Tensor) -> np.ndarray:

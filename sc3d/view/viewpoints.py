@@ -22,7 +22,8 @@ def aerial_view(points: np.ndarray, size: tuple[int, int], from_above: bool = Fa
     focal = (3.0 if from_above else 1.4) * max(size)  # from above nearly parallel, so that walls do not show
     slopes = 0.95 * np.array(size) / (2 * focal)
     span = max(float(np.ptp(points, axis=0).max()), 1e-3)
-    for _ in range(8):  # centre what is seen, then step back until it fits; converges because the view is narrow
+    # centre what is seen, then step back until it fits; converges because the view is narrow
+    for _ in range(8):
         cam_from_world = look_at(target + span * backward, target)
         offsets = (points - target) @ cam_from_world[:3, :3].T
         distance = max(float((np.abs(offsets[:, :2]) / slopes - offsets[:, 2:]).max()), 0.2 * span)
@@ -31,18 +32,26 @@ def aerial_view(points: np.ndarray, size: tuple[int, int], from_above: bool = Fa
         centre = target + distance * backward
         target = target + shift @ cam_from_world[:2, :3]
     calibration = (focal, focal, size[0] / 2, size[1] / 2)
-    return pinhole_view("above" if from_above else "oblique", size, calibration, look_at(centre, centre - backward))
+    return pinhole_view(
+        "above" if from_above else "oblique", size, calibration, look_at(centre, centre - backward)
+    )
 
 
 def fitted(view: View, size: tuple[int, int], even: bool = False) -> View:
-    """The undistorted view of a photo, as large as fits into `size` (width, height) px but not enlarged; even: both sides divisible by 2."""
+    """The undistorted view of a photo, as large as fits into `size` (width, height) px but not enlarged;
+    even: both sides divisible by 2.
+    """
     pinhole = undistorted(view)
     scale, step = min(1.0, size[0] / pinhole.width, size[1] / pinhole.height), 2 if even else 1
-    return pinhole.resized(*(max(step, step * int(scale * side / step + 1e-6)) for side in (pinhole.width, pinhole.height)))
+    return pinhole.resized(
+        *(max(step, step * int(scale * side / step + 1e-6)) for side in (pinhole.width, pinhole.height))
+    )
 
 
 def frusta(views: Sequence[View], depth: float) -> np.ndarray:
-    """(8 M, 2, 3) float64 line ends, world, of camera pyramids whose base lies `depth` (world units) before the centre."""
+    """(8 M, 2, 3) float64 line ends, world, of camera pyramids whose base lies `depth` (world units) before
+    the centre.
+    """
     lines = np.empty((len(views), 8, 2, 3))
     for edges, view in zip(lines, views, strict=True):
         pinhole = undistorted(view, 100)

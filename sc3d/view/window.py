@@ -1,4 +1,6 @@
-"""The window: the cloud in any of its colourings, classes on and off, the cameras, and what is known of a clicked point. Needs a display."""
+"""The window: the cloud in any of its colourings, classes on and off, the cameras, and what is known of a
+clicked point. Needs a display.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,11 @@ _PANEL_EM = 15  # width of the panel, in font heights
 _PICKED_COLOR = (1.0, 0.0, 0.8)
 
 
-def show(inspector: Inspector, views: Sequence[View] = (), by: Colouring = "label", classes: set[int] | None = None) -> None:
-    """Open a window and return when it is closed. A point clicked with Ctrl held is described in the panel and in the log.
+def show(
+    inspector: Inspector, views: Sequence[View] = (), by: Colouring = "label", classes: set[int] | None = None
+) -> None:
+    """Open a window and return when it is closed. A point clicked with Ctrl held is described in the panel
+    and in the log.
 
     inspector: has the cloud, with any of the attributes that `color_points` shows; those it has can be chosen
     views: cameras drawn as pyramids; by: colouring at the start; classes: ids shown at the start, None = all
@@ -45,7 +50,9 @@ def show(inspector: Inspector, views: Sequence[View] = (), by: Colouring = "labe
         show_with_keys(shown, lines, inspector, hidden, by)
 
 
-def _show_with_panel(shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int], by: Colouring) -> None:
+def _show_with_panel(
+    shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int], by: Colouring
+) -> None:
     import open3d as o3d
 
     application = o3d.visualization.gui.Application.instance
@@ -57,7 +64,9 @@ def _show_with_panel(shown: ShownCloud, lines: np.ndarray, inspector: Inspector,
 
 
 class _Window:
-    """A 3D view with a panel at its right: colouring, legend, classes, cameras, point size, the picked point. One geometry per class."""
+    """A 3D view with a panel at its right: colouring, legend, classes, cameras, point size, the picked point.
+    One geometry per class.
+    """
 
     def __init__(self, shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int]) -> None:
         import open3d as o3d
@@ -90,7 +99,9 @@ class _Window:
         colors = self._shown.colors(by).astype(np.float32) / np.float32(255)
         for label in self._shown.class_counts:
             chosen = self._shown.label == label
-            cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(np.ascontiguousarray(self._shown.points[chosen])))
+            cloud = o3d.t.geometry.PointCloud(
+                o3d.core.Tensor.from_numpy(np.ascontiguousarray(self._shown.points[chosen]))
+            )
             cloud.point.colors = o3d.core.Tensor.from_numpy(np.ascontiguousarray(colors[chosen]))
             self._scene.scene.remove_geometry(f"class {label}")
             self._scene.scene.add_geometry(f"class {label}", cloud, self._material)
@@ -100,7 +111,9 @@ class _Window:
         self._redraw()
 
     def forget(self) -> None:
-        """Let go of the cloud: the panel keeps this object alive, and Open3D takes tensors that outlive the program for leaks and fails."""
+        """Let go of the cloud: the panel keeps this object alive, and Open3D takes tensors that outlive the
+        program for leaks and fails.
+        """
         del self._shown, self._inspector
 
     def _look(self) -> None:
@@ -146,7 +159,9 @@ class _Window:
             entries = [(scale.high, scale.colors[-1]), (scale.low, scale.colors[0])]
         for name, color in entries:
             row = gui.Horiz(self._em // 2)
-            row.add_child(gui.ImageWidget(o3d.geometry.Image(np.tile(np.uint8(color), (self._em, self._em, 1)))))
+            row.add_child(
+                gui.ImageWidget(o3d.geometry.Image(np.tile(np.uint8(color), (self._em, self._em, 1))))
+            )
             row.add_child(gui.Label(name))
             legend.add_child(row)
         return legend
@@ -157,7 +172,12 @@ class _Window:
         panel.add_child(self._gui.Label("Classes"))
         for label, count in self._shown.class_counts.items():
             name = f"{self._shown.class_table.name(label)} ({count:,})"
-            self._add_box(panel, name, label not in self._hidden, lambda shown, label=label: self._show_class(label, shown))
+            self._add_box(
+                panel,
+                name,
+                label not in self._hidden,
+                lambda shown, label=label: self._show_class(label, shown),
+            )
 
     def _add_box(self, panel: object, name: str, checked: bool, changed: object) -> None:
         box = self._gui.Checkbox(name)
@@ -176,7 +196,9 @@ class _Window:
         ends = lines.reshape(-1, 3)
         if not len(ends):
             return
-        line_set = o3d.geometry.LineSet(o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(np.arange(len(ends)).reshape(-1, 2)))
+        line_set = o3d.geometry.LineSet(
+            o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(np.arange(len(ends)).reshape(-1, 2))
+        )
         line_set.paint_uniform_color(np.array(LINE_COLOR) / 255)
         material = self._rendering.MaterialRecord()
         material.shader, material.line_width = "unlitLine", 2.0
@@ -192,7 +214,8 @@ class _Window:
         if event.type != gui.MouseEvent.Type.BUTTON_DOWN or not event.is_modifier_down(gui.KeyModifier.CTRL):
             return gui.Widget.EventCallbackResult.IGNORED
         column, row = event.x - self._scene.frame.x, event.y - self._scene.frame.y
-        post = self._gui.Application.instance.post_to_main_thread  # the renderer's thread must not touch the panel, nor keep its picture
+        # the renderer's thread must not touch the panel, nor keep its picture
+        post = self._gui.Application.instance.post_to_main_thread
         pick = self._scene.scene.scene.render_to_depth_image
         pick(lambda depth: post(self._window, partial(self._pick, np.array(depth), column, row)))
         return gui.Widget.EventCallbackResult.HANDLED
@@ -211,10 +234,18 @@ class _Window:
     def _describe(self, picked: PickedPoint) -> None:
         import open3d as o3d
 
-        self._description.text = "\n".join([f"{name}: {value}" for name, value in picked.facts()] + [f"  {name}" for name in picked.photos])
-        mark = o3d.t.geometry.PointCloud(o3d.core.Tensor((picked.position - self._shown.origin).astype(np.float32)[None]))
+        self._description.text = "\n".join(
+            [f"{name}: {value}" for name, value in picked.facts()] + [f"  {name}" for name in picked.photos]
+        )
+        mark = o3d.t.geometry.PointCloud(
+            o3d.core.Tensor((picked.position - self._shown.origin).astype(np.float32)[None])
+        )
         material = self._rendering.MaterialRecord()
-        material.shader, material.point_size, material.base_color = "defaultUnlit", 14.0, [*_PICKED_COLOR, 1.0]
+        material.shader, material.point_size, material.base_color = (
+            "defaultUnlit",
+            14.0,
+            [*_PICKED_COLOR, 1.0],
+        )
         self._scene.scene.remove_geometry("picked")
         self._scene.scene.add_geometry("picked", mark, material)
         self._redraw()

@@ -19,24 +19,34 @@ _F1 = 290  # GLFW's key codes
 _MAX_CLASS_KEYS = 12
 
 
-def show_with_keys(shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int], by: Colouring) -> None:
-    """Keys 1 to 5 choose the colouring, F1 to F12 show and hide classes, P describes the point in the middle; the log is the legend.
+def show_with_keys(
+    shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int], by: Colouring
+) -> None:
+    """Keys 1 to 5 choose the colouring, F1 to F12 show and hide classes, P describes the point in the middle;
+    the log is the legend.
 
-    lines: (L, 2, 3) ends of the cameras' lines, in the frame of `shown`; hidden: ids of classes that are not shown at the start
+    lines: (L, 2, 3) ends of the cameras' lines, in the frame of `shown`; hidden: ids of classes that are not
+        shown at the start
     Raises Sc3dError if no window can be opened.
     """
     visualizer = o3d.visualization.VisualizerWithKeyCallback()
     if not visualizer.create_window("sc3d", 1400, 900):
-        raise Sc3dError("cannot open a window here: `sc3d view SCENE --screenshot FILE` renders a picture without one")
+        raise Sc3dError(
+            "cannot open a window here: `sc3d view SCENE --screenshot FILE` renders a picture without one"
+        )
     window = _KeyWindow(visualizer, shown, inspector, hidden, by)
     if len(lines):
         ends = lines.reshape(-1, 3)
-        line_set = o3d.geometry.LineSet(o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(np.arange(len(ends)).reshape(-1, 2)))
+        line_set = o3d.geometry.LineSet(
+            o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(np.arange(len(ends)).reshape(-1, 2))
+        )
         line_set.paint_uniform_color(np.array(LINE_COLOR) / 255)
         visualizer.add_geometry(line_set)
     for number, name in enumerate(shown.colourings, start=1):
         visualizer.register_key_callback(ord(str(number)), lambda _, name=name: window.choose(name))
-        legend = ", ".join(f"{entry} rgb{tuple(color)}" for entry, color in legend_entries(name, shown.class_table))
+        legend = ", ".join(
+            f"{entry} rgb{tuple(color)}" for entry, color in legend_entries(name, shown.class_table)
+        )
         logger.info("key %d: %s%s", number, name, f" ({legend})" if legend else "")
     if shown.class_table is not None and len(shown.class_counts) > 1:
         for number, label in enumerate(list(shown.class_counts)[:_MAX_CLASS_KEYS]):
@@ -52,8 +62,21 @@ def show_with_keys(shown: ShownCloud, lines: np.ndarray, inspector: Inspector, h
 class _KeyWindow:
     """What the keys do."""
 
-    def __init__(self, visualizer: o3d.visualization.VisualizerWithKeyCallback, shown: ShownCloud, inspector: Inspector, hidden: set[int], by: str) -> None:
-        self._visualizer, self._shown, self._inspector, self._hidden, self._by = visualizer, shown, inspector, hidden, by
+    def __init__(
+        self,
+        visualizer: o3d.visualization.VisualizerWithKeyCallback,
+        shown: ShownCloud,
+        inspector: Inspector,
+        hidden: set[int],
+        by: str,
+    ) -> None:
+        self._visualizer, self._shown, self._inspector, self._hidden, self._by = (
+            visualizer,
+            shown,
+            inspector,
+            hidden,
+            by,
+        )
         self._cloud = o3d.geometry.PointCloud()
         self._fill()
         visualizer.add_geometry(self._cloud)
@@ -82,7 +105,9 @@ class _KeyWindow:
         return False
 
     def forget(self) -> None:
-        """Let go of the cloud: the keys keep this object alive, and Open3D takes tensors that outlive the program for leaks and fails."""
+        """Let go of the cloud: the keys keep this object alive, and Open3D takes tensors that outlive the
+        program for leaks and fails.
+        """
         del self._shown, self._inspector, self._cloud
 
     @property

@@ -23,7 +23,10 @@ from sc3d.segmentation.strokes.backend import StrokesSettings
 from sc3d.segmentation.strokes.files import read_strokes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-CLASSES = [{"id": 2, "name": "road", "color": [150, 150, 160]}, {"id": 5, "name": "grass", "color": [170, 220, 110]}]
+CLASSES = [
+    {"id": 2, "name": "road", "color": [150, 150, 160]},
+    {"id": 5, "name": "grass", "color": [170, 220, 110]},
+]
 SIZE = (240, 160)
 TINY = StrokesSettings(members=2, trees=4, steps=60, require_all=False)
 ROAD = {"label": "road", "shape_type": "linestrip", "points": [[20, 10], [20.5, 150]], "width": 9}
@@ -52,16 +55,27 @@ def server(scene):
         thread.join()
 
 
-def ask(server, path: str, content: object = None, **headers: str | None) -> tuple[int, bytes, http.client.HTTPMessage]:
-    """GET, or POST of JSON (or bytes) as the page does it; headers of None are left out, underscores are dashes."""
+def ask(
+    server, path: str, content: object = None, **headers: str | None
+) -> tuple[int, bytes, http.client.HTTPMessage]:
+    """GET, or POST of JSON (or bytes) as the page does it; headers of None are left out, underscores are
+    dashes.
+    """
     own = {"Host": f"127.0.0.1:{server.server_port}"}
     body = None
     if content is not None:
         body = content if isinstance(content, bytes) else json.dumps(content).encode()
-        own |= {"Origin": f"http://127.0.0.1:{server.server_port}", "X-Token": server.token, "Content-Type": "application/json", "Content-Length": str(len(body))}
+        own |= {
+            "Origin": f"http://127.0.0.1:{server.server_port}",
+            "X-Token": server.token,
+            "Content-Type": "application/json",
+            "Content-Length": str(len(body)),
+        }
     own |= {name.replace("_", "-"): value for name, value in headers.items()}
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
-    connection.putrequest("GET" if content is None else "POST", path, skip_host=True, skip_accept_encoding=True)
+    connection.putrequest(
+        "GET" if content is None else "POST", path, skip_host=True, skip_accept_encoding=True
+    )
     for name, value in own.items():
         if value is not None:
             connection.putheader(name, value)
@@ -73,13 +87,23 @@ def ask(server, path: str, content: object = None, **headers: str | None) -> tup
 
 
 def test_strokes_are_saved_as_the_backend_reads_them(server, scene):
-    status, body, _ = ask(server, "/strokes/a", {"shapes": [ROAD | {"other": "x"}, GRASS], "imageWidth": SIZE[0], "imageHeight": SIZE[1]})
+    status, body, _ = ask(
+        server,
+        "/strokes/a",
+        {"shapes": [ROAD | {"other": "x"}, GRASS], "imageWidth": SIZE[0], "imageHeight": SIZE[1]},
+    )
     assert status == 200 and json.loads(body) == {"saved": 2}
     written = json.loads((scene.strokes / "a.json").read_text())
-    assert (written["imagePath"], written["imageWidth"], written["imageHeight"], written["imageData"]) == ("a.png", *SIZE, None)
-    assert "other" not in written["shapes"][0] and [path.name for path in scene.strokes.iterdir()] == ["a.json"]
+    assert (written["imagePath"], written["imageWidth"], written["imageHeight"], written["imageData"]) == (
+        "a.png",
+        *SIZE,
+        None,
+    )
+    assert "other" not in written["shapes"][0] and [path.name for path in scene.strokes.iterdir()] == [
+        "a.json"
+    ]
     assert json.loads(ask(server, "/strokes/a")[1])["shapes"] == [ROAD, GRASS]
-    drawn, = read_strokes(scene.strokes, scene.images, scene.class_table())
+    (drawn,) = read_strokes(scene.strokes, scene.images, scene.class_table())
     assert [shape.label for shape in drawn.shapes] == [2, 5] and drawn.shapes[0].width == 9
     assert json.loads(ask(server, "/scene")[1])["photos"][0]["strokes"] == 2
     assert ask(server, "/strokes/a", {"shapes": []})[0] == 200 and not list(scene.strokes.iterdir())
@@ -88,22 +112,33 @@ def test_strokes_are_saved_as_the_backend_reads_them(server, scene):
 def test_coordinates_of_a_reduced_photo_are_scaled_and_windows_may_save_at_once(server, scene):
     half = {"shapes": [ROAD], "imageWidth": SIZE[0] // 2, "imageHeight": SIZE[1] // 2}
     statuses = []
-    threads = [threading.Thread(target=lambda: statuses.append(ask(server, "/strokes/a", half)[0])) for _ in range(8)]
+    threads = [
+        threading.Thread(target=lambda: statuses.append(ask(server, "/strokes/a", half)[0])) for _ in range(8)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
     assert statuses == [200] * 8 and [path.name for path in scene.strokes.iterdir()] == ["a.json"]
-    shape, = json.loads(ask(server, "/strokes/a")[1])["shapes"]
+    (shape,) = json.loads(ask(server, "/strokes/a")[1])["shapes"]
     assert shape == ROAD | {"points": [[40, 20], [41, 300]], "width": 18}
 
 
 def test_photos_with_any_name_are_found(server, scene):
     listed = json.loads(ask(server, "/scene")[1])
-    assert [photo["stem"] for photo in listed["photos"]] == ["a", "b c+ä"] and [entry["name"] for entry in listed["classes"]] == ["road", "grass", "_background_"]
+    assert [photo["stem"] for photo in listed["photos"]] == ["a", "b c+ä"] and [
+        entry["name"] for entry in listed["classes"]
+    ] == ["road", "grass", "_background_"]
     status, body, headers = ask(server, "/photo/b%20c%2B%C3%A4")
-    assert status == 200 and headers["Content-Type"] == "image/jpeg" and Image.open(io.BytesIO(body)).size == SIZE
-    assert ask(server, "/strokes/b%20c%2B%C3%A4", {"shapes": [ROAD]})[0] == 200 and (scene.strokes / "b c+ä.json").exists()
+    assert (
+        status == 200
+        and headers["Content-Type"] == "image/jpeg"
+        and Image.open(io.BytesIO(body)).size == SIZE
+    )
+    assert (
+        ask(server, "/strokes/b%20c%2B%C3%A4", {"shapes": [ROAD]})[0] == 200
+        and (scene.strokes / "b c+ä.json").exists()
+    )
 
 
 def test_run_shows_a_mask_in_the_colours_of_the_classes(server):
@@ -114,13 +149,22 @@ def test_run_shows_a_mask_in_the_colours_of_the_classes(server):
     mask = np.array(Image.open(io.BytesIO(body)))
     for columns, color in ((slice(0, 85), [150, 150, 160, 255]), (slice(155, 240), [170, 220, 110, 255])):
         assert (mask[:, columns] == color).all(axis=-1).mean() > 0.95
-    assert (mask[mask[..., 3] < 255] [:, 3] == 0).all()
+    assert (mask[mask[..., 3] < 255][:, 3] == 0).all()
     server.session._trying.acquire()
     assert ask(server, "/try/a", {})[0] == 409
     server.session._trying.release()
 
 
-@pytest.mark.parametrize("headers", [{"Host": "evil.example"}, {"Host": "127.0.0.1"}, {"Host": None}, {"Sec_Fetch_Site": "cross-site"}, {"Sec_Fetch_Site": "same-site"}])
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example"},
+        {"Host": "127.0.0.1"},
+        {"Host": None},
+        {"Sec_Fetch_Site": "cross-site"},
+        {"Sec_Fetch_Site": "same-site"},
+    ],
+)
 @pytest.mark.parametrize("path", ["/", "/scene", "/photo/a", "/strokes/a"])
 def test_other_hosts_and_sites_are_refused(server, path, headers):
     assert ask(server, path)[0] == 200
@@ -128,17 +172,47 @@ def test_other_hosts_and_sites_are_refused(server, path, headers):
     assert status == 403 and server.token.encode() not in body
 
 
-@pytest.mark.parametrize(("status", "headers"), [
-    (403, {"Origin": None}), (403, {"Origin": "null"}), (403, {"Origin": "http://evil.example"}), (403, {"Origin": "http://127.0.0.1:1"}), (403, {"Host": "evil.example"}),
-    (403, {"X_Token": None}), (403, {"X_Token": "x" * 43}), (403, {"X_Token": "ä"}), (403, {"Sec_Fetch_Site": "cross-site"}),
-    (415, {"Content_Type": "text/plain"}), (415, {"Content_Type": None}), (411, {"Content_Length": None}), (411, {"Content_Length": "-1"}), (413, {"Content_Length": str(LARGEST_BODY + 1)}),
-])
+@pytest.mark.parametrize(
+    ("status", "headers"),
+    [
+        (403, {"Origin": None}),
+        (403, {"Origin": "null"}),
+        (403, {"Origin": "http://evil.example"}),
+        (403, {"Origin": "http://127.0.0.1:1"}),
+        (403, {"Host": "evil.example"}),
+        (403, {"X_Token": None}),
+        (403, {"X_Token": "x" * 43}),
+        (403, {"X_Token": "ä"}),
+        (403, {"Sec_Fetch_Site": "cross-site"}),
+        (415, {"Content_Type": "text/plain"}),
+        (415, {"Content_Type": None}),
+        (411, {"Content_Length": None}),
+        (411, {"Content_Length": "-1"}),
+        (413, {"Content_Length": str(LARGEST_BODY + 1)}),
+    ],
+)
 def test_posts_of_others_and_wrong_ones_write_nothing(server, scene, status, headers):
     assert ask(server, "/strokes/a", {"shapes": [ROAD]}, **headers)[0] == status
     assert not scene.strokes.exists()
 
 
-@pytest.mark.parametrize("stem", ["../a", "..%2Fa", "%2e%2e%2fa", "..%5Ca", "/etc/passwd", "%2Fetc%2Fpasswd", "a/../a", "a.png", "a%00", "", "unknown", "flight%2Fb c"])
+@pytest.mark.parametrize(
+    "stem",
+    [
+        "../a",
+        "..%2Fa",
+        "%2e%2e%2fa",
+        "..%5Ca",
+        "/etc/passwd",
+        "%2Fetc%2Fpasswd",
+        "a/../a",
+        "a.png",
+        "a%00",
+        "",
+        "unknown",
+        "flight%2Fb c",
+    ],
+)
 @pytest.mark.parametrize("kind", ["photo", "strokes", "try", "images"])
 def test_only_photos_of_the_scene_have_addresses(server, scene, kind, stem):
     address = f"/{kind}/{stem}".replace(" ", "%20")
@@ -146,11 +220,24 @@ def test_only_photos_of_the_scene_have_addresses(server, scene, kind, stem):
     assert not scene.strokes.exists()
 
 
-@pytest.mark.parametrize(("status", "content"), [
-    (400, b"{"), (400, b"[" * 100_000), (422, []), (422, {"shapes": {}}), (422, {"shapes": [1]}), (422, {"shapes": [ROAD | {"label": "roof"}]}), (422, {"shapes": [ROAD | {"points": [[1]]}]}),
-    (422, {"shapes": [ROAD | {"points": [[1, "2"]]}]}), (422, b'{"shapes": [{"label": "road", "shape_type": "point", "points": [[NaN, 1]]}]}'), (422, {"shapes": [ROAD | {"width": -1}]}),
-    (422, {"shapes": [ROAD | {"shape_type": "mask"}]}), (422, {"shapes": [ROAD], "imageWidth": 10, "imageHeight": 500}), (422, {"shapes": [ROAD], "imageWidth": "9", "imageHeight": 5}),
-])
+@pytest.mark.parametrize(
+    ("status", "content"),
+    [
+        (400, b"{"),
+        (400, b"[" * 100_000),
+        (422, []),
+        (422, {"shapes": {}}),
+        (422, {"shapes": [1]}),
+        (422, {"shapes": [ROAD | {"label": "roof"}]}),
+        (422, {"shapes": [ROAD | {"points": [[1]]}]}),
+        (422, {"shapes": [ROAD | {"points": [[1, "2"]]}]}),
+        (422, b'{"shapes": [{"label": "road", "shape_type": "point", "points": [[NaN, 1]]}]}'),
+        (422, {"shapes": [ROAD | {"width": -1}]}),
+        (422, {"shapes": [ROAD | {"shape_type": "mask"}]}),
+        (422, {"shapes": [ROAD], "imageWidth": 10, "imageHeight": 500}),
+        (422, {"shapes": [ROAD], "imageWidth": "9", "imageHeight": 5}),
+    ],
+)
 def test_drawings_are_checked_before_they_replace_others(server, scene, status, content):
     ask(server, "/strokes/a", {"shapes": [GRASS]})
     before = (scene.strokes / "a.json").read_bytes()
@@ -162,9 +249,18 @@ def test_drawings_are_checked_before_they_replace_others(server, scene, status, 
 def test_pages_forbid_everything_from_elsewhere(server):
     for path in ("/", "/page.js", "/scene", "/photo/a", "/nothing"):
         headers = ask(server, path)[2]
-        assert headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'")
-        assert headers["Cross-Origin-Resource-Policy"] == "same-origin" and headers["X-Content-Type-Options"] == "nosniff" and headers["Access-Control-Allow-Origin"] is None
-    assert server.token.encode() in ask(server, "/")[1] and server.token.encode() not in ask(server, "/page.js")[1]
+        assert headers["Content-Security-Policy"].startswith(
+            "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'"
+        )
+        assert (
+            headers["Cross-Origin-Resource-Policy"] == "same-origin"
+            and headers["X-Content-Type-Options"] == "nosniff"
+            and headers["Access-Control-Allow-Origin"] is None
+        )
+    assert (
+        server.token.encode() in ask(server, "/")[1]
+        and server.token.encode() not in ask(server, "/page.js")[1]
+    )
     for file in Path(sc3d.annotate.__file__).parent.iterdir():
         if file.suffix in (".html", ".css", ".js"):
             assert not re.search(r"(https?:)?//[a-z0-9]+\.[a-z]|@import|url\(", file.read_text()), file
@@ -181,18 +277,26 @@ def test_only_the_loopback_address_and_a_free_port(server, scene):
     with pytest.raises(InputError, match="no free port"):
         AnnotationServer(server.session, 70_000)
     with socket.socket() as probe:
-        addresses = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)} - {"127.0.0.1"}
+        addresses = {
+            info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
+        } - {"127.0.0.1"}
         probe.settimeout(2)
         for address in list(addresses)[:1]:
             assert probe.connect_ex((address, server.server_port)) != 0
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    (lambda scene: (["--photo", "z.jpg"]), "no photo 'z.jpg'"),
-    (lambda scene: scene.classes.unlink() or [], "classes.json"),
-    (lambda scene: shutil.rmtree(scene.images) or [], "images"),
-    (lambda scene: scene.strokes.mkdir() or (scene.strokes / "a.json").write_text("[]") and [], "not a LabelMe file"),
-])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda scene: (["--photo", "z.jpg"]), "no photo 'z.jpg'"),
+        (lambda scene: scene.classes.unlink() or [], "classes.json"),
+        (lambda scene: shutil.rmtree(scene.images) or [], "images"),
+        (
+            lambda scene: scene.strokes.mkdir() or (scene.strokes / "a.json").write_text("[]") and [],
+            "not a LabelMe file",
+        ),
+    ],
+)
 def test_errors_come_before_the_page(scene, capsys, change, words):
     options = change(scene)
     with pytest.raises(SystemExit) as stopped:
@@ -205,7 +309,9 @@ def test_errors_come_before_the_page(scene, capsys, change, words):
 
 @pytest.fixture(scope="module")
 def browser():
-    api = pytest.importorskip("playwright.sync_api", reason="the page is tested with playwright: pip install playwright")
+    api = pytest.importorskip(
+        "playwright.sync_api", reason="the page is tested with playwright: pip install playwright"
+    )
     program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if program is None:
         pytest.skip("the page is tested in Chromium: apt install chromium")
@@ -220,9 +326,17 @@ def page(browser, server):
     opened = browser.new_page(viewport={"width": 1000, "height": 700})
     opened.set_default_timeout(60_000)
     opened.wrong, opened.hosts = [], set()
-    opened.on("console", lambda message: opened.wrong.append(message.text) if message.type in ("error", "warning") else None)
+    opened.on(
+        "console",
+        lambda message: opened.wrong.append(message.text) if message.type in ("error", "warning") else None,
+    )
     opened.on("pageerror", lambda error: opened.wrong.append(str(error)))
-    opened.on("request", lambda request: opened.hosts.add(request.url.split("/")[2]) if request.url.startswith("http") else None)
+    opened.on(
+        "request",
+        lambda request: (
+            opened.hosts.add(request.url.split("/")[2]) if request.url.startswith("http") else None
+        ),
+    )
     load(opened, server)
     yield opened
     opened.close()
@@ -238,7 +352,9 @@ def on_screen(page, x: float, y: float) -> tuple[float, float]:
     """Where a place of the photo is shown, as long as all of it is in view."""
     box = page.locator("#canvas").bounding_box()
     scale = 0.97 * min(box["width"] / SIZE[0], box["height"] / SIZE[1])
-    return box["x"] + box["width"] / 2 + (x - SIZE[0] / 2) * scale, box["y"] + box["height"] / 2 + (y - SIZE[1] / 2) * scale
+    return box["x"] + box["width"] / 2 + (x - SIZE[0] / 2) * scale, box["y"] + box["height"] / 2 + (
+        y - SIZE[1] / 2
+    ) * scale
 
 
 def drag(page, *places: tuple[float, float]) -> None:
@@ -265,16 +381,25 @@ def test_draws_saves_reloads_and_finds_it(page, server, scene):
         page.mouse.click(*on_screen(page, *place))
     page.wait_for_selector("#photos [aria-pressed=true] small.dirty")
     first = saved(page, scene)
-    assert [(shape["label"], shape["shape_type"]) for shape in first] == [("road", "linestrip"), ("grass", "polygon")]
-    assert np.allclose(first[0]["points"], [[20, 20], [20, 140], [60, 140]], atol=1) and np.allclose(first[1]["points"], [[150, 20], [220, 20], [220, 100]], atol=1)
+    assert [(shape["label"], shape["shape_type"]) for shape in first] == [
+        ("road", "linestrip"),
+        ("grass", "polygon"),
+    ]
+    assert np.allclose(first[0]["points"], [[20, 20], [20, 140], [60, 140]], atol=1) and np.allclose(
+        first[1]["points"], [[150, 20], [220, 20], [220, 100]], atol=1
+    )
     before = page.locator("#canvas").screenshot()
     load(page, server)
     assert page.inner_text("#photos [aria-pressed=true] small") == "2"
     page.mouse.move(5, 5)
     page.wait_for_timeout(100)
-    colors = [np.array(Image.open(io.BytesIO(picture)).convert("RGB"))[row, column].astype(int) for picture in (before, page.locator("#canvas").screenshot())
-              for column, row in [np.subtract(on_screen(page, 200, 40), on_screen_corner(page)).astype(int)]]
-    assert np.abs(colors[0] - colors[1]).max() < 12 and colors[1][1] > colors[1][0] + 15  # the polygon is there again
+    colors = [
+        np.array(Image.open(io.BytesIO(picture)).convert("RGB"))[row, column].astype(int)
+        for picture in (before, page.locator("#canvas").screenshot())
+        for column, row in [np.subtract(on_screen(page, 200, 40), on_screen_corner(page)).astype(int)]
+    ]
+    # the polygon is there again
+    assert np.abs(colors[0] - colors[1]).max() < 12 and colors[1][1] > colors[1][0] + 15
     assert not page.wrong and page.hosts == {f"127.0.0.1:{server.server_port}"}
 
 
@@ -320,7 +445,7 @@ def test_zoom_keeps_the_place_under_the_mouse(page, scene):
     page.mouse.down()
     page.mouse.up()
     page.keyboard.press("f")
-    shape, = saved(page, scene)
+    (shape,) = saved(page, scene)
     assert np.allclose(shape["points"], [[60, 50]], atol=1)
 
 
@@ -330,10 +455,14 @@ def test_run_lays_the_mask_over_the_photo(page, scene):
     drag(page, (200, 20), (200, 140))
     page.keyboard.press("r")
     page.wait_for_selector("#status:has-text('Done')")
-    page.evaluate("() => { const slider = document.getElementById('opacity'); slider.value = 100; slider.dispatchEvent(new Event('input')); }")
+    page.evaluate(
+        "() => { const slider = document.getElementById('opacity'); slider.value = 100; slider.dispatchEvent(new Event('input')); }"
+    )
     page.wait_for_timeout(100)
     column, row = np.subtract(on_screen(page, 45, 80), on_screen_corner(page)).astype(int)
-    shown = lambda: np.array(Image.open(io.BytesIO(page.locator("#canvas").screenshot())).convert("RGB"))[row - 5 : row + 6, column - 5 : column + 6].reshape(-1, 3)
+    shown = lambda: np.array(Image.open(io.BytesIO(page.locator("#canvas").screenshot())).convert("RGB"))[
+        row - 5 : row + 6, column - 5 : column + 6
+    ].reshape(-1, 3)
     assert (shown() == [150, 150, 160]).all()
     page.keyboard.press("m")
     page.wait_for_timeout(100)

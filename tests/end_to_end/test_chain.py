@@ -1,4 +1,6 @@
-"""The whole chain on synthetic photos: cameras from SfM, Gaussians, labels, report. The first test is small; the slow one is the acceptance size."""
+"""The whole chain on synthetic photos: cameras from SfM, Gaussians, labels, report. The first test is small;
+the slow one is the acceptance size.
+"""
 
 import json
 import re
@@ -15,7 +17,9 @@ def run(*arguments) -> None:
 
 
 def centre_error(found, truth) -> tuple[int, float, float]:
-    """Photos in both models, largest distance of the centres after similarity alignment over the extent of the true ones, and the scale found."""
+    """Photos in both models, largest distance of the centres after similarity alignment over the extent of
+    the true ones, and the scale found.
+    """
     true_centres = {view.name: view.centre for view in truth.views}
     names = [view.name for view in found.views if view.name in true_centres]
     source = np.array([view.centre for view in found.views if view.name in true_centres])
@@ -32,20 +36,54 @@ def centre_error(found, truth) -> tuple[int, float, float]:
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     path = tmp_path_factory.mktemp("synthetic") / "site"
-    run("synthesize", path, "--views", 12, "--width", 400, "--extent", 70, "--altitude", 45, "--num-points", 50000)
+    run(
+        "synthesize",
+        path,
+        "--views",
+        12,
+        "--width",
+        400,
+        "--extent",
+        70,
+        "--altitude",
+        45,
+        "--num-points",
+        50000,
+    )
     return path
 
 
 @pytest.fixture(scope="module")
 def scene(site):
     path = site.parent / "scene"
-    run("run", site / "images", path, "--masks", site / "masks", "--confidence", site / "confidence", "--classes", site / "classes.json",
-        "--truth", site / "truth", "--train.iterations", 250, "--train.max-size", 400, "--train.max-gaussians", 40000, "--extract.max-size", 400)
+    run(
+        "run",
+        site / "images",
+        path,
+        "--masks",
+        site / "masks",
+        "--confidence",
+        site / "confidence",
+        "--classes",
+        site / "classes.json",
+        "--truth",
+        site / "truth",
+        "--train.iterations",
+        250,
+        "--train.max-size",
+        400,
+        "--train.max-gaussians",
+        40000,
+        "--extract.max-size",
+        400,
+    )
     return path
 
 
 def test_cameras_are_metric_and_right(site, scene):
-    count, error, scale = centre_error(read_sparse_model(scene / "sparse" / "0"), read_sparse_model(site / "sparse" / "0"))
+    count, error, scale = centre_error(
+        read_sparse_model(scene / "sparse" / "0"), read_sparse_model(site / "sparse" / "0")
+    )
     assert count == 12
     assert error < 0.005  # small photos of a small site; the slow test has the acceptance figure
     assert scale == pytest.approx(1, abs=0.01)  # GPS in the photos
@@ -65,20 +103,48 @@ def test_report_is_one_page_with_pictures_and_nothing_from_outside(scene):
 
 
 def test_second_run_does_nothing_and_a_changed_option_reruns_what_follows(scene, caplog):
-    arguments = ["run", scene.parent / "site" / "images", scene, "--masks", scene.parent / "site" / "masks", "--confidence", scene.parent / "site" / "confidence",
-                 "--classes", scene.parent / "site" / "classes.json", "--truth", scene.parent / "site" / "truth", "--train.iterations", 250,
-                 "--train.max-size", 400, "--train.max-gaussians", 40000, "--extract.max-size", 400]
-    before = {name: (scene / name).stat().st_mtime_ns for name in ("gaussians.ply", "cloud.ply", "seeds.ply", "labelled.ply", "metrics.json", "report.html")}
+    arguments = [
+        "run",
+        scene.parent / "site" / "images",
+        scene,
+        "--masks",
+        scene.parent / "site" / "masks",
+        "--confidence",
+        scene.parent / "site" / "confidence",
+        "--classes",
+        scene.parent / "site" / "classes.json",
+        "--truth",
+        scene.parent / "site" / "truth",
+        "--train.iterations",
+        250,
+        "--train.max-size",
+        400,
+        "--train.max-gaussians",
+        40000,
+        "--extract.max-size",
+        400,
+    ]
+    before = {
+        name: (scene / name).stat().st_mtime_ns
+        for name in ("gaussians.ply", "cloud.ply", "seeds.ply", "labelled.ply", "metrics.json", "report.html")
+    }
     run(*arguments)
     assert before == {name: (scene / name).stat().st_mtime_ns for name in before}
     run(*arguments, "--propagate.method", "knn")
     after = {name: (scene / name).stat().st_mtime_ns for name in before}
-    assert [name for name in before if after[name] != before[name]] == ["labelled.ply", "metrics.json", "report.html"]
+    assert [name for name in before if after[name] != before[name]] == [
+        "labelled.ply",
+        "metrics.json",
+        "report.html",
+    ]
 
 
 @pytest.mark.slow
 def test_forty_views_register_within_two_thousandths(tmp_path):
     run("synthesize", tmp_path / "site", "--views", 40)
     run("reconstruct", tmp_path / "site" / "images", tmp_path / "scene")
-    count, error, scale = centre_error(read_sparse_model(tmp_path / "scene" / "sparse" / "0"), read_sparse_model(tmp_path / "site" / "sparse" / "0"))
+    count, error, scale = centre_error(
+        read_sparse_model(tmp_path / "scene" / "sparse" / "0"),
+        read_sparse_model(tmp_path / "site" / "sparse" / "0"),
+    )
     assert count == 40 and error < 0.002 and scale == pytest.approx(1, abs=0.005)

@@ -67,7 +67,12 @@ def test_label_works_with_larger_masks_than_photos_and_with_confidence(scene):
 def test_finished_work_is_skipped_until_settings_or_inputs_change(scene):
     run("label", scene)
     record = json.loads(sidecar(scene / "seeds.ply").read_text())
-    assert record["stage"] == "label" and record["settings"]["consensus"] == 0.66 and record["versions"]["sc3d"] and record["seconds"] >= 0
+    assert (
+        record["stage"] == "label"
+        and record["settings"]["consensus"] == 0.66
+        and record["versions"]["sc3d"]
+        and record["seconds"] >= 0
+    )
     written = (scene / "seeds.ply").stat().st_mtime_ns
     run("label", scene)
     assert (scene / "seeds.ply").stat().st_mtime_ns == written
@@ -84,8 +89,26 @@ def test_finished_work_is_skipped_until_settings_or_inputs_change(scene):
 
 def test_output_and_cloud_options(scene, tmp_path):
     (scene / "cloud.ply").rename(tmp_path / "other.ply")
-    run("label", scene, "--cloud", tmp_path / "other.ply", "--output", tmp_path / "mine.ply", "--method", "majority")
-    run("propagate", scene, "--seeds", tmp_path / "mine.ply", "--output", tmp_path / "full.ply", "--method", "knn")
+    run(
+        "label",
+        scene,
+        "--cloud",
+        tmp_path / "other.ply",
+        "--output",
+        tmp_path / "mine.ply",
+        "--method",
+        "majority",
+    )
+    run(
+        "propagate",
+        scene,
+        "--seeds",
+        tmp_path / "mine.ply",
+        "--output",
+        tmp_path / "full.ply",
+        "--method",
+        "knn",
+    )
     run("evaluate", scene, "--labelled", tmp_path / "full.ply", "--output", tmp_path / "figures.json")
     assert json.loads((tmp_path / "figures.json").read_text())["labels"]["oa"] > 0.98
     assert not (scene / "seeds.ply").exists() and not (scene / "metrics.json").exists()

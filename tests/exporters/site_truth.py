@@ -1,4 +1,6 @@
-"""True footprints, heights and trees of a synthetic site, from its layout, and how well exported objects agree with them."""
+"""True footprints, heights and trees of a synthetic site, from its layout, and how well exported objects
+agree with them.
+"""
 
 import numpy as np
 import shapely
@@ -23,7 +25,9 @@ def footprint(building: Building, eaves: bool = True) -> shapely.Polygon:
 
 def roof_height(building: Building) -> float:
     """The ridge or the parapet above the levelled plot, m; chimneys and machines do not count."""
-    return building.wall if building.roof == FLAT else building.wall + 0.12 + 0.62 * (min(building.half) + EAVES)
+    return (
+        building.wall if building.roof == FLAT else building.wall + 0.12 + 0.62 * (min(building.half) + EAVES)
+    )
 
 
 def trees(world: World, min_height: float = 2.0) -> np.ndarray:
@@ -41,15 +45,20 @@ def trees(world: World, min_height: float = 2.0) -> np.ndarray:
     return np.array(rows)
 
 
-def compare_buildings(found: list[dict], buildings: list[Building], eaves: bool = True) -> dict[str, np.ndarray]:
+def compare_buildings(
+    found: list[dict], buildings: list[Building], eaves: bool = True
+) -> dict[str, np.ndarray]:
     """Match each true building with the found one that overlaps it most; found if the IoU is at least 0.5.
 
-    found: [{"polygon": ..., "height": m}]; returns: iou (B,), height_error (B,), NaN where nothing overlaps; extra: number of found ones without a match
+    found: [{"polygon": ..., "height": m}]; returns: iou (B,), height_error (B,), NaN where nothing overlaps;
+        extra: number of found ones without a match
     """
     iou, error, used = np.zeros(len(buildings)), np.full(len(buildings), np.nan), set()
     for row, building in enumerate(buildings):
         true = footprint(building, eaves)
-        overlaps = [true.intersection(item["polygon"]).area / true.union(item["polygon"]).area for item in found]
+        overlaps = [
+            true.intersection(item["polygon"]).area / true.union(item["polygon"]).area for item in found
+        ]
         if overlaps and max(overlaps) > 0:
             best = int(np.argmax(overlaps))
             iou[row], error[row] = overlaps[best], found[best]["height"] - roof_height(building)
@@ -59,7 +68,9 @@ def compare_buildings(found: list[dict], buildings: list[Building], eaves: bool 
 
 
 def match_trees(found: np.ndarray, true: np.ndarray) -> int:
-    """How many true trees (T, 4) have one of the found places (F, 2) within their crown radius, one to one, nearest pairs first."""
+    """How many true trees (T, 4) have one of the found places (F, 2) within their crown radius, one to one,
+    nearest pairs first.
+    """
     distance = np.hypot(*(found[:, None] - true[None, :, :2]).transpose(2, 0, 1))
     matched = 0
     for flat in np.argsort(distance, axis=None, kind="stable"):

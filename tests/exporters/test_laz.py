@@ -21,7 +21,9 @@ ENU = UTM | {"origin": [46.8427, -91.9944, 198.6]}
 
 def random_cloud(count: int = 2000, **options) -> o3d.t.geometry.PointCloud:
     rng = np.random.default_rng(1)
-    return labelled_cloud(rng.uniform(-150, 150, (count, 3)), rng.choice([0, 1, 2, 3, 4, 9], count), **options)
+    return labelled_cloud(
+        rng.uniform(-150, 150, (count, 3)), rng.choice([0, 1, 2, 3, 4, 9], count), **options
+    )
 
 
 def read(scene, settings=Export()) -> laspy.LasData:
@@ -42,8 +44,15 @@ def test_laz_keeps_positions_to_the_millimetre_and_everything_else_exactly(tmp_p
     assert np.abs(las.xyz - (array(cloud, "positions") + UTM["offset"])).max() < 0.00051
     codes = {0: 1} | {entry["id"]: entry["asprs"] for entry in CLASSES}
     assert (las.classification == [codes[label] for label in array(cloud, "label")]).all()
-    assert (np.stack([las.red, las.green, las.blue], 1) == array(cloud, "colors").astype(np.uint16) * 257).all()
-    for name, dtype in (("confidence", np.float32), ("state", np.uint8), ("num_views", np.uint16), ("label", np.uint8)):
+    assert (
+        np.stack([las.red, las.green, las.blue], 1) == array(cloud, "colors").astype(np.uint16) * 257
+    ).all()
+    for name, dtype in (
+        ("confidence", np.float32),
+        ("state", np.uint8),
+        ("num_views", np.uint16),
+        ("label", np.uint8),
+    ):
         assert las[name].dtype == dtype
         assert (las[name] == array(cloud, name)).all()
     assert (las.return_number == 1).all() and (las.number_of_returns == 1).all()
@@ -54,9 +63,14 @@ def test_laz_of_local_enu_lies_where_proj_says(tmp_path):
     cloud = random_cloud()
     las = read(write_scene(tmp_path, cloud, ENU))
     latitude, longitude, height = ENU["origin"]
-    centre = np.array(pyproj.Transformer.from_crs(4979, 4978, always_xy=True).transform(longitude, latitude, height))
+    centre = np.array(
+        pyproj.Transformer.from_crs(4979, 4978, always_xy=True).transform(longitude, latitude, height)
+    )
     a, b = np.radians([longitude, latitude])
-    east, up = np.array([-np.sin(a), np.cos(a), 0]), np.array([np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)])
+    east, up = (
+        np.array([-np.sin(a), np.cos(a), 0]),
+        np.array([np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)]),
+    )
     axes = np.stack([east, np.cross(up, east), up])
     geocentric = centre + array(cloud, "positions") @ axes
     geodetic = pyproj.Transformer.from_crs(4978, 4979, always_xy=True).transform(*geocentric.T)
@@ -76,7 +90,10 @@ def test_laszip_reads_the_same_points(tmp_path):
     pytest.importorskip("laszip")
     scene = write_scene(tmp_path, random_cloud(), UTM)
     ours = read(scene)
-    assert (laspy.read(laz.outputs(scene, Export())[0], laz_backend=laspy.LazBackend.Laszip).points.array == ours.points.array).all()
+    assert (
+        laspy.read(laz.outputs(scene, Export())[0], laz_backend=laspy.LazBackend.Laszip).points.array
+        == ours.points.array
+    ).all()
 
 
 def test_without_georeference_there_is_no_crs_and_nothing_moves(tmp_path):
@@ -103,7 +120,10 @@ def test_feet_stay_feet(tmp_path):
     """EPSG:2229 is in US survey feet, heights too."""
     cloud = random_cloud(50)
     georeference = {"epsg": 32611, "offset": [384000.0, 3768000.0, 90.0]}
-    feet, metres = read(write_scene(tmp_path, cloud, georeference), Export(epsg=2229)), read(write_scene(tmp_path, cloud, georeference))
+    feet, metres = (
+        read(write_scene(tmp_path, cloud, georeference), Export(epsg=2229)),
+        read(write_scene(tmp_path, cloud, georeference)),
+    )
     assert np.abs(feet.z * 1200 / 3937 - metres.z).max() < 0.001
     distance = [np.hypot(*np.diff(las.xyz[:2, :2], axis=0)[0]) for las in (feet, metres)]
     assert distance[0] * 1200 / 3937 == pytest.approx(distance[1], rel=1e-3)
@@ -159,10 +179,18 @@ def test_normals_turn_with_the_grid(tmp_path):
     part = o3d.t.io.read_point_cloud(str(clouds.outputs(scene, Export())[0] / "3_road.ply"))
     before, after = array(cloud, "normals")[array(cloud, "label") == 3], array(part, "normals")
     turned = np.degrees(np.angle((after[:, 0] + 1j * after[:, 1]) / (before[:, 0] + 1j * before[:, 1])))
-    convergence = pyproj.Proj("EPSG:32615").get_factors(ENU["origin"][1], ENU["origin"][0]).meridian_convergence
+    convergence = (
+        pyproj.Proj("EPSG:32615").get_factors(ENU["origin"][1], ENU["origin"][0]).meridian_convergence
+    )
     steep = np.hypot(before[:, 0], before[:, 1]) < 0.2  # their direction in plan is uncertain
     assert np.abs(turned[~steep] - convergence).max() < 0.02 and abs(convergence) > 0.5
-    assert np.abs(array(part, "positions") - read_georeference(scene).to_crs(array(cloud, "positions")[array(cloud, "label") == 3])).max() < 1e-6
+    assert (
+        np.abs(
+            array(part, "positions")
+            - read_georeference(scene).to_crs(array(cloud, "positions")[array(cloud, "label") == 3])
+        ).max()
+        < 1e-6
+    )
 
 
 def test_laz_in_parts_holds_what_the_whole_does(tmp_path, monkeypatch):

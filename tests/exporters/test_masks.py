@@ -41,7 +41,8 @@ def test_masks_back_are_right_where_the_given_ones_are_not(scene):
         assert (mask == truth)[truth > 0].mean() > 0.985
         confidence = np.array(Image.open(scene / "export" / "confidence" / stem(view)))
         assert ((confidence > 0) == (mask > 0)).all() and np.median(confidence[mask > 0]) > 200
-    assert Image.open(scene / "export" / "masks.jpg").size[0] >= 1200  # masks in and back; there are no photos
+    # masks in and back; there are no photos
+    assert Image.open(scene / "export" / "masks.jpg").size[0] >= 1200
 
 
 def test_masks_back_can_be_small_and_go_in_again(scene):
@@ -52,8 +53,19 @@ def test_masks_back_can_be_small_and_go_in_again(scene):
     (scene / "images").mkdir()
     for view in views():
         Image.new("RGB", (160, 120)).save(scene / "images" / view.name)
-    run("segment", scene, "--masks", scene / "export" / "masks", "--confidence", scene / "export" / "confidence")
-    assert Image.open(scene / "masks" / stem(views()[0])).size == Image.open(scene / "confidence" / stem(views()[0])).size == (80, 60)
+    run(
+        "segment",
+        scene,
+        "--masks",
+        scene / "export" / "masks",
+        "--confidence",
+        scene / "export" / "confidence",
+    )
+    assert (
+        Image.open(scene / "masks" / stem(views()[0])).size
+        == Image.open(scene / "confidence" / stem(views()[0])).size
+        == (80, 60)
+    )
 
 
 def test_doubt_is_the_product_of_confidence_and_contradiction():
@@ -61,8 +73,12 @@ def test_doubt_is_the_product_of_confidence_and_contradiction():
     fused = np.uint8([[1, 2, 2, 0], [1, 1, 2, 1]])
     sure = np.float32([[0.9, 0.75, 1, 0], [0.5, 1.0, 1, 0.2]])
     confidence = np.uint8([[100, 200, 50, 7], [100, 100, 100, 10]])
-    np.testing.assert_array_equal(refinement.doubt(mask, confidence, fused, sure), [[100, 50, 50, 7], [50, 0, 100, 8]])
-    np.testing.assert_array_equal(refinement.doubt(mask, None, fused, sure), [[255, 64, 255, 255], [128, 0, 255, 204]])
+    np.testing.assert_array_equal(
+        refinement.doubt(mask, confidence, fused, sure), [[100, 50, 50, 7], [50, 0, 100, 8]]
+    )
+    np.testing.assert_array_equal(
+        refinement.doubt(mask, None, fused, sure), [[255, 64, 255, 255], [128, 0, 255, 204]]
+    )
 
 
 def test_refined_confidence_is_low_where_a_mask_is_wrong_and_label_takes_it(scene, monkeypatch):
@@ -96,7 +112,11 @@ def test_agreement_is_measured_on_photos_left_out(scene):
     opened = Scene(scene)
     masks = Masks.of(opened, None)
     asked = []
-    result = refinement.refine(refinement.material_of(opened, masks), masks.views, lambda view: asked.append(view.name) or masks.read(view))
+    result = refinement.refine(
+        refinement.material_of(opened, masks),
+        masks.views,
+        lambda view: asked.append(view.name) or masks.read(view),
+    )
     assert 0.9 < result.before <= 1 and 0.9 < result.after <= 1
     first_fusion = asked[: asked.index("photo_2.jpg")]
     assert set(first_fusion) == {"photo_0.jpg", "photo_1.jpg", "photo_3.jpg", "photo_4.jpg"}

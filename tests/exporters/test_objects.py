@@ -1,4 +1,6 @@
-"""Buildings and trees: found, outlined, measured and counted, on shapes with a known answer and on a synthetic site with its layout."""
+"""Buildings and trees: found, outlined, measured and counted, on shapes with a known answer and on a
+synthetic site with its layout.
+"""
 
 import json
 
@@ -43,11 +45,22 @@ def exported(scene, settings=Export()) -> tuple[list[dict], list[dict]]:
 
 def test_objects_of_a_synthetic_site_agree_with_its_layout(tmp_path, site):
     world, cloud = site
-    buildings, crowns = exported(write_scene(tmp_path, labelled_cloud(cloud.point.positions.numpy(), cloud.point.label.numpy().ravel())))
-    found = [{"polygon": shapely.geometry.shape(item["geometry"]), "height": item["properties"]["height_m"]} for item in buildings]
+    buildings, crowns = exported(
+        write_scene(
+            tmp_path, labelled_cloud(cloud.point.positions.numpy(), cloud.point.label.numpy().ravel())
+        )
+    )
+    found = [
+        {"polygon": shapely.geometry.shape(item["geometry"]), "height": item["properties"]["height_m"]}
+        for item in buildings
+    ]
     result = compare_buildings(found, world.buildings)
     assert len(world.buildings) >= 5 and (result["iou"] > 0.8).all() and result["extra"] == 0
-    assert result["iou"].mean() > 0.93 and np.abs(result["height_error"]).mean() < 0.35 and np.abs(result["height_error"]).max() < 0.7
+    assert (
+        result["iou"].mean() > 0.93
+        and np.abs(result["height_error"]).mean() < 0.35
+        and np.abs(result["height_error"]).max() < 0.7
+    )
     true = trees(world)
     places = np.array([shapely.geometry.shape(item["geometry"]).centroid.coords[0] for item in crowns])
     assert abs(len(places) - len(true)) <= 0.15 * len(true)
@@ -57,28 +70,40 @@ def test_objects_of_a_synthetic_site_agree_with_its_layout(tmp_path, site):
     assert np.median(np.abs(heights - true[nearest, 3])) < 0.6
     for item, shape in zip(buildings, found):
         assert item["properties"]["area_m2"] == pytest.approx(shape["polygon"].area, abs=0.2)
-        assert item["properties"]["class"] == "building" and 0.4 < item["properties"]["confidence"] < 0.6  # random in this cloud
+        # random in this cloud
+        assert item["properties"]["class"] == "building" and 0.4 < item["properties"]["confidence"] < 0.6
 
 
 def test_geojson_is_on_earth_and_geopackage_in_the_crs(tmp_path, site):
     world, cloud = site
-    scene = write_scene(tmp_path, labelled_cloud(cloud.point.positions.numpy(), cloud.point.label.numpy().ravel()), UTM)
+    scene = write_scene(
+        tmp_path, labelled_cloud(cloud.point.positions.numpy(), cloud.point.label.numpy().ravel()), UTM
+    )
     buildings, crowns = exported(scene)
     true = shapely.union_all([footprint(building) for building in world.buildings])
     to_utm = pyproj.Transformer.from_crs(4326, 32615, always_xy=True).transform
     shapes = [shapely.geometry.shape(item["geometry"]) for item in buildings]
-    local = shapely.union_all([shapely.transform(shape, lambda corners: np.stack(to_utm(*corners.T), 1) - UTM["offset"][:2]) for shape in shapes])
+    local = shapely.union_all(
+        [
+            shapely.transform(shape, lambda corners: np.stack(to_utm(*corners.T), 1) - UTM["offset"][:2])
+            for shape in shapes
+        ]
+    )
     assert local.intersection(true).area > 0.9 * local.union(true).area
     assert all(shape.is_valid and shape.exterior.is_ccw for shape in shapes)
     area = [abs(pyproj.Geod(ellps="WGS84").geometry_area_perimeter(shape)[0]) for shape in shapes]
-    assert np.allclose(area, [item["properties"]["area_m2"] for item in buildings], rtol=2e-3)  # the UTM scale is 0.9997 here
+    # the UTM scale is 0.9997 here
+    assert np.allclose(area, [item["properties"]["area_m2"] for item in buildings], rtol=2e-3)
     assert all(item["properties"]["ground_m"] > 150 for item in buildings)
     raw = pytest.importorskip("pyogrio.raw")
     package = objects.outputs(scene, Export())[2]
     for layer, features in (("buildings", buildings), ("trees", crowns)):
         meta, _, geometry, columns = raw.read(package, layer=layer)
         assert pyproj.CRS(meta["crs"]).to_epsg() == 32615 and len(geometry) == len(features)
-        assert np.allclose(columns[list(meta["fields"]).index("height_m")], [item["properties"]["height_m"] for item in features])
+        assert np.allclose(
+            columns[list(meta["fields"]).index("height_m")],
+            [item["properties"]["height_m"] for item in features],
+        )
     centres = [shapely.from_wkb(item).centroid.coords[0] for item in raw.read(package, layer="buildings")[2]]
     assert np.abs(np.array(centres) - [to_utm(*shape.centroid.coords[0]) for shape in shapes]).max() < 0.001
 
@@ -86,7 +111,11 @@ def test_geojson_is_on_earth_and_geopackage_in_the_crs(tmp_path, site):
 def test_feet_and_metres_count_the_same(tmp_path, site):
     _, cloud = site
     georeference = {"epsg": 32611, "offset": [384000.0, 3768000.0, 90.0]}
-    scene = write_scene(tmp_path, labelled_cloud(cloud.point.positions.numpy(), cloud.point.label.numpy().ravel()), georeference)
+    scene = write_scene(
+        tmp_path,
+        labelled_cloud(cloud.point.positions.numpy(), cloud.point.label.numpy().ravel()),
+        georeference,
+    )
     metres, feet = exported(scene), exported(scene, Export(epsg=2229))
     for kind in (0, 1):
         assert abs(len(metres[kind]) - len(feet[kind])) <= 1
@@ -98,7 +127,10 @@ def test_point_order_changes_nothing(tmp_path, site):
     _, cloud = site
     points, label = cloud.point.positions.numpy(), cloud.point.label.numpy().ravel()
     order = np.random.default_rng(1).permutation(len(points))
-    first, second = (exported(write_scene(tmp_path / str(number), labelled_cloud(points[rows], label[rows]))) for number, rows in enumerate((slice(None), order)))
+    first, second = (
+        exported(write_scene(tmp_path / str(number), labelled_cloud(points[rows], label[rows])))
+        for number, rows in enumerate((slice(None), order))
+    )
     for one, two in zip(first, second):
         assert [item["geometry"] for item in one] == [item["geometry"] for item in two]
 
@@ -107,7 +139,9 @@ def test_classes_without_asprs_codes_are_an_error(tmp_path, site):
     _, cloud = site
     made = labelled_cloud(cloud.point.positions.numpy()[:1000], cloud.point.label.numpy().ravel()[:1000])
     with pytest.raises(InputError, match="ASPRS code.*classes.json"):
-        objects.write(write_scene(tmp_path, made, classes=[entry | {"asprs": 1} for entry in CLASSES]), Export())
+        objects.write(
+            write_scene(tmp_path, made, classes=[entry | {"asprs": 1} for entry in CLASSES]), Export()
+        )
     only = labelled_cloud(cloud.point.positions.numpy()[:1000], np.ones(1000))
     with pytest.raises(InputError, match="ground class"):
         objects.write(write_scene(tmp_path, only), Export())
@@ -148,12 +182,21 @@ def test_connected_cells_against_scipy():
     groups, heights = (rng.random((40, 50)) < 0.6).astype(int), rng.normal(size=(40, 50))
     expected = ndimage.label(groups)[0]
     found = connected_cells(groups, heights, np.inf)
-    assert len(np.unique(np.stack([expected.ravel(), found.ravel()], 1), axis=0)) == expected.max() + 1 == found.max() + 1
+    assert (
+        len(np.unique(np.stack([expected.ravel(), found.ravel()], 1), axis=0))
+        == expected.max() + 1
+        == found.max() + 1
+    )
     split = connected_cells(groups, heights, 0.5)
     assert split.max() > found.max()
     same = (split[:, 1:] == split[:, :-1]) & (groups[:, 1:] > 0)
-    assert ((np.abs(np.diff(heights, axis=1)) < 0.5) & (groups[:, 1:] > 0) & (groups[:, :-1] > 0) <= same).all()
-    assert all((split.ravel()[cells] == number).all() for number, cells in enumerate(cells_by_number(split, split.max()), start=1))
+    assert (
+        (np.abs(np.diff(heights, axis=1)) < 0.5) & (groups[:, 1:] > 0) & (groups[:, :-1] > 0) <= same
+    ).all()
+    assert all(
+        (split.ravel()[cells] == number).all()
+        for number, cells in enumerate(cells_by_number(split, split.max()), start=1)
+    )
 
 
 def box(grid: Grid, x0: float, y0: float, x1: float, y1: float) -> np.ndarray:
@@ -162,13 +205,23 @@ def box(grid: Grid, x0: float, y0: float, x1: float, y1: float) -> np.ndarray:
 
 
 def test_roofs_split_where_their_heights_part_and_towers_stay():
-    low, high, tower, shed = box(GRID, 5, 5, 15, 15), box(GRID, 15, 5, 25, 15), box(GRID, 18, 8, 22, 12), box(GRID, 30, 5, 32, 7)
+    low, high, tower, shed = (
+        box(GRID, 5, 5, 15, 15),
+        box(GRID, 15, 5, 25, 15),
+        box(GRID, 18, 8, 22, 12),
+        box(GRID, 30, 5, 32, 7),
+    )
     covered = low | high | shed
     heights = np.select([tower, low, high, shed], [15.0, 4.0, 9.0, 3.0], np.nan)
     found = split_buildings(covered, heights, GRID, min_area=10.0)
     assert found.max() == 2 and (found[shed] == 0).all()
-    assert len(np.unique(found[low])) == 1 and len(np.unique(found[high])) == 1 and found[low][0] != found[high][0]
-    sloping = np.where(low | high, GRID.centres()[:, 0].reshape(GRID.shape), np.nan)  # the same cells under one steep roof
+    assert (
+        len(np.unique(found[low])) == 1
+        and len(np.unique(found[high])) == 1
+        and found[low][0] != found[high][0]
+    )
+    # the same cells under one steep roof
+    sloping = np.where(low | high, GRID.centres()[:, 0].reshape(GRID.shape), np.nan)
     assert split_buildings(low | high, sloping, GRID, 10.0).max() == 1
 
 
@@ -192,7 +245,10 @@ def test_roof_tops_leave_out_chimneys():
 @pytest.mark.parametrize("turn", [0.0, 0.3, 1.1])
 def test_rectangular_outline_of_a_noisy_l(turn):
     """Turned, sampled on cells, its border frayed: the corners come back."""
-    corners = np.array([[-8, -5], [8, -5], [8, 1], [1, 1], [1, 6], [-8, 6]], float) @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]] + [20, 15]
+    corners = np.array([[-8, -5], [8, -5], [8, 1], [1, 1], [1, 6], [-8, 6]], float) @ [
+        [np.cos(turn), np.sin(turn)],
+        [-np.sin(turn), np.cos(turn)],
+    ] + [20, 15]
     true = shapely.Polygon(corners)
     noisy = shapely.contains_xy(true.buffer(0.01), *GRID.centres().T).reshape(GRID.shape)
     edge = ndimage.binary_dilation(noisy) & ~ndimage.binary_erosion(noisy)
@@ -225,12 +281,20 @@ def test_trace_keeps_area_and_holes():
 def canopy_of(trees_: list[tuple[float, float, float, float]]) -> np.ndarray:
     """Highest of several round crowns (x, y, radius, height); NaN outside."""
     x, y = (values.reshape(GRID.shape) for values in GRID.centres().T)
-    layers = [np.where(np.hypot(x - a, y - b) < radius, height - 0.4 * height * (np.hypot(x - a, y - b) / radius) ** 2, np.nan) for a, b, radius, height in trees_]
+    layers = [
+        np.where(
+            np.hypot(x - a, y - b) < radius,
+            height - 0.4 * height * (np.hypot(x - a, y - b) / radius) ** 2,
+            np.nan,
+        )
+        for a, b, radius, height in trees_
+    ]
     return np.fmax.reduce(layers)
 
 
 def test_touching_crowns_are_told_apart():
-    planted = [(10, 10, 3, 8), (14.5, 10, 3, 9), (12, 14, 2.5, 7), (30, 20, 3, 10), (33, 5, 1.2, 1.5)]  # the last one is a bush
+    # the last one is a bush
+    planted = [(10, 10, 3, 8), (14.5, 10, 3, 9), (12, 14, 2.5, 7), (30, 20, 3, 10), (33, 5, 1.2, 1.5)]
     crowns = split_crowns(canopy_of(planted), GRID, 2.0)
     assert crowns.max() == 4
     rows, columns = GRID.cells(np.array([[x, y] for x, y, _, _ in planted]))
@@ -240,7 +304,10 @@ def test_touching_crowns_are_told_apart():
 
 
 def test_a_lumpy_crown_is_one_tree():
-    lobes = [(20 + 1.2 * np.cos(angle), 15 + 1.2 * np.sin(angle), 1.4, 8 + 0.3 * np.cos(3 * angle)) for angle in np.arange(0, 6.2, 1.2)]
+    lobes = [
+        (20 + 1.2 * np.cos(angle), 15 + 1.2 * np.sin(angle), 1.4, 8 + 0.3 * np.cos(3 * angle))
+        for angle in np.arange(0, 6.2, 1.2)
+    ]
     assert split_crowns(canopy_of(lobes + [(20, 15, 1.6, 8.2)]), GRID, 2.0).max() == 1
 
 
@@ -257,5 +324,7 @@ def test_every_cell_climbs_upwards():
 
 
 def test_numbers_follow_the_order_of_cells():
-    assert (renumbered(np.array([[0, 9, 9], [4, 4, 0], [9, 2, 2]])) == [[0, 1, 1], [2, 2, 0], [1, 3, 3]]).all()
+    assert (
+        renumbered(np.array([[0, 9, 9], [4, 4, 0], [9, 2, 2]])) == [[0, 1, 1], [2, 2, 0], [1, 3, 3]]
+    ).all()
     assert (renumbered(np.array([[7, 7], [3, 7]])) == [[1, 1], [2, 1]]).all()

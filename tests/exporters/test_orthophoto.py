@@ -25,7 +25,12 @@ def site(step: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
     """Points and labels of the ground that slopes to the east, and of a flat roof over part of it."""
     x, y = np.meshgrid(np.arange(step / 2, SIZE[0], step), np.arange(step / 2, SIZE[1], step))
     ground = np.stack([x.ravel(), y.ravel(), 0.05 * x.ravel()], 1)
-    over = (ground[:, 0] > ROOF[0]) & (ground[:, 0] < ROOF[2]) & (ground[:, 1] > ROOF[1]) & (ground[:, 1] < ROOF[3])
+    over = (
+        (ground[:, 0] > ROOF[0])
+        & (ground[:, 0] < ROOF[2])
+        & (ground[:, 1] > ROOF[1])
+        & (ground[:, 1] < ROOF[3])
+    )
     roof = ground[over] * [1, 1, 0] + [0, 0, ROOF[4]]
     points = np.concatenate([ground, roof])
     label = np.concatenate([np.where(ground[:, 0] < SIZE[0] / 2, 3, 4), np.ones(len(roof), int)])
@@ -36,10 +41,20 @@ def site(step: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
 def write_mesh(path, hole: bool = False) -> None:
     """The ground (its east end missing if `hole`) and the roof, two triangles each."""
     east = 15.0 if hole else SIZE[0]
-    quads = [[[0, 0, 0], [east, 0, 0.05 * east], [east, SIZE[1], 0.05 * east], [0, SIZE[1], 0]],
-             [[ROOF[0], ROOF[1], ROOF[4]], [ROOF[2], ROOF[1], ROOF[4]], [ROOF[2], ROOF[3], ROOF[4]], [ROOF[0], ROOF[3], ROOF[4]]]]
+    quads = [
+        [[0, 0, 0], [east, 0, 0.05 * east], [east, SIZE[1], 0.05 * east], [0, SIZE[1], 0]],
+        [
+            [ROOF[0], ROOF[1], ROOF[4]],
+            [ROOF[2], ROOF[1], ROOF[4]],
+            [ROOF[2], ROOF[3], ROOF[4]],
+            [ROOF[0], ROOF[3], ROOF[4]],
+        ],
+    ]
     triangles = [[base, base + 1, base + 2, base, base + 2, base + 3] for base in (0, 4)]
-    mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(np.array(quads, np.float64).reshape(-1, 3)), o3d.core.Tensor(np.array(triangles, np.int32).reshape(-1, 3)))
+    mesh = o3d.t.geometry.TriangleMesh(
+        o3d.core.Tensor(np.array(quads, np.float64).reshape(-1, 3)),
+        o3d.core.Tensor(np.array(triangles, np.int32).reshape(-1, 3)),
+    )
     o3d.t.io.write_triangle_mesh(str(path), mesh)
 
 
@@ -73,20 +88,34 @@ def test_places_show_their_class_colour_and_height(tmp_path, mesh):
     assert np.abs(sampled(height, places)[:, 0] - true_height - UTM["offset"][2]).max() < 1e-3
     top = cloud.point.positions.numpy()
     nearest = np.argmin(((np.stack([x, y, true_height], 1)[:300, None] - top[None]) ** 2).sum(2), axis=1)
-    assert (sampled(color, places)[:300] == np.c_[cloud.point.colors.numpy()[nearest], np.full(300, 255)]).all()
+    assert (
+        sampled(color, places)[:300] == np.c_[cloud.point.colors.numpy()[nearest], np.full(300, 255)]
+    ).all()
 
 
 def test_files_are_what_map_programs_expect(tmp_path):
     points, label = site()
-    scene = write_scene(tmp_path, labelled_cloud(points[points[:, 0] + points[:, 1] < 25], label[points[:, 0] + points[:, 1] < 25]), UTM)
+    scene = write_scene(
+        tmp_path,
+        labelled_cloud(points[points[:, 0] + points[:, 1] < 25], label[points[:, 0] + points[:, 1] < 25]),
+        UTM,
+    )
     figures = orthophoto.write(scene, Export(pixel_size=0.1))
     color, classes, names, height = orthophoto.outputs(scene, Export())
     empty = (576019.9, 5188011.9)  # the corner without points
-    for file, dtype, empty_value in ((color, "uint8", (0, 0, 0, 0)), (classes, "uint8", (0,)), (height, "float32", (-9999.0,))):
+    for file, dtype, empty_value in (
+        (color, "uint8", (0, 0, 0, 0)),
+        (classes, "uint8", (0,)),
+        (height, "float32", (-9999.0,)),
+    ):
         with rasterio.open(file) as dataset:
             assert dataset.crs.to_epsg() == 32615 and dataset.res == (0.1, 0.1)
             assert np.allclose(dataset.bounds, (576000, 5188000, 576020, 5188012), atol=1e-6)
-            assert dataset.dtypes[0] == dtype and dataset.profile["tiled"] and dataset.profile["compress"] == "deflate"
+            assert (
+                dataset.dtypes[0] == dtype
+                and dataset.profile["tiled"]
+                and dataset.profile["compress"] == "deflate"
+            )
             assert tuple(next(dataset.sample([empty]))) == empty_value
             assert dataset.dataset_mask()[0, -1] == 0 and dataset.dataset_mask()[-1, 0] == 255
     with rasterio.open(classes) as dataset:
@@ -105,7 +134,12 @@ def test_strips_and_point_order_do_not_show(tmp_path, monkeypatch):
     write_mesh(scene.mesh)
     orthophoto.write(scene, Export(pixel_size=0.2))
     order = np.random.default_rng(1).permutation(len(points))
-    shuffled = o3d.t.geometry.PointCloud({name: o3d.core.Tensor(np.ascontiguousarray(cloud.point[name].numpy()[order])) for name in cloud.point})
+    shuffled = o3d.t.geometry.PointCloud(
+        {
+            name: o3d.core.Tensor(np.ascontiguousarray(cloud.point[name].numpy()[order]))
+            for name in cloud.point
+        }
+    )
     other = write_scene(tmp_path / "b", shuffled)
     write_mesh(other.mesh)
     monkeypatch.setattr(orthophoto, "TILE", 16)
@@ -159,7 +193,10 @@ def test_highest_points_against_a_loop():
     grid = Grid.around(points, 0.7)
     best = {}
     for row, cell in enumerate(grid.flat_cells(points)):
-        if cell not in best or (points[row, 2], points[row, 0]) > (points[best[cell], 2], points[best[cell], 0]):
+        if cell not in best or (points[row, 2], points[row, 0]) > (
+            points[best[cell], 2],
+            points[best[cell], 0],
+        ):
             best[cell] = row
     found = grids.highest_points(grid, points).ravel()
     assert {cell: row for cell, row in enumerate(found) if row >= 0} == best
@@ -167,7 +204,10 @@ def test_highest_points_against_a_loop():
 
 
 def test_grids_of_neighbours_share_their_lines():
-    first, second = Grid.around(np.array([[576000.03, 5188000.0, 0], [576010.0, 5188010.0, 0]]), 0.3), Grid.around(np.array([[576011.0, 5188007.7, 0]]), 0.3)
+    first, second = (
+        Grid.around(np.array([[576000.03, 5188000.0, 0], [576010.0, 5188010.0, 0]]), 0.3),
+        Grid.around(np.array([[576011.0, 5188007.7, 0]]), 0.3),
+    )
     steps = np.array([second.left - first.left, second.top - first.top]) / 0.3
     assert np.abs(steps - np.round(steps)).max() < 1e-6
 

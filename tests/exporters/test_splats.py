@@ -1,4 +1,6 @@
-"""Labelled splats as files: what is on the ground gets the ground's class, and other programs read back what was written."""
+"""Labelled splats as files: what is on the ground gets the ground's class, and other programs read back what
+was written.
+"""
 
 import json
 
@@ -28,15 +30,19 @@ def run(*arguments) -> None:
 
 
 def site() -> Gaussians:
-    """Opaque flat Gaussians on the ground of `scenes`, with random colours and odd quaternions, and 30 small floaters 6 m above it; local frame."""
+    """Opaque flat Gaussians on the ground of `scenes`, with random colours and odd quaternions, and 30 small
+    floaters 6 m above it; local frame.
+    """
     generator = torch.Generator().manual_seed(0)
     x, y = np.meshgrid(np.arange(-3.9, 4, 0.2), np.arange(-3.9, 4, 0.2))
     ground = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
     high = np.random.default_rng(0).uniform([-1, -1, 6], [1, 1, 6.5], (30, 3))
     means = torch.from_numpy(np.concatenate([ground, high]) + ORIGIN - local_origin(views())).float()
     count = len(means)
-    scales = torch.tensor([0.13, 0.13, 2e-3]).log().repeat(count, 1) + 0.05 * torch.randn(count, 3, generator=generator)
-    scales[len(ground):] = np.log(0.03)
+    scales = torch.tensor([0.13, 0.13, 2e-3]).log().repeat(count, 1) + 0.05 * torch.randn(
+        count, 3, generator=generator
+    )
+    scales[len(ground) :] = np.log(0.03)
     quats = torch.tensor([1.0, 0, 0, 0]) + 0.02 * torch.randn(count, 4, generator=generator)
     logits = 4 + 0.5 * torch.randn(count, generator=generator)
     return Gaussians(means, scales, 1.7 * quats, logits, 0.3 * torch.randn(count, 9, 3, generator=generator))
@@ -86,7 +92,11 @@ def test_ply_loses_nothing(scene, splats):
     for name, values in load_gaussians(Scene(scene))[0].parameters().items():
         assert torch.equal(splats.gaussians.parameters()[name], values), name
     header = (scene / "export" / "splats.ply").read_bytes().partition(b"end_header")[0].decode()
-    assert "property uchar label" in header and "property float confidence" in header and "comment sc3d label 1 road" in header
+    assert (
+        "property uchar label" in header
+        and "property float confidence" in header
+        and "comment sc3d label 1 road" in header
+    )
     np.testing.assert_array_equal(splats.origin, local_origin(views()))
 
 
@@ -119,10 +129,15 @@ def test_spz_keeps_what_it_can_hold(scene, splats):
     assert np.abs(opacity - gaussians.opacities.numpy()).max() <= 1 / 510 + 1e-6
     assert np.abs(cloud["f_dc"].numpy() - gaussians.sh[:, 0].numpy()).max() <= 1 / (2 * 255 * 0.15) + 1e-5
     rest = gaussians.sh[:, 1:].numpy().clip(-1, 127 / 128)
-    assert np.abs(cloud["f_rest"].numpy() - rest).max() <= 17 / 256 + 1e-6 and np.abs(cloud["f_rest"].numpy() - rest)[:, :3].max() <= 9 / 256 + 1e-6
+    assert (
+        np.abs(cloud["f_rest"].numpy() - rest).max() <= 17 / 256 + 1e-6
+        and np.abs(cloud["f_rest"].numpy() - rest)[:, :3].max() <= 9 / 256 + 1e-6
+    )
     unit = torch.nn.functional.normalize(gaussians.quats, dim=1).numpy()
     assert (1 - np.abs((cloud["rot"].numpy() * unit).sum(axis=1))).max() < 1e-5
-    assert (scene / "export" / "splats.spz").stat().st_size < 0.25 * (scene / "export" / "splats.ply").stat().st_size
+    assert (scene / "export" / "splats.spz").stat().st_size < 0.25 * (
+        scene / "export" / "splats.ply"
+    ).stat().st_size
 
 
 def test_only_the_chosen_classes_and_both_formats_alike(scene, tmp_path, splats):
@@ -134,7 +149,9 @@ def test_only_the_chosen_classes_and_both_formats_alike(scene, tmp_path, splats)
     assert torch.equal(grass.gaussians.means, splats.gaussians.means[torch.from_numpy(kept)])
     np.testing.assert_array_equal(grass.confidence, splats.confidence[kept])
     summary = json.loads(sidecar(scene / "export" / "splats.ply").read_text())["summary"]
-    assert summary["splats_splats_by_class"] == {"grass": int(kept.sum())} and summary["spz_origin"] == list(local_origin(views()))
+    assert summary["splats_splats_by_class"] == {"grass": int(kept.sum())} and summary["spz_origin"] == list(
+        local_origin(views())
+    )
     run("export", scene, "--format", "splats", "spz", "--classes", "grass")  # SPZ now from the PLY
     assert (scene / "export" / "splats.spz").read_bytes() == alone
     run("export", scene, "--format", "splats", "spz")
@@ -153,7 +170,18 @@ def test_the_comment_says_where_the_origin_lies(scene):
 
 def test_pictures_in_class_colours(scene, tmp_path):
     def picture(*options) -> np.ndarray:
-        run("view", scene, "--splats", "--screenshot", tmp_path / "a.png", "--size", 320, 240, "--from-above", *options)
+        run(
+            "view",
+            scene,
+            "--splats",
+            "--screenshot",
+            tmp_path / "a.png",
+            "--size",
+            320,
+            240,
+            "--from-above",
+            *options,
+        )
         return read_image(tmp_path / "a.png")[:240].astype(int)
 
     image = picture("--by", "label")
@@ -173,23 +201,70 @@ class TestBadInput:
 
     def test_classes_that_are_not_there(self, capsys, scene):
         before = (scene / "export" / "splats.ply").read_bytes()
-        self.check(capsys, ["no class 'tree'", "road, grass"], "export", scene, "--format", "splats", "--classes", "tree")
+        self.check(
+            capsys,
+            ["no class 'tree'", "road, grass"],
+            "export",
+            scene,
+            "--format",
+            "splats",
+            "--classes",
+            "tree",
+        )
         assert (scene / "export" / "splats.ply").read_bytes() == before
 
     def test_missing_files(self, capsys, tmp_path):
         path = write_bare_scene(tmp_path / "scene")
         self.check(capsys, ["labelled.ply is missing", "propagate"], "export", path, "--format", "splats")
         run("label", path)
-        self.check(capsys, ["gaussians.ply is missing", "train"], "export", path, "--format", "spz", "--labelled", path / "seeds.ply")
-        self.check(capsys, ["splats.ply is missing", "--format splats"], "view", path, "--splats", "--by", "confidence", "--screenshot", tmp_path / "a.png")
-        self.check(capsys, ["state", "confidence"], "view", path, "--splats", "--by", "state", "--screenshot", tmp_path / "a.png")
+        self.check(
+            capsys,
+            ["gaussians.ply is missing", "train"],
+            "export",
+            path,
+            "--format",
+            "spz",
+            "--labelled",
+            path / "seeds.ply",
+        )
+        self.check(
+            capsys,
+            ["splats.ply is missing", "--format splats"],
+            "view",
+            path,
+            "--splats",
+            "--by",
+            "confidence",
+            "--screenshot",
+            tmp_path / "a.png",
+        )
+        self.check(
+            capsys,
+            ["state", "confidence"],
+            "view",
+            path,
+            "--splats",
+            "--by",
+            "state",
+            "--screenshot",
+            tmp_path / "a.png",
+        )
         assert not (path / "export").exists()
 
     def test_a_cloud_without_labels(self, capsys, scene, tmp_path):
         cloud = o3d.t.io.read_point_cloud(str(scene / "labelled.ply"))
         cloud.point["label"] = o3d.core.Tensor(np.zeros((len(cloud.point.positions), 1), np.uint8))
         o3d.t.io.write_point_cloud(str(tmp_path / "bare.ply"), cloud)
-        self.check(capsys, ["no splat shows a label", "bare.ply"], "export", scene, "--format", "splats", "--labelled", tmp_path / "bare.ply")
+        self.check(
+            capsys,
+            ["no splat shows a label", "bare.ply"],
+            "export",
+            scene,
+            "--format",
+            "splats",
+            "--labelled",
+            tmp_path / "bare.ply",
+        )
 
     def test_splats_of_other_cameras_and_without_labels(self, capsys, scene, tmp_path, splats):
         written = scene / "export" / "splats.ply"

@@ -21,7 +21,9 @@ MODELS = {
 
 
 def make_view(model: str) -> cameras.View:
-    return cameras.View("photo.jpg", pycolmap.Camera(model=model, width=1280, height=720, params=MODELS[model]), POSE)
+    return cameras.View(
+        "photo.jpg", pycolmap.Camera(model=model, width=1280, height=720, params=MODELS[model]), POSE
+    )
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -65,7 +67,9 @@ def test_points_behind_or_far_outside_the_field_of_view_are_not_seen():
 
 
 def test_look_at_from_above_has_north_up_and_east_right():
-    view = cameras.pinhole_view("a", (100, 100), (100, 100, 50, 50), cameras.look_at(np.array([0.0, 0.0, 10.0]), np.zeros(3)))
+    view = cameras.pinhole_view(
+        "a", (100, 100), (100, 100, 50, 50), cameras.look_at(np.array([0.0, 0.0, 10.0]), np.zeros(3))
+    )
     pixels, _ = cameras.project(view, np.array([[1.0, 0, 0], [0, 1.0, 0]]))
     assert pixels[0, 0] > 50 and pixels[0, 1] == pytest.approx(50)
     assert pixels[1, 1] < 50 and pixels[1, 0] == pytest.approx(50)
@@ -97,9 +101,14 @@ def test_undistorted_photo_shows_what_the_pinhole_view_projects(model):
     pinhole = cameras.undistorted(view, 640)
     assert pinhole.camera.is_undistorted() and max(pinhole.width, pinhole.height) == 640
     columns, rows = np.meshgrid(np.arange(1280), np.arange(720))
-    photo = np.stack([columns / 5, rows / 3, np.zeros_like(rows)], axis=2)  # colour = position in the distorted photo
+    # colour = position in the distorted photo
+    photo = np.stack([columns / 5, rows / 3, np.zeros_like(rows)], axis=2)
     warped = cameras.resample(photo.astype(np.float32), view, pinhole)
-    pixels = np.random.default_rng(0).uniform([20, 20], [pinhole.width - 20, pinhole.height - 20], (200, 2)).astype(int)
+    pixels = (
+        np.random.default_rng(0)
+        .uniform([20, 20], [pinhole.width - 20, pinhole.height - 20], (200, 2))
+        .astype(int)
+    )
     directions, _ = cameras.rays(pinhole, pixels + 0.5)
     expected, _ = cameras.project(view, view.centre + 10 * directions)
     found = warped[pixels[:, 1], pixels[:, 0], :2] * [5, 3] + 0.5

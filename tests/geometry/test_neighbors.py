@@ -42,7 +42,9 @@ def test_normals_of_noisy_plane_and_sphere_within_two_degrees():
     rng = np.random.default_rng(0)
     plane = np.concatenate([rng.uniform(-5, 5, (20000, 2)), rng.normal(0, 0.002, (20000, 1))], axis=1)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    normals = neighbors.estimate_normals(plane @ rotation.T, neighbors.NeighborIndex(plane @ rotation.T).nearest(plane @ rotation.T, 30)[0])
+    normals = neighbors.estimate_normals(
+        plane @ rotation.T, neighbors.NeighborIndex(plane @ rotation.T).nearest(plane @ rotation.T, 30)[0]
+    )
     assert np.quantile(angle_degrees(normals, np.tile(rotation[:, 2], (len(plane), 1))), 0.99) < 2
     ball = sphere(40000)
     normals = neighbors.estimate_normals(ball, neighbors.NeighborIndex(ball).nearest(ball, 30)[0])
@@ -62,7 +64,9 @@ def test_curvature_zero_on_a_plane_and_large_on_a_cubes_edge_whatever_the_signs(
     top = np.stack([*np.meshgrid(step, step), np.ones((41, 41))], axis=2).reshape(-1, 3)
     side = top[:, [0, 2, 1]][top[:, 1] < 1]  # the face y = 1; the shared edge only once
     cube = np.concatenate([top, side])
-    normals = np.concatenate([np.tile(np.float32([0, 0, 1]), (len(top), 1)), np.tile(np.float32([0, 1, 0]), (len(side), 1))])
+    normals = np.concatenate(
+        [np.tile(np.float32([0, 0, 1]), (len(top), 1)), np.tile(np.float32([0, 1, 0]), (len(side), 1))]
+    )
     near = neighbors.NeighborIndex(cube).nearest(cube, 31)[0][:, 1:]
     bend = neighbors.curvature(normals, near)
     inner = (np.abs(cube[:, 1] - 0.3) < 0.05) & (cube[:, 2] == 1) & (np.abs(cube[:, 0] - 0.5) < 0.2)
@@ -79,4 +83,6 @@ def test_spacing_of_grid_and_random_sample():
     grid = np.stack(np.meshgrid(np.arange(60) * 0.5, np.arange(60) * 0.5, [0.0]), axis=-1).reshape(-1, 3)
     random = np.random.default_rng(0).uniform([0, 0, 0], [30, 30, 0], (3600, 3))
     for points in (grid, random):
-        assert neighbors.point_spacing(neighbors.NeighborIndex(points).nearest(points, 9)[1]) == pytest.approx(0.5, rel=0.2)
+        assert neighbors.point_spacing(
+            neighbors.NeighborIndex(points).nearest(points, 9)[1]
+        ) == pytest.approx(0.5, rel=0.2)

@@ -17,7 +17,12 @@ def grid(low: float, high: float, step: float, height: float) -> np.ndarray:
 
 
 def overhead(height: float = 20.0, size: int = 200) -> object:
-    return pinhole_view("top", (size, size), (size, size, size / 2, size / 2), look_at(np.array([0.0, 0, height]), np.zeros(3)))
+    return pinhole_view(
+        "top",
+        (size, size),
+        (size, size, size / 2, size / 2),
+        look_at(np.array([0.0, 0, height]), np.zeros(3)),
+    )
 
 
 def sphere_mesh(resolution: int = 100):
@@ -28,14 +33,18 @@ def sphere_mesh(resolution: int = 100):
 @pytest.mark.parametrize("offset", [np.zeros(3), np.array([5e5, 5e6, 200.0])])
 def test_range_and_depth_of_a_sphere_are_analytic(offset):
     vertices, triangles = sphere_mesh(300)
-    view = pinhole_view("a", (300, 200), (400, 400, 140, 105), look_at(np.array([7.0, 2, 3]), np.zeros(3))).shifted(-offset)
+    view = pinhole_view(
+        "a", (300, 200), (400, 400, 140, 105), look_at(np.array([7.0, 2, 3]), np.zeros(3))
+    ).shifted(-offset)
     first = first_surface(Surface.from_mesh(vertices + offset, triangles, np.round(offset)), view)
     hit = np.isfinite(first.range)
     rows, columns = np.nonzero(hit)
     points = surface_points(first, view, rows, columns) - offset
     assert hit.sum() > 5000
     assert np.abs(np.linalg.norm(points, axis=1) - 2).max() < 1e-3
-    towards = (view.centre - offset - points) / np.linalg.norm(view.centre - offset - points, axis=1, keepdims=True)
+    towards = (view.centre - offset - points) / np.linalg.norm(
+        view.centre - offset - points, axis=1, keepdims=True
+    )
     cosine = np.einsum("ij,ij->i", towards, points / 2)
     assert np.quantile(np.abs(first.incidence[hit] - cosine), 0.99) < 0.03
 
@@ -47,8 +56,13 @@ def test_a_wall_hides_what_is_behind_it(kind):
     normals = np.tile(UP, (len(points), 1))
     view = overhead()
     if kind == "mesh":
-        corners = np.array([[-2, -2, 5], [2, -2, 5], [2, 2, 5], [-2, 2, 5], [-6, -6, 0], [6, -6, 0], [6, 6, 0], [-6, 6, 0]], float)
-        surface = Surface.from_mesh(corners, np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]), np.zeros(3))
+        corners = np.array(
+            [[-2, -2, 5], [2, -2, 5], [2, 2, 5], [-2, 2, 5], [-6, -6, 0], [6, -6, 0], [6, 6, 0], [-6, 6, 0]],
+            float,
+        )
+        surface = Surface.from_mesh(
+            corners, np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]), np.zeros(3)
+        )
     else:
         surface = Surface.from_cloud(points, normals, np.zeros(3))
     seen = see_points(view, points, normals, first_surface(surface, view), 0.1).points
@@ -56,9 +70,11 @@ def test_a_wall_hides_what_is_behind_it(kind):
     visible[seen] = True
     shadow = np.abs(ground[:, :2]).max(axis=1) < 2 * 20 / 15 - 0.2  # what the roof covers, seen from 20 m
     assert not visible[: len(ground)][shadow].any()
-    open_ground = (np.abs(ground[:, :2]).max(axis=1) > 2 * 20 / 15 + 0.4) & (np.abs(ground[:, :2]).max(axis=1) < 6)
+    open_ground = (np.abs(ground[:, :2]).max(axis=1) > 2 * 20 / 15 + 0.4) & (
+        np.abs(ground[:, :2]).max(axis=1) < 6
+    )
     assert visible[: len(ground)][open_ground].mean() > 0.999
-    assert visible[len(ground):].all()
+    assert visible[len(ground) :].all()
 
 
 def test_without_the_filter_everything_in_the_image_is_seen():
@@ -70,7 +86,13 @@ def test_back_faces_are_not_seen():
     wall = grid(-2, 2, 0.1, 5.0)
     points = np.concatenate([wall, wall - [0, 0, 0.05]])  # a slab thinner than the tolerance
     normals = np.concatenate([np.tile(UP, (len(wall), 1)), np.tile(-UP, (len(wall), 1))])
-    seen = see_points(overhead(), points, normals, first_surface(Surface.from_cloud(points, normals, np.zeros(3)), overhead()), 0.1).points
+    seen = see_points(
+        overhead(),
+        points,
+        normals,
+        first_surface(Surface.from_cloud(points, normals, np.zeros(3)), overhead()),
+        0.1,
+    ).points
     assert len(seen) == len(wall) and seen.max() < len(wall)
 
 
@@ -83,7 +105,9 @@ def test_pixel_to_surface_and_point_to_pixel_agree_on_a_sphere():
     index, agree, total = NeighborIndex(points), 0, 0
     for seed in range(6):
         centre = np.random.default_rng(seed).normal(size=3)
-        view = pinhole_view("a", (900, 900), (1000, 1000, 450, 450), look_at(9 * centre / np.linalg.norm(centre), np.zeros(3)))
+        view = pinhole_view(
+            "a", (900, 900), (1000, 1000, 450, 450), look_at(9 * centre / np.linalg.norm(centre), np.zeros(3))
+        )
         first = first_surface(surface, view)
         forward = np.zeros(len(points), bool)
         forward[see_points(view, points, normals, first, 0.02).points] = True

@@ -32,10 +32,16 @@ def sphere():
     color = np.broadcast_to(np.uint8([200, 100, 0]), (300, 400, 3))
     for row in range(40):  # spread evenly, by the golden angle
         height, turn = 1 - (2 * row + 1) / 40, np.pi * (3 - np.sqrt(5)) * row
-        centre = np.array([np.cos(turn) * np.sqrt(1 - height**2), np.sin(turn) * np.sqrt(1 - height**2), height])
+        centre = np.array(
+            [np.cos(turn) * np.sqrt(1 - height**2), np.sin(turn) * np.sqrt(1 - height**2), height]
+        )
         view = pinhole_view("a", (400, 300), (600, 600, 190, 155), look_at(8 * centre, np.zeros(3)))
         first = first_surface(surface, view)
-        depth = np.where(np.isfinite(first.range) & (first.incidence > np.cos(np.deg2rad(75))), first.range * first.ray_z, 0)
+        depth = np.where(
+            np.isfinite(first.range) & (first.incidence > np.cos(np.deg2rad(75))),
+            first.range * first.ray_z,
+            0,
+        )
         fusion.integrate(view, depth.astype(np.float32), color, 20.0)
     return fusion
 
@@ -70,7 +76,9 @@ def test_a_deep_scene_keeps_its_depth():
     """A plane 120 m away: nothing wraps, as 16-bit millimetres would at 65.5 m."""
     fusion = DepthFusion(0.5, 2000)
     for x in (0.0, 10.0):
-        view = pinhole_view("a", (120, 90), (150, 150, 57, 47), look_at(np.array([x, 0, 120.0]), np.array([x, 0, 0.0])))
+        view = pinhole_view(
+            "a", (120, 90), (150, 150, 57, 47), look_at(np.array([x, 0, 120.0]), np.array([x, 0, 0.0]))
+        )
         fusion.integrate(view, np.full((90, 120), 120, np.float32), np.zeros((90, 120, 3), np.uint8), 150.0)
     height = fusion.mesh().vertex.positions.numpy()[:, 2]
     assert len(height) > 1000 and np.abs(height).max() < 0.05
@@ -85,7 +93,9 @@ def test_empty_depth_adds_nothing_and_distorted_views_are_refused():
     view = pinhole_view("a", (20, 10), (15, 15, 10, 5), np.eye(4))
     fusion.integrate(view, np.zeros((10, 20), np.float32), np.zeros((10, 20, 3), np.uint8), 150.0)
     assert len(fusion.cloud().point.positions) == 0 and len(fusion.mesh().triangle.indices) == 0
-    radial = View("b", pycolmap.Camera(model="RADIAL", width=20, height=10, params=[15, 10, 5, 0.1, 0]), np.eye(4))
+    radial = View(
+        "b", pycolmap.Camera(model="RADIAL", width=20, height=10, params=[15, 10, 5, 0.1, 0]), np.eye(4)
+    )
     with pytest.raises(ValueError, match="pinhole"):
         fusion.integrate(radial, np.ones((10, 20), np.float32), np.zeros((10, 20, 3), np.uint8), 150.0)
 
@@ -98,7 +108,9 @@ def test_small_parts_are_dropped():
 
 
 def test_pixel_squares_cover_exactly_the_wanted_pixels_at_their_depth():
-    view = pinhole_view("a", (80, 60), (90, 90, 37, 32), look_at(np.array([3.0, 1, 20]), np.array([0.0, 0, 0])))
+    view = pinhole_view(
+        "a", (80, 60), (90, 90, 37, 32), look_at(np.array([3.0, 1, 20]), np.array([0.0, 0, 0]))
+    )
     rng = np.random.default_rng(0)
     depth = rng.uniform(15, 16, (60, 80)).astype(np.float32)
     wanted = np.zeros((60, 80), bool)
@@ -106,7 +118,9 @@ def test_pixel_squares_cover_exactly_the_wanted_pixels_at_their_depth():
     depth[12, 30] = 0
     mesh, cloud = pixel_squares(view, depth, np.full((60, 80, 3), 77, np.uint8), wanted)
     assert len(mesh.triangle.indices) == 2 * len(cloud.point.positions) == 2 * (30 * 40 - 1)
-    first = first_surface(Surface.from_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), np.zeros(3)), view)
+    first = first_surface(
+        Surface.from_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), np.zeros(3)), view
+    )
     seen = first.range * first.ray_z
     inner = wanted.copy()
     inner[12, 30] = False
@@ -116,14 +130,20 @@ def test_pixel_squares_cover_exactly_the_wanted_pixels_at_their_depth():
     outside[9:41, 19:61] = False  # squares reach half a pixel further
     assert not np.isfinite(seen[outside]).any()
     corners = mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy()]
-    facing = np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), view.centre - corners[:, 0])
+    facing = np.einsum(
+        "ij,ij->i",
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
+        view.centre - corners[:, 0],
+    )
     assert (facing > 0).all()
     empty, none = pixel_squares(view, depth, np.zeros((60, 80, 3), np.uint8), np.zeros((60, 80), bool))
     assert len(empty.triangle.indices) == 0 and len(none.point.positions) == 0
 
 
 def test_order_is_that_of_positions_and_says_the_same():
-    """A mesh whose vertices and triangles are shuffled comes out as the same bytes, with the same corners, sense and colours."""
+    """A mesh whose vertices and triangles are shuffled comes out as the same bytes, with the same corners,
+    sense and colours.
+    """
     rng = np.random.default_rng(3)
     mesh = o3d.t.geometry.TriangleMesh.create_sphere(1.0, 12)
     vertices, triangles = mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy()
@@ -131,28 +151,39 @@ def test_order_is_that_of_positions_and_says_the_same():
     found = []
     for _ in range(2):
         order = rng.permutation(len(vertices))
-        turned = np.stack([np.roll(row, rng.integers(3)) for row in np.argsort(order)[rng.permutation(triangles)]])
+        turned = np.stack(
+            [np.roll(row, rng.integers(3)) for row in np.argsort(order)[rng.permutation(triangles)]]
+        )
         shuffled = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(vertices[order]), o3d.core.Tensor(turned))
         shuffled.vertex.colors = o3d.core.Tensor(colors[order])
         found.append(mesh_in_order(shuffled))
     one, other = found
-    assert all((one.vertex[name].numpy() == other.vertex[name].numpy()).all() for name in ("positions", "colors"))
+    assert all(
+        (one.vertex[name].numpy() == other.vertex[name].numpy()).all() for name in ("positions", "colors")
+    )
     assert (one.triangle.indices.numpy() == other.triangle.indices.numpy()).all()
     keys = one.vertex.positions.numpy()[:, ::-1].tolist()
     assert keys == sorted(keys)
-    described = np.concatenate([one.vertex.positions.numpy(), one.vertex.colors.numpy()], axis=1)[one.triangle.indices.numpy()]
+    described = np.concatenate([one.vertex.positions.numpy(), one.vertex.colors.numpy()], axis=1)[
+        one.triangle.indices.numpy()
+    ]
     before = np.concatenate([vertices, colors], axis=1)[triangles]
     assert _corner_set(described) == _corner_set(before)
 
 
 def _corner_set(corners: np.ndarray) -> list:
     """Triangles without regard to their order or first corner, but to their sense."""
-    return sorted(min(tuple(map(tuple, np.roll(triangle, turn, axis=0))) for turn in range(3)) for triangle in corners)
+    return sorted(
+        min(tuple(map(tuple, np.roll(triangle, turn, axis=0))) for turn in range(3)) for triangle in corners
+    )
 
 
 def test_cloud_order_keeps_every_point_with_its_values():
     rng = np.random.default_rng(4)
-    points, order = rng.integers(0, 4, (60, 3)).astype(np.float32) + rng.random((60, 3)).astype(np.float32), rng.permutation(60)
+    points, order = (
+        rng.integers(0, 4, (60, 3)).astype(np.float32) + rng.random((60, 3)).astype(np.float32),
+        rng.permutation(60),
+    )
     clouds = []
     for rows in (np.arange(60), order):
         cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points[rows]))
@@ -160,7 +191,9 @@ def test_cloud_order_keeps_every_point_with_its_values():
         clouds.append(cloud_in_order(cloud))
     for name in ("positions", "colors"):
         np.testing.assert_array_equal(clouds[0].point[name].numpy(), clouds[1].point[name].numpy())
-    np.testing.assert_array_equal(clouds[0].point.positions.numpy(), points[clouds[0].point.colors.numpy()[:, 0]])
+    np.testing.assert_array_equal(
+        clouds[0].point.positions.numpy(), points[clouds[0].point.colors.numpy()[:, 0]]
+    )
 
 
 FUSE = """
@@ -183,7 +216,16 @@ print(state.hexdigest())
 
 def test_one_core_and_all_cores_give_the_same_bytes():
     def digest(cores: int) -> str:
-        environment = os.environ | {"OMP_NUM_THREADS": str(cores), "PYTHONPATH": str(Path(__file__).parents[2])}
-        return subprocess.run([sys.executable, "-c", FUSE, str(cores)], env=environment, capture_output=True, text=True, check=True).stdout
+        environment = os.environ | {
+            "OMP_NUM_THREADS": str(cores),
+            "PYTHONPATH": str(Path(__file__).parents[2]),
+        }
+        return subprocess.run(
+            [sys.executable, "-c", FUSE, str(cores)],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
 
     assert digest(1) == digest(2) == digest(2)

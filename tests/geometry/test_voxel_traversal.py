@@ -1,4 +1,6 @@
-"""The voxel grid as a surface: a step-by-step twin of the traversal, analytic shapes, floaters and gaps, both directions of visibility."""
+"""The voxel grid as a surface: a step-by-step twin of the traversal, analytic shapes, floaters and gaps, both
+directions of visibility.
+"""
 
 import numba
 import numpy as np
@@ -44,57 +46,96 @@ def patches_of(voxels: np.ndarray, shapes: np.ndarray, voxel_size: float) -> Pat
 
 
 def rays_from(rng: np.random.Generator, extent: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Starts (3,) in voxels and directions (K, 3): outside and inside the grid, on voxel corners; along axes and diagonals, towards corners, any."""
+    """Starts (3,) in voxels and directions (K, 3): outside and inside the grid, on voxel corners; along axes
+    and diagonals, towards corners, any.
+    """
     middle = 8 + extent / 2
-    starts = [middle + extent * d for d in DIAGONALS] + list(rng.uniform(8, 8 + extent, (10, 3))) + list(rng.integers(8, 8 + extent, (10, 3)).astype(float))
+    starts = (
+        [middle + extent * d for d in DIAGONALS]
+        + list(rng.uniform(8, 8 + extent, (10, 3)))
+        + list(rng.integers(8, 8 + extent, (10, 3)).astype(float))
+    )
     starts += [np.array([middle, middle, -5.0]), np.array([8.0, 8.0, 100.0])]
     bundles = []
     for start in starts:
         corners = rng.integers(8, 9 + extent, (30, 3)) - start
-        directions = np.concatenate([DIAGONALS, rng.normal(size=(40, 3)), corners[np.abs(corners).max(axis=1) > 0]])
+        directions = np.concatenate(
+            [DIAGONALS, rng.normal(size=(40, 3)), corners[np.abs(corners).max(axis=1) > 0]]
+        )
         bundles.append((start, unit(directions)))
     return bundles
 
 
-def slow_hits(shapes: np.ndarray, positions: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Range and |cosine| (K,) of the nearer of the patches (K, 2, 12) of one voxel per ray; positions (K, 3) from the voxel's corner."""
+def slow_hits(
+    shapes: np.ndarray, positions: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Range and |cosine| (K,) of the nearer of the patches (K, 2, 12) of one voxel per ray; positions (K, 3)
+    from the voxel's corner.
+    """
     d, n, away = directions[:, None], shapes[:, :, 3:6], shapes[:, :, :3] - positions[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(d == 0, 1e300, 1 / d)
-        times = np.stack([shapes[:, :, 6:9] - positions[:, None], shapes[:, :, 9:] - positions[:, None]]) * inverse
+        times = (
+            np.stack([shapes[:, :, 6:9] - positions[:, None], shapes[:, :, 9:] - positions[:, None]])
+            * inverse
+        )
         enter, leave = times.min(axis=0).max(axis=2), times.max(axis=0).min(axis=2)
         slope, scattered = dot(d, n), (n == 0).all(axis=2)
-        distance = np.where(scattered, np.maximum(enter, np.minimum(leave, dot(away, d))), dot(away, n) / slope)
+        distance = np.where(
+            scattered, np.maximum(enter, np.minimum(leave, dot(away, d))), dot(away, n) / slope
+        )
         distance[~((distance > 0) & (enter <= distance) & (distance <= leave))] = np.inf
     nearest, rows = distance.argmin(axis=1), np.arange(len(distance))
     return distance[rows, nearest], np.where(scattered, 1, np.abs(slope))[rows, nearest]
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]  # in the order of the kernel, to the bit
+    # in the order of the kernel, to the bit
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
-def slow_trace(lookup: np.ndarray, shapes: np.ndarray, positions: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A DDA over single voxels without blocks or bounds, for all rays (K, 3) at once; lookup: (S, S, S) row of a voxel, -1 = nothing there."""
-    voxels, ahead, rows = np.floor(positions).astype(int), (directions >= 0).astype(int), np.arange(len(positions))
+def slow_trace(
+    lookup: np.ndarray, shapes: np.ndarray, positions: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A DDA over single voxels without blocks or bounds, for all rays (K, 3) at once; lookup: (S, S, S) row
+    of a voxel, -1 = nothing there.
+    """
+    voxels, ahead, rows = (
+        np.floor(positions).astype(int),
+        (directions >= 0).astype(int),
+        np.arange(len(positions)),
+    )
     inverse = np.divide(1, directions, out=np.zeros_like(directions), where=directions != 0)
     distance, incidence = np.full(len(rows), np.inf), np.zeros(len(rows))
     for _ in range(300):
         inside = rows[np.isinf(distance) & ((voxels >= 0) & (voxels < len(lookup))).all(axis=1)]
         found = inside[lookup[tuple(voxels[inside].T)] >= 0]
-        ranges, cosines = slow_hits(shapes[lookup[tuple(voxels[found].T)]], (positions - voxels)[found], directions[found])
+        ranges, cosines = slow_hits(
+            shapes[lookup[tuple(voxels[found].T)]], (positions - voxels)[found], directions[found]
+        )
         distance[found], incidence[found] = ranges, np.where(np.isfinite(ranges), cosines, 0)
-        axis = np.where(directions == 0, np.inf, (voxels + ahead - positions) * inverse).argmin(axis=1)  # the first of equal ones
+        # the first of equal ones
+        axis = np.where(directions == 0, np.inf, (voxels + ahead - positions) * inverse).argmin(axis=1)
         voxels[rows, axis] += 2 * ahead[rows, axis] - 1
     return distance, incidence
 
 
-@pytest.mark.parametrize(("seed", "share", "voxel_size", "num_hits"), [(0, 0.002, 0.25, 30), (1, 0.03, 0.25, 500), (2, 0.3, 1.0, 2000)])
+@pytest.mark.parametrize(
+    ("seed", "share", "voxel_size", "num_hits"),
+    [(0, 0.002, 0.25, 30), (1, 0.03, 0.25, 500), (2, 0.3, 1.0, 2000)],
+)
 def test_hits_are_those_of_a_dda_over_single_voxels(seed, share, voxel_size, num_hits):
     rng = np.random.default_rng(seed)
     voxels = occupancy(rng, 30, share)
-    shapes = np.concatenate([rng.random((len(voxels), 2, 3)), unit(rng.normal(size=(len(voxels), 2, 3))),
-                             rng.uniform(-0.2, 0.3, (len(voxels), 2, 3)), rng.uniform(0.7, 1.2, (len(voxels), 2, 3))], axis=2).astype(np.float32)
+    shapes = np.concatenate(
+        [
+            rng.random((len(voxels), 2, 3)),
+            unit(rng.normal(size=(len(voxels), 2, 3))),
+            rng.uniform(-0.2, 0.3, (len(voxels), 2, 3)),
+            rng.uniform(0.7, 1.2, (len(voxels), 2, 3)),
+        ],
+        axis=2,
+    ).astype(np.float32)
     kind = rng.random(len(voxels))
     shapes[kind < 0.4, 1] = np.nan  # one side only
     shapes[kind < 0.2, 0, 3:6] = 0  # scattered points
@@ -102,40 +143,54 @@ def test_hits_are_those_of_a_dda_over_single_voxels(seed, share, voxel_size, num
     lookup = np.full((48, 48, 48), -1)
     lookup[tuple(voxels.T)] = np.arange(len(voxels))
     bundles = rays_from(rng, 30)
-    fast = np.concatenate([surface.cast(camera_at(start * voxel_size), directions) for start, directions in bundles], axis=1)
+    fast = np.concatenate(
+        [surface.cast(camera_at(start * voxel_size), directions) for start, directions in bundles], axis=1
+    )
     starts = np.concatenate([np.tile(start, (len(directions), 1)) for start, directions in bundles])
     directions = np.concatenate([directions for _, directions in bundles]).astype(np.float64)
     distance, incidence = slow_trace(lookup, shapes.astype(np.float64), starts, directions)
     np.testing.assert_array_equal(fast[0], (distance * voxel_size).astype(np.float32))
     np.testing.assert_array_equal(fast[1], incidence.astype(np.float32))
-    assert np.isfinite(distance).sum() > num_hits and (directions == 0).any(axis=1)[np.isfinite(distance)].sum() > num_hits / 20
+    assert (
+        np.isfinite(distance).sum() > num_hits
+        and (directions == 0).any(axis=1)[np.isfinite(distance)].sum() > num_hits / 20
+    )
 
 
 def test_the_first_voxel_is_that_of_a_slab_test_over_all_voxels():
     rng = np.random.default_rng(3)
     voxels = occupancy(rng, 24, 0.01)
     shapes = np.full((len(voxels), 2, 12), np.nan)
-    shapes[:, 0, :3], shapes[:, 0, 3:6], shapes[:, 0, 6:9], shapes[:, 0, 9:] = 0.5, 0, 0, 1  # a ray that enters is stopped beside the middle
+    # a ray that enters is stopped beside the middle
+    shapes[:, 0, :3], shapes[:, 0, 3:6], shapes[:, 0, 6:9], shapes[:, 0, 9:] = 0.5, 0, 0, 1
     surface = VoxelSurface(patches_of(voxels, shapes, 1.0))
     for start in [*rng.uniform(8, 32, (10, 3)), *rng.uniform(-40, 80, (10, 3))]:
         directions = unit(rng.normal(size=(200, 3)) + 0.5 * (20 - start) / 30)
         distance, _ = surface.cast(camera_at(start), directions)
-        times = (np.stack([voxels, voxels + 1]) - start)[:, None] / directions.astype(np.float64)[None, :, None]
+        times = (np.stack([voxels, voxels + 1]) - start)[:, None] / directions.astype(np.float64)[
+            None, :, None
+        ]
         enters, leaves = times.min(axis=0).max(axis=2), times.max(axis=0).min(axis=2)
         first = np.clip((voxels + 0.5 - start) @ directions.T.astype(np.float64), enters.T, leaves.T).T
         blocked = (first > 0) & (leaves > enters)
         nearest = np.where(blocked, enters, np.inf).argmin(axis=1)
         rows = np.arange(len(directions))
-        np.testing.assert_allclose(distance, np.where(blocked.any(axis=1), first[rows, nearest], np.inf), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(
+            distance, np.where(blocked.any(axis=1), first[rows, nearest], np.inf), rtol=1e-5, atol=1e-5
+        )
 
 
 def test_no_ray_and_no_surface_give_nothing():
     points = np.random.default_rng(0).uniform(0, 100, (200, 3))  # floaters only
     surface = VoxelSurface.from_cloud(points, np.tile(UP, (200, 1)), 0.5)
-    distance, incidence = surface.cast(camera_at(np.zeros(3)), unit(np.random.default_rng(1).normal(size=(50, 3))))
+    distance, incidence = surface.cast(
+        camera_at(np.zeros(3)), unit(np.random.default_rng(1).normal(size=(50, 3)))
+    )
     assert np.isinf(distance).all() and (incidence == 0).all()
     plane = np.random.default_rng(0).uniform(0, 4, (2000, 3)) * [1, 1, 0]
-    distance, _ = VoxelSurface.from_cloud(plane, np.tile(UP, (2000, 1)), 0.3).cast(camera_at(np.array([2.0, 2, 5])), np.float32([[np.nan] * 3, [0, 0, -1]]))
+    distance, _ = VoxelSurface.from_cloud(plane, np.tile(UP, (2000, 1)), 0.3).cast(
+        camera_at(np.array([2.0, 2, 5])), np.float32([[np.nan] * 3, [0, 0, -1]])
+    )
     assert np.isinf(distance[0]) and abs(distance[1] - 5) < 1e-5
 
 
@@ -150,7 +205,12 @@ def ring(size: int = 300) -> list:
     """Views of a sphere of radius 2 from all sides."""
     directions = np.random.default_rng(0).normal(size=(8, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return [pinhole_view("a", (size, size), (1.1 * size, 1.1 * size, size / 2, size / 2), look_at(9 * d, np.zeros(3))) for d in directions]
+    return [
+        pinhole_view(
+            "a", (size, size), (1.1 * size, 1.1 * size, size / 2, size / 2), look_at(9 * d, np.zeros(3))
+        )
+        for d in directions
+    ]
 
 
 def range_to_sphere(view) -> np.ndarray:
@@ -158,7 +218,9 @@ def range_to_sphere(view) -> np.ndarray:
     directions, _ = rays(view)
     along = -directions @ view.centre
     inside = 4 - (view.centre @ view.centre - along**2)
-    return np.where(inside > 0, along - np.sqrt(np.maximum(inside, 0)), np.nan).reshape(view.height, view.width)
+    return np.where(inside > 0, along - np.sqrt(np.maximum(inside, 0)), np.nan).reshape(
+        view.height, view.width
+    )
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.2])
@@ -169,20 +231,30 @@ def test_ranges_are_finer_than_voxels(noise):
     surface = VoxelSurface.from_cloud(points, normals, voxel)
     for view in ring()[:3]:
         first, exact = first_surface(surface, view), range_to_sphere(view)
-        cosine = np.abs(81 - 4 - exact**2) / (4 * exact)  # between ray and normal, from the triangle of centre, camera and hit
+        # between ray and normal, from the triangle of centre, camera and hit
+        cosine = np.abs(81 - 4 - exact**2) / (4 * exact)
         inner = np.isfinite(exact) & (cosine > 0.3)
         error = np.abs(first.range - exact)[inner] * cosine[inner] / voxel
         assert np.isfinite(first.range)[np.isfinite(exact)].mean() > 0.998
-        assert np.median(error) < (0.15 if noise else 0.01) and np.quantile(error, 0.99) < (0.65 if noise else 0.05)
+        assert np.median(error) < (0.15 if noise else 0.01) and np.quantile(error, 0.99) < (
+            0.65 if noise else 0.05
+        )
 
 
 def test_pixel_to_surface_and_point_to_pixel_agree_on_a_sphere():
-    """A pixel binds only points that face it (METHOD 3.3): beyond the horizon, planes stand out a little, next to points that face away."""
+    """A pixel binds only points that face it (METHOD 3.3): beyond the horizon, planes stand out a little,
+    next to points that face away.
+    """
     points, normals = sphere(20_000)
     spacing = spacing_of(points)
-    surface, index, agree = VoxelSurface.from_cloud(points, normals, SURFACE_VOXEL * spacing), NeighborIndex(points), []
+    surface, index, agree = (
+        VoxelSurface.from_cloud(points, normals, SURFACE_VOXEL * spacing),
+        NeighborIndex(points),
+        [],
+    )
     for view in ring(900)[:4]:
-        near = pinhole_view("a", (900, 900), (1750, 1750, 450, 450), view.cam_from_world)  # the sphere fills the picture
+        # the sphere fills the picture
+        near = pinhole_view("a", (900, 900), (1750, 1750, 450, 450), view.cam_from_world)
         first = first_surface(surface, near)
         forward, backward = np.zeros((2, len(points)), bool)
         forward[see_points(near, points, normals, first, 2 * spacing).points] = True
@@ -199,12 +271,21 @@ def grid(low: float, high: float, step: float, height: float) -> np.ndarray:
 
 
 def overhead(height: float = 20.0, size: int = 400):
-    return pinhole_view("top", (size, size), (size, size, size / 2, size / 2), look_at(np.array([0.0, 0, height]), np.zeros(3)))
+    return pinhole_view(
+        "top",
+        (size, size),
+        (size, size, size / 2, size / 2),
+        look_at(np.array([0.0, 0, height]), np.zeros(3)),
+    )
 
 
 def seen_by(view, points: np.ndarray, surface: VoxelSurface, tolerance: float = 0.1) -> np.ndarray:
     visible = np.zeros(len(points), bool)
-    visible[see_points(view, points, np.tile(UP, (len(points), 1)), first_surface(surface, view), tolerance).points] = True
+    visible[
+        see_points(
+            view, points, np.tile(UP, (len(points), 1)), first_surface(surface, view), tolerance
+        ).points
+    ] = True
     return visible
 
 
@@ -232,10 +313,13 @@ def test_half_of_a_foreground_still_blocks_and_floaters_do_not(regular):
 def test_nothing_grows_beyond_the_edge_of_a_roof():
     ground, roof = grid(-6, 6, 0.1, 0.0), grid(-2, 2.05, 0.1, 5.0)
     points = np.concatenate([ground, roof])
-    visible = seen_by(overhead(), points, VoxelSurface.from_cloud(points, np.tile(UP, (len(points), 1)), 0.25))[: len(ground)]
+    visible = seen_by(
+        overhead(), points, VoxelSurface.from_cloud(points, np.tile(UP, (len(points), 1)), 0.25)
+    )[: len(ground)]
     reach = np.abs(ground[:, :2]).max(axis=1)
     assert not visible[reach < 2 * 20 / 15 - 0.1].any()
-    assert visible[(reach > 2.2 * 20 / 15) & (reach < 5.8)].all()  # at most 1.5 spacings, 20 cm with the pixel, too large
+    # at most 1.5 spacings, 20 cm with the pixel, too large
+    assert visible[(reach > 2.2 * 20 / 15) & (reach < 5.8)].all()
 
 
 def test_a_wall_thinner_than_a_voxel_shows_the_face_on_the_camera_s_side():
@@ -244,7 +328,9 @@ def test_a_wall_thinner_than_a_voxel_shows_the_face_on_the_camera_s_side():
     normals = np.repeat(np.float32([[-1, 0, 0], [1, 0, 0]]), len(faces[0]), axis=0)
     surface = VoxelSurface.from_cloud(points, normals, 0.25)
     for side in (-1.0, 1.0):
-        distance, incidence = surface.cast(camera_at(np.array([6 * side, 0.3, 0.2])), np.float32([[-side, 0, 0]]))
+        distance, incidence = surface.cast(
+            camera_at(np.array([6 * side, 0.3, 0.2])), np.float32([[-side, 0, 0]])
+        )
         assert abs(distance[0] - 5.95) < 1e-4 and incidence[0] == pytest.approx(1)
 
 
@@ -253,10 +339,20 @@ def test_no_label_passes_a_wall():
     ground = np.column_stack([rng.uniform(-6, 6, (15_000, 2)), np.zeros(15_000)])
     roof = np.column_stack([rng.uniform(-3, 3, (4000, 2)), np.full(4000, 4.0)])
     points, normals = np.concatenate([ground, roof]), np.tile(UP, (19_000, 1))
-    views = [pinhole_view(f"{k}", (200, 200), (200, 200, 100, 100), look_at(np.array([x, 0.1, 20.0]), np.zeros(3))) for k, x in enumerate((-3.0, 0.0, 3.0))]
+    views = [
+        pinhole_view(f"{k}", (200, 200), (200, 200, 100, 100), look_at(np.array([x, 0.1, 20.0]), np.zeros(3)))
+        for k, x in enumerate((-3.0, 0.0, 3.0))
+    ]
     surface = VoxelSurface.from_cloud(points, normals, SURFACE_VOXEL * spacing_of(points))
     settings = Label(voxel_size=0.25, edge_width=0, verify="no", method="majority")
-    labels = fuse(Cloud(points, normals), views, lambda view: (np.full((200, 200), 2, np.uint8), None), surface, 5, settings).labels
+    labels = fuse(
+        Cloud(points, normals),
+        views,
+        lambda view: (np.full((200, 200), 2, np.uint8), None),
+        surface,
+        5,
+        settings,
+    ).labels
     hidden = np.abs(ground[:, :2]).max(axis=1) < 2.7  # under the roof for all three
     assert (labels.state[: len(ground)][hidden] == UNSEEN).all()
     assert (labels.label[len(ground) :] == 2).mean() > 0.99
@@ -264,7 +360,8 @@ def test_no_label_passes_a_wall():
 
 def test_the_surface_depends_on_neither_order_nor_threads_nor_units_nor_zero():
     points, normals = sphere(6000, 1)
-    points[:2000] *= 1 + 0.05 * np.random.default_rng(2).normal(size=(2000, 1))  # rough, so that normals scatter in some voxels
+    # rough, so that normals scatter in some voxels
+    points[:2000] *= 1 + 0.05 * np.random.default_rng(2).normal(size=(2000, 1))
     normals[:1000] = normals[np.random.default_rng(3).permutation(1000)]
     view, voxel = ring()[0], 0.2
     first = first_surface(VoxelSurface.from_cloud(points, normals, voxel), view)
@@ -313,5 +410,7 @@ def test_the_mesh_is_the_surface_unless_another_is_wanted(tmp_path):
     assert isinstance(read_surface(mesh, points, normals, np.zeros(3)), Surface)
     assert isinstance(read_surface(mesh, points, normals, np.zeros(3), "voxels"), VoxelSurface)
     for kind, height in (("auto", 4), ("surfels", 1), ("voxels", 1)):
-        distance, _ = read_surface(mesh, points, normals, np.zeros(3), kind).cast(camera_at(np.array([1.03, 1.04, 9])), np.float32([[0, 0, -1]]))
+        distance, _ = read_surface(mesh, points, normals, np.zeros(3), kind).cast(
+            camera_at(np.array([1.03, 1.04, 9])), np.float32([[0, 0, -1]])
+        )
         assert 9 - distance[0] == pytest.approx(height, abs=1e-4)

@@ -64,11 +64,25 @@ def test_opposite_faces_of_a_wall_within_a_voxel_have_different_sides():
     front = np.concatenate([np.full((500, 1), 0.52), rng.uniform(0, 4, (500, 2))], axis=1)
     back = front + [0.05, 0, 0]
     points = np.concatenate([front, back])
-    normals = np.concatenate([np.tile(np.float32([-1, 0, 0]), (500, 1)), np.tile(np.float32([1, 0, 0]), (500, 1))])
+    normals = np.concatenate(
+        [np.tile(np.float32([-1, 0, 0]), (500, 1)), np.tile(np.float32([1, 0, 0]), (500, 1))]
+    )
     sides, flat = normal_sides(normals, sort_by_voxel(points, 1.0, np.zeros(3)))
     assert flat.all()
     assert len(set(sides[:500])) == 1 and len(set(sides[500:])) == 1 and sides[0] != sides[-1]
     order = rng.permutation(1000)
-    np.testing.assert_array_equal(normal_sides(normals[order], sort_by_voxel(points[order], 1.0, np.zeros(3)))[0], sides[order])
+    np.testing.assert_array_equal(
+        normal_sides(normals[order], sort_by_voxel(points[order], 1.0, np.zeros(3)))[0], sides[order]
+    )
     ridge = np.float32([[0.7, 0, 0.714], [-0.7, 0, 0.714]])  # a roof's two slopes stay together
-    assert len(set(normal_sides(ridge / np.linalg.norm(ridge, axis=1, keepdims=True), sort_by_voxel(np.full((2, 3), 0.5), 1.0, np.zeros(3)))[0])) == 1
+    assert (
+        len(
+            set(
+                normal_sides(
+                    ridge / np.linalg.norm(ridge, axis=1, keepdims=True),
+                    sort_by_voxel(np.full((2, 3), 0.5), 1.0, np.zeros(3)),
+                )[0]
+            )
+        )
+        == 1
+    )

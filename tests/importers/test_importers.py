@@ -1,4 +1,6 @@
-"""Other programs' projects, clouds and meshes: written as those programs write them (or by their own code), read back to the same projections."""
+"""Other programs' projects, clouds and meshes: written as those programs write them (or by their own code),
+read back to the same projections.
+"""
 
 import json
 import shutil
@@ -55,7 +57,10 @@ def fly(model: str = "OPENCV", count: int = 6) -> list[View]:
     camera = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=CAMERAS[model], camera_id=1)
     rng = np.random.default_rng(5)
     centres = [[20 * np.cos(step), 15 * np.sin(step), 30 + step] for step in range(count)]
-    return [View(f"shot_{row}.jpg", camera, look_at(np.array(centre), rng.normal(0, 3, 3))) for row, centre in enumerate(centres)]
+    return [
+        View(f"shot_{row}.jpg", camera, look_at(np.array(centre), rng.normal(0, 3, 3)))
+        for row, centre in enumerate(centres)
+    ]
 
 
 def probe(count: int = 300) -> np.ndarray:
@@ -69,21 +74,37 @@ def write_photos(folder: Path, views: list[View]) -> Path:
     return folder
 
 
-def same_projections(found: list[View], views: list[View], points: np.ndarray, moved: np.ndarray | None = None) -> float:
-    """Largest distance, px, between where two sets of views see points (`moved`: the points in the frame of `found`); all must see the same ones."""
+def same_projections(
+    found: list[View], views: list[View], points: np.ndarray, moved: np.ndarray | None = None
+) -> float:
+    """Largest distance, px, between where two sets of views see points (`moved`: the points in the frame of
+    `found`); all must see the same ones.
+    """
     by_name = {Path(view.name).stem: view for view in found}
     assert set(by_name) == {Path(view.name).stem for view in views}
     worst = 0.0
     for view in views:
-        first, second = project(view, points)[0], project(by_name[Path(view.name).stem], points if moved is None else moved)[0]
+        first, second = (
+            project(view, points)[0],
+            project(by_name[Path(view.name).stem], points if moved is None else moved)[0],
+        )
         inside = np.isfinite(first).all(axis=1) & (first > 0).all(axis=1) & (first < SIZE).all(axis=1)
         assert inside.sum() > 30
         worst = max(worst, float(np.abs(first - second)[inside].max()))
     return worst
 
 
-def metashape_xml(views: list[View], lens: dict, reference: str = "", transform: tuple | None = None, extra: str = "", kind: str = "frame") -> str:
-    """Cameras as Metashape exports them; `transform`: rotation, translation and scale to geocentric (or local) coordinates."""
+def metashape_xml(
+    views: list[View],
+    lens: dict,
+    reference: str = "",
+    transform: tuple | None = None,
+    extra: str = "",
+    kind: str = "frame",
+) -> str:
+    """Cameras as Metashape exports them; `transform`: rotation, translation and scale to geocentric (or
+    local) coordinates.
+    """
     inner = "".join(f"<{name}>{value!r}</{name}>" for name, value in lens.items())
     rotation, translation, scale = transform or (np.eye(3), np.zeros(3), 1.0)
     cameras = []
@@ -92,37 +113,78 @@ def metashape_xml(views: list[View], lens: dict, reference: str = "", transform:
         matrix[:3, :3] = rotation.T @ view.cam_from_world[:3, :3].T
         matrix[:3, 3] = rotation.T @ (view.centre - translation) / scale
         numbers = " ".join(repr(float(value)) for value in matrix.ravel())
-        cameras.append(f'<camera id="{row}" sensor_id="0" component_id="0" label="{Path(view.name).stem}"><transform>{numbers}</transform><orientation>1</orientation></camera>')
+        cameras.append(
+            f'<camera id="{row}" sensor_id="0" component_id="0" label="{Path(view.name).stem}"><transform>{numbers}</transform><orientation>1</orientation></camera>'
+        )
     flat = " ".join(repr(float(value)) for value in rotation.ravel())
-    placed = (f'<transform><rotation locked="true">{flat}</rotation><translation>{" ".join(repr(float(value)) for value in translation)}</translation>'
-              f"<scale>{scale!r}</scale></transform>") if transform else ""
-    return (f'<?xml version="1.0" encoding="UTF-8"?>\n{extra}<document version="2.0.0"><chunk label="Chunk 1" enabled="true"><sensors next_id="1">'
-            f'<sensor id="0" label="FC6310" type="{kind}"><resolution width="{SIZE[0]}" height="{SIZE[1]}"/><property name="pixel_width" value="0.0024"/>'
-            f'<calibration type="{kind}" class="initial"><resolution width="{SIZE[0]}" height="{SIZE[1]}"/><f>400</f></calibration>'
-            f'<calibration type="{kind}" class="adjusted"><resolution width="{SIZE[0]}" height="{SIZE[1]}"/>{inner}</calibration></sensor></sensors>'
-            f'<components next_id="1" active_id="0"><component id="0" label="Component 1">{placed}</component></components>'
-            f'<cameras next_id="9" next_group_id="1"><group id="0" label="Group 1" type="folder">{"".join(cameras)}</group>'
-            f'<camera id="8" sensor_id="0" label="unaligned"><orientation>1</orientation></camera></cameras>'
-            + (f"<reference>{reference}</reference>" if reference else "") + "</chunk></document>\n")
+    placed = (
+        (
+            f'<transform><rotation locked="true">{flat}</rotation><translation>{" ".join(repr(float(value)) for value in translation)}</translation>'
+            f"<scale>{scale!r}</scale></transform>"
+        )
+        if transform
+        else ""
+    )
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?>\n{extra}<document version="2.0.0"><chunk label="Chunk 1" enabled="true"><sensors next_id="1">'
+        f'<sensor id="0" label="FC6310" type="{kind}"><resolution width="{SIZE[0]}" height="{SIZE[1]}"/><property name="pixel_width" value="0.0024"/>'
+        f'<calibration type="{kind}" class="initial"><resolution width="{SIZE[0]}" height="{SIZE[1]}"/><f>400</f></calibration>'
+        f'<calibration type="{kind}" class="adjusted"><resolution width="{SIZE[0]}" height="{SIZE[1]}"/>{inner}</calibration></sensor></sensors>'
+        f'<components next_id="1" active_id="0"><component id="0" label="Component 1">{placed}</component></components>'
+        f'<cameras next_id="9" next_group_id="1"><group id="0" label="Group 1" type="folder">{"".join(cameras)}</group>'
+        f'<camera id="8" sensor_id="0" label="unaligned"><orientation>1</orientation></camera></cameras>'
+        + (f"<reference>{reference}</reference>" if reference else "")
+        + "</chunk></document>\n"
+    )
 
 
 def metashape_lens() -> dict[str, float]:
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = CAMERAS["FULL_OPENCV"][:9]
-    return {"f": fy, "cx": cx - SIZE[0] / 2, "cy": cy - SIZE[1] / 2, "b1": fx - fy, "k1": k1, "k2": k2, "k3": k3, "p1": p2, "p2": p1}
+    return {
+        "f": fy,
+        "cx": cx - SIZE[0] / 2,
+        "cy": cy - SIZE[1] / 2,
+        "b1": fx - fy,
+        "k1": k1,
+        "k2": k2,
+        "k3": k3,
+        "p1": p2,
+        "p2": p1,
+    }
 
 
 def opensfm_json(views: list[View], points: np.ndarray, reference: tuple | None) -> list[dict]:
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = CAMERAS["FULL_OPENCV"][:9]
     size = max(SIZE)
-    camera = {"projection_type": "brown", "width": SIZE[0], "height": SIZE[1], "focal_x": fx / size, "focal_y": fy / size, "c_x": (cx - SIZE[0] / 2) / size,
-              "c_y": (cy - SIZE[1] / 2) / size, "k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
+    camera = {
+        "projection_type": "brown",
+        "width": SIZE[0],
+        "height": SIZE[1],
+        "focal_x": fx / size,
+        "focal_y": fy / size,
+        "c_x": (cx - SIZE[0] / 2) / size,
+        "c_y": (cy - SIZE[1] / 2) / size,
+        "k1": k1,
+        "k2": k2,
+        "p1": p1,
+        "p2": p2,
+        "k3": k3,
+    }
     shots = {}
     for view in views:
         vector = pycolmap.Rotation3d(view.cam_from_world[:3, :3])
         angle = 2 * np.arctan2(np.linalg.norm(vector.quat[:3]), vector.quat[3])
         axis = vector.quat[:3] / np.linalg.norm(vector.quat[:3])
-        shots[view.name] = {"rotation": (angle * axis).tolist(), "translation": view.cam_from_world[:3, 3].tolist(), "camera": "v2 dji", "gps_position": view.centre.tolist()}
-    listed = {str(100 + row): {"coordinates": point.tolist(), "color": [10.0, 20.0, float(row % 256)]} for row, point in enumerate(points)}
+        shots[view.name] = {
+            "rotation": (angle * axis).tolist(),
+            "translation": view.cam_from_world[:3, 3].tolist(),
+            "camera": "v2 dji",
+            "gps_position": view.centre.tolist(),
+        }
+    listed = {
+        str(100 + row): {"coordinates": point.tolist(), "color": [10.0, 20.0, float(row % 256)]}
+        for row, point in enumerate(points)
+    }
     found = {"cameras": {"v2 dji": camera}, "shots": shots, "points": listed}
     if reference:
         found["reference_lla"] = dict(zip(("latitude", "longitude", "altitude"), reference))
@@ -131,11 +193,30 @@ def opensfm_json(views: list[View], points: np.ndarray, reference: tuple | None)
 
 def pix4d_text(views: list[View]) -> str:
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = CAMERAS["FULL_OPENCV"][:9]
-    lines = ["fileName imageWidth imageHeight", "camera matrix K [3x3]", "radial distortion [3x1]", "tangential distortion [2x1]", "camera position t [3x1]",
-             "camera rotation R [3x3]", "camera model m = K [R|-Rt] X", ""]
+    lines = [
+        "fileName imageWidth imageHeight",
+        "camera matrix K [3x3]",
+        "radial distortion [3x1]",
+        "tangential distortion [2x1]",
+        "camera position t [3x1]",
+        "camera rotation R [3x3]",
+        "camera model m = K [R|-Rt] X",
+        "",
+    ]
     for view in views:
-        lines += [f"{view.name} {SIZE[0]} {SIZE[1]}", f"{fx!r} 0 {cx!r}", f"0 {fy!r} {cy!r}", "0 0 1", f"{k1!r} {k2!r} {k3!r}", f"{p1!r} {p2!r}",
-                  *(" ".join(repr(float(value)) for value in row) for row in (view.centre, *view.cam_from_world[:3, :3])), ""]
+        lines += [
+            f"{view.name} {SIZE[0]} {SIZE[1]}",
+            f"{fx!r} 0 {cx!r}",
+            f"0 {fy!r} {cy!r}",
+            "0 0 1",
+            f"{k1!r} {k2!r} {k3!r}",
+            f"{p1!r} {p2!r}",
+            *(
+                " ".join(repr(float(value)) for value in row)
+                for row in (view.centre, *view.cam_from_world[:3, :3])
+            ),
+            "",
+        ]
     return "\n".join(lines)
 
 
@@ -172,7 +253,15 @@ class TestRoundTrips:
 
     def test_opensfm(self, tmp_path):
         views, points = fly(), probe(50)
-        views = [replace(view, camera=pycolmap.Camera(model="FULL_OPENCV", width=SIZE[0], height=SIZE[1], params=CAMERAS["FULL_OPENCV"])) for view in views]
+        views = [
+            replace(
+                view,
+                camera=pycolmap.Camera(
+                    model="FULL_OPENCV", width=SIZE[0], height=SIZE[1], params=CAMERAS["FULL_OPENCV"]
+                ),
+            )
+            for view in views
+        ]
         write_photos(tmp_path / "osfm" / "images", views)
         (tmp_path / "osfm" / "reconstruction.json").write_text(json.dumps(opensfm_json(views, points, PLACE)))
         tracks, size = ["OPENSFM_TRACKS_VERSION_v2"], max(SIZE)
@@ -180,32 +269,52 @@ class TestRoundTrips:
             for row, pixel in enumerate(project(view, points)[0]):
                 if np.isfinite(pixel).all():
                     x, y = (pixel - np.array(SIZE) / 2) / size
-                    tracks.append("\t".join(map(str, [view.name, 100 + row, row, x, y, 0.01, 10, 20, 30, -1, -1])))
-        tracks.append("\t".join(map(str, [views[0].name, 7, 7, 0.1, 0.1, 0.01, 1, 2, 3, -1, -1])))  # a track that was not triangulated
+                    tracks.append(
+                        "\t".join(map(str, [view.name, 100 + row, row, x, y, 0.01, 10, 20, 30, -1, -1]))
+                    )
+        # a track that was not triangulated
+        tracks.append("\t".join(map(str, [views[0].name, 7, 7, 0.1, 0.1, 0.01, 1, 2, 3, -1, -1])))
         (tmp_path / "osfm" / "tracks.csv").write_text("\n".join(tracks) + "\n")
         run("import", tmp_path / "osfm", tmp_path / "scene")
         model = Scene(tmp_path / "scene").model
         assert same_projections(model.views, views, probe()) < 1e-6
         np.testing.assert_allclose(model.points, points, atol=1e-12)
-        assert [len(track) for track in model.tracks] == [int(np.isfinite(project(view, points)[0]).all(axis=1).sum()) for view in views]
+        assert [len(track) for track in model.tracks] == [
+            int(np.isfinite(project(view, points)[0]).all(axis=1).sum()) for view in views
+        ]
         reconstruction = pycolmap.Reconstruction(str(tmp_path / "scene" / "sparse" / "0"))
         reconstruction.update_point_3d_errors()
-        assert reconstruction.compute_mean_reprojection_error() < 1e-6  # the pixels of the tracks are where the cameras see the points
+        # the pixels of the tracks are where the cameras see the points
+        assert reconstruction.compute_mean_reprojection_error() < 1e-6
         found = read_georeference(Scene(tmp_path / "scene"))
         assert found.epsg == 32615 and found.origin == PLACE and not found.is_moved
 
     @pytest.mark.parametrize("topocentric", [True, False])
     def test_odm_project(self, tmp_path, topocentric):
-        views, points = [replace(view, camera=pycolmap.Camera(model="FULL_OPENCV", width=SIZE[0], height=SIZE[1], params=CAMERAS["FULL_OPENCV"])) for view in fly()], probe(20)
+        views, points = (
+            [
+                replace(
+                    view,
+                    camera=pycolmap.Camera(
+                        model="FULL_OPENCV", width=SIZE[0], height=SIZE[1], params=CAMERAS["FULL_OPENCV"]
+                    ),
+                )
+                for view in fly()
+            ],
+            probe(20),
+        )
         enu, root = from_origin(PLACE), tmp_path / "odm"
         write_photos(root / "images", views)
         (root / "opensfm").mkdir()
         (root / "odm_georeferencing").mkdir()
-        (root / "odm_georeferencing" / "coords.txt").write_text("WGS84 UTM 15N\n576600 5188100\n1.0 2.0 3.0\n")
+        (root / "odm_georeferencing" / "coords.txt").write_text(
+            "WGS84 UTM 15N\n576600 5188100\n1.0 2.0 3.0\n"
+        )
         geocoords = Georeference(32615, (576600.0, 5188100.0, 0.0))
         corners = np.vstack([np.zeros(3), np.eye(3)])
         moved = geocoords.from_crs(enu.to_crs(corners))
-        matrix, shift = (moved[1:] - moved[0]).T, moved[0]  # as ODM projects: linear, then the nearest rotation
+        # as ODM projects: linear, then the nearest rotation
+        matrix, shift = (moved[1:] - moved[0]).T, moved[0]
         in_utm = []
         for view in views:
             left, _, right = np.linalg.svd(view.cam_from_world[:3, :3] @ np.linalg.inv(matrix))
@@ -218,43 +327,93 @@ class TestRoundTrips:
             content[1]["shots"][view.name]["gps_position"] = view.centre.tolist()  # stays topocentric
         (root / "opensfm" / "reconstruction.json").write_text(json.dumps(content))
         if topocentric:
-            (root / "opensfm" / "reconstruction.topocentric.json").write_text(json.dumps(opensfm_json(views, points, PLACE)))
+            (root / "opensfm" / "reconstruction.topocentric.json").write_text(
+                json.dumps(opensfm_json(views, points, PLACE))
+            )
         run("import", root, tmp_path / "scene", "--from", "odm")
         found = read_georeference(Scene(tmp_path / "scene"))
         assert (found.origin is not None) == topocentric and found.epsg == 32615
         model = Scene(tmp_path / "scene").model
         here = found.from_crs(enu.to_crs(probe()))
-        assert same_projections(model.views, views, probe(), here) < (1e-5 if topocentric else 0.5)  # ODM's own rounding of rotations and scale
-        np.testing.assert_allclose(found.to_crs(np.array([view.centre for view in model.views])), enu.to_crs(np.array([view.centre for view in views])),
-                                   atol=1e-6 if topocentric else 1e-2)
+        # ODM's own rounding of rotations and scale
+        assert same_projections(model.views, views, probe(), here) < (1e-5 if topocentric else 0.5)
+        np.testing.assert_allclose(
+            found.to_crs(np.array([view.centre for view in model.views])),
+            enu.to_crs(np.array([view.centre for view in views])),
+            atol=1e-6 if topocentric else 1e-2,
+        )
 
     def test_pix4d(self, tmp_path):
-        views = [replace(view, camera=pycolmap.Camera(model="FULL_OPENCV", width=SIZE[0], height=SIZE[1], params=CAMERAS["FULL_OPENCV"])) for view in fly()]
+        views = [
+            replace(
+                view,
+                camera=pycolmap.Camera(
+                    model="FULL_OPENCV", width=SIZE[0], height=SIZE[1], params=CAMERAS["FULL_OPENCV"]
+                ),
+            )
+            for view in fly()
+        ]
         params = tmp_path / "site" / "1_initial" / "params"
         params.mkdir(parents=True)
         (params / "site_calibrated_camera_parameters.txt").write_text(pix4d_text(views))
         (params / "site_offset.xyz").write_text("576600.000 5188100.000 150.000\n")
         (params / "site_wkt.prj").write_text(pyproj.CRS.from_epsg(32615).to_wkt("WKT1_ESRI"))
-        run("import", tmp_path / "site", tmp_path / "scene", "--images", write_photos(tmp_path / "photos", views))
+        run(
+            "import",
+            tmp_path / "site",
+            tmp_path / "scene",
+            "--images",
+            write_photos(tmp_path / "photos", views),
+        )
         assert same_projections(Scene(tmp_path / "scene").model.views, views, probe()) < 1e-6
-        assert read_georeference(Scene(tmp_path / "scene")) == Georeference(32615, (576600.0, 5188100.0, 150.0))
+        assert read_georeference(Scene(tmp_path / "scene")) == Georeference(
+            32615, (576600.0, 5188100.0, 150.0)
+        )
 
     def test_metashape_local(self, tmp_path):
-        views = [replace(view, camera=pycolmap.Camera(model="FULL_OPENCV", width=SIZE[0], height=SIZE[1], params=CAMERAS["FULL_OPENCV"])) for view in fly()]
+        views = [
+            replace(
+                view,
+                camera=pycolmap.Camera(
+                    model="FULL_OPENCV", width=SIZE[0], height=SIZE[1], params=CAMERAS["FULL_OPENCV"]
+                ),
+            )
+            for view in fly()
+        ]
         transform = (pycolmap.Rotation3d(np.array([0.3, -1.0, 0.5])).matrix(), np.array([3.0, 4, 5]), 12.354)
-        (tmp_path / "cameras.xml").write_text(metashape_xml(views, metashape_lens(), 'LOCAL_CS["Local Coordinates (m)",UNIT["metre",1]]', transform))
-        run("import", tmp_path / "cameras.xml", tmp_path / "scene", "--images", write_photos(tmp_path / "photos", views))
+        (tmp_path / "cameras.xml").write_text(
+            metashape_xml(
+                views, metashape_lens(), 'LOCAL_CS["Local Coordinates (m)",UNIT["metre",1]]', transform
+            )
+        )
+        run(
+            "import",
+            tmp_path / "cameras.xml",
+            tmp_path / "scene",
+            "--images",
+            write_photos(tmp_path / "photos", views),
+        )
         assert same_projections(Scene(tmp_path / "scene").model.views, views, probe()) < 1e-6
         assert read_georeference(Scene(tmp_path / "scene")) is None
 
     @pytest.mark.parametrize("epsg, expected", [(4326, 32615), (32615, 32615), (26991, 26991)])
     def test_metashape_on_earth(self, tmp_path, epsg, expected):
         """Chunk to geocentric coordinates, at 12.35 chunk units per metre, as a real export has it."""
-        views = [replace(view, camera=pycolmap.Camera(model="FULL_OPENCV", width=SIZE[0], height=SIZE[1], params=CAMERAS["FULL_OPENCV"])) for view in fly()]
+        views = [
+            replace(
+                view,
+                camera=pycolmap.Camera(
+                    model="FULL_OPENCV", width=SIZE[0], height=SIZE[1], params=CAMERAS["FULL_OPENCV"]
+                ),
+            )
+            for view in fly()
+        ]
         geodesy = pycolmap.GPSTransform()
 
         def ecef(points: np.ndarray) -> np.ndarray:
-            return np.asarray(geodesy.ellipsoid_to_ecef(np.asarray(geodesy.enu_to_ellipsoid(np.atleast_2d(points), *PLACE))))
+            return np.asarray(
+                geodesy.ellipsoid_to_ecef(np.asarray(geodesy.enu_to_ellipsoid(np.atleast_2d(points), *PLACE)))
+            )
 
         left, _, right = np.linalg.svd((ecef(np.eye(3)) - ecef(np.zeros((1, 3)))).T)
         axes, zero = left @ right, ecef(np.zeros((1, 3)))[0]
@@ -266,33 +425,55 @@ class TestRoundTrips:
             geocentric.append(replace(view, cam_from_world=pose))
         transform = (pycolmap.Rotation3d(np.array([0.3, -1.0, 0.5])).matrix(), zero + [50, -20, 30], 12.354)
         reference = pyproj.CRS.from_epsg(epsg).to_wkt("WKT1_GDAL")
-        (tmp_path / "cameras.xml").write_text(metashape_xml(geocentric, metashape_lens(), reference, transform))
+        (tmp_path / "cameras.xml").write_text(
+            metashape_xml(geocentric, metashape_lens(), reference, transform)
+        )
         run("import", tmp_path / "cameras.xml", tmp_path / "scene")
         found, truth = read_georeference(Scene(tmp_path / "scene")), from_origin(PLACE, expected)
         assert found.epsg == expected and found.origin is not None
         model = Scene(tmp_path / "scene").model
-        centres, expected_centres = (np.array([view.centre for view in some]) for some in (model.views, views))
-        np.testing.assert_allclose(found.to_crs(centres), truth.to_crs(expected_centres), atol=1e-3)  # a millimetre at UTM size
+        centres, expected_centres = (
+            np.array([view.centre for view in some]) for some in (model.views, views)
+        )
+        # a millimetre at UTM size
+        np.testing.assert_allclose(found.to_crs(centres), truth.to_crs(expected_centres), atol=1e-3)
         assert same_projections(model.views, views, probe(), found.from_crs(truth.to_crs(probe()))) < 0.01
 
 
 class TestFilesOfTheToolsThemselves:
     @pytest.mark.parametrize("name", ["opencv", "fisheye"])
     def test_transforms_json_by_nerfstudio(self, tmp_path, name):
-        """Written by colmap_to_json of nerfstudio 1.1.5 from the COLMAP model beside it; its applied_transform is undone."""
+        """Written by colmap_to_json of nerfstudio 1.1.5 from the COLMAP model beside it; its
+        applied_transform is undone.
+        """
         run("import", FILES / f"nerfstudio_{name}", tmp_path / "scene")
-        found, truth = Scene(tmp_path / "scene").model, read_sparse_model(FILES / f"nerfstudio_{name}" / "colmap")
-        assert same_projections(found.views, truth.views, np.random.default_rng(2).uniform([-4, -4, -0.5], [4, 4, 1.5], (300, 3))) < 1e-6
-        np.testing.assert_allclose(found.points, truth.points, atol=1e-4)  # nerfstudio writes them as text of a few digits
+        found, truth = (
+            Scene(tmp_path / "scene").model,
+            read_sparse_model(FILES / f"nerfstudio_{name}" / "colmap"),
+        )
+        assert (
+            same_projections(
+                found.views,
+                truth.views,
+                np.random.default_rng(2).uniform([-4, -4, -0.5], [4, 4, 1.5], (300, 3)),
+            )
+            < 1e-6
+        )
+        # nerfstudio writes them as text of a few digits
+        np.testing.assert_allclose(found.points, truth.points, atol=1e-4)
         np.testing.assert_array_equal(found.colors, truth.colors)
         assert sum(map(len, found.tracks)) > 100  # guessed, so that train and extract can start
 
     @pytest.mark.parametrize("number", range(9))
     def test_lenses_of_opensfm(self, number):
-        """Projections computed by OpenSfM's own C++ code, in its convention: the centre of the first pixel is (0, 0)."""
+        """Projections computed by OpenSfM's own C++ code, in its convention: the centre of the first pixel is
+        (0, 0).
+        """
         case = json.loads((FILES / "opensfm_projections.json").read_text())["cameras"][number]
         camera = to_camera(opensfm_lens(case["camera"], "test"), 0.01, "test")
-        np.testing.assert_allclose(camera.img_from_cam(np.array(case["points"])), np.array(case["pixels"]) + 0.5, atol=1e-3)
+        np.testing.assert_allclose(
+            camera.img_from_cam(np.array(case["points"])), np.array(case["pixels"]) + 0.5, atol=1e-3
+        )
 
     def test_pix4d_as_documented(self, tmp_path):
         """The example of a calibrated_camera_parameters.txt in nFrames' documentation."""
@@ -315,7 +496,7 @@ DSC00002.JPG 6000 4000
 -0.00681563617726710196 0.99623997911544937001 -0.08636811399786505083
 0.05598885152258621656 -0.08585445062421988294 -0.99473326164012199069
 """)
-        view, = read_project(tmp_path, Import()).views
+        (view,) = read_project(tmp_path, Import()).views
         assert view.camera.model_name == "FULL_OPENCV" and (view.width, view.height) == (6000, 4000)
         np.testing.assert_allclose(view.centre, [-892.5025, 11.2136, -4.0173], atol=1e-4)
         assert view.cam_from_world[2, 2] < -0.99  # looks down
@@ -333,26 +514,55 @@ class TestLenses:
         r2 = x**2 + y**2
         factor = sum(k * r2 ** (n + 1) for n, k in enumerate(lens.radial)) + 1
         p1, p2 = lens.tangential
-        u, v = x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x**2), y * factor + 2 * p2 * x * y + p1 * (r2 + 2 * y**2)
-        return np.stack([lens.focal[0] * u + lens.skew * v + lens.principal[0], lens.focal[1] * v + lens.principal[1]], axis=1)
+        u, v = (
+            x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+            y * factor + 2 * p2 * x * y + p1 * (r2 + 2 * y**2),
+        )
+        return np.stack(
+            [lens.focal[0] * u + lens.skew * v + lens.principal[0], lens.focal[1] * v + lens.principal[1]],
+            axis=1,
+        )
 
     def points(self, reach: float = 0.5) -> np.ndarray:
-        return np.random.default_rng(0).uniform([-reach, -0.8 * reach, 1], [reach, 0.8 * reach, 1], (500, 3)) * np.random.default_rng(1).uniform(1, 50, (500, 1))
+        return np.random.default_rng(0).uniform(
+            [-reach, -0.8 * reach, 1], [reach, 0.8 * reach, 1], (500, 3)
+        ) * np.random.default_rng(1).uniform(1, 50, (500, 1))
 
-    @pytest.mark.parametrize("changes, model", [
-        ({}, "FULL_OPENCV"), ({"radial": (-0.09, 0.0, 0.0, 0.0)}, "OPENCV"), ({"radial": (), "tangential": (0.0, 0.0)}, "PINHOLE"),
-        ({"radial": (-0.0919, -0.0763, 0.1163, -0.0761)}, "FULL_OPENCV"),  # k4 of a real Mavic 3M, as the nearest quotient
-        ({"fisheye": True, "tangential": (0.0, 0.0)}, "OPENCV_FISHEYE"), ({"fisheye": True}, "THIN_PRISM_FISHEYE"),
-        ({"fisheye": True, "radial": (-0.03, 0.01, -0.002, 0.001, -0.0003), "tangential": (0.0, 0.0)}, "RAD_TAN_THIN_PRISM_FISHEYE")])
+    @pytest.mark.parametrize(
+        "changes, model",
+        [
+            ({}, "FULL_OPENCV"),
+            ({"radial": (-0.09, 0.0, 0.0, 0.0)}, "OPENCV"),
+            ({"radial": (), "tangential": (0.0, 0.0)}, "PINHOLE"),
+            # k4 of a real Mavic 3M, as the nearest quotient
+            ({"radial": (-0.0919, -0.0763, 0.1163, -0.0761)}, "FULL_OPENCV"),
+            ({"fisheye": True, "tangential": (0.0, 0.0)}, "OPENCV_FISHEYE"),
+            ({"fisheye": True}, "THIN_PRISM_FISHEYE"),
+            (
+                {"fisheye": True, "radial": (-0.03, 0.01, -0.002, 0.001, -0.0003), "tangential": (0.0, 0.0)},
+                "RAD_TAN_THIN_PRISM_FISHEYE",
+            ),
+        ],
+    )
     def test_every_lens_projects_as_its_formula(self, changes, model):
         lens = replace(self.LENS, **changes)
         camera = to_camera(lens, 0.01, "test")
         assert camera.model_name == model
-        np.testing.assert_allclose(camera.img_from_cam(self.points()), self.lens_project(lens, self.points()), atol=0.01)
+        np.testing.assert_allclose(
+            camera.img_from_cam(self.points()), self.lens_project(lens, self.points()), atol=0.01
+        )
 
-    @pytest.mark.parametrize("changes, word", [
-        ({"skew": -0.306}, "skew"), ({"focal": (0.0, 1.0)}, "positive"), ({"radial": (np.nan,)}, "finite"), ({"prism": (0.1, 0.0)}, "prism"),
-        ({"radial": (-0.4, 0.9, -3.0, 5.0, 8.0, -9.0)}, "radial polynomial"), ({"fisheye": True, "radial": (0.1,) * 5}, "no COLMAP model")])
+    @pytest.mark.parametrize(
+        "changes, word",
+        [
+            ({"skew": -0.306}, "skew"),
+            ({"focal": (0.0, 1.0)}, "positive"),
+            ({"radial": (np.nan,)}, "finite"),
+            ({"prism": (0.1, 0.0)}, "prism"),
+            ({"radial": (-0.4, 0.9, -3.0, 5.0, 8.0, -9.0)}, "radial polynomial"),
+            ({"fisheye": True, "radial": (0.1,) * 5}, "no COLMAP model"),
+        ],
+    )
     def test_what_colmap_has_not_is_refused(self, changes, word):
         with pytest.raises(InputError, match=word):
             to_camera(replace(self.LENS, **changes), 0.01, "test")
@@ -364,7 +574,10 @@ class TestLenses:
         tolerance = float(str(caught.value).split("--tolerance ")[1])
         assert 0.1 < tolerance < 0.2
         camera = to_camera(lens, tolerance, "test")
-        assert np.abs(camera.img_from_cam(self.points(0.4)) - self.lens_project(lens, self.points(0.4))).max() < tolerance
+        assert (
+            np.abs(camera.img_from_cam(self.points(0.4)) - self.lens_project(lens, self.points(0.4))).max()
+            < tolerance
+        )
 
 
 class TestBadProjects:
@@ -381,33 +594,63 @@ class TestBadProjects:
         (tmp_path / "empty" / "transforms.json").write_text('{"frames": []}')
         self.check(capsys, tmp_path, tmp_path / "empty", "no photo")
 
-    @pytest.mark.parametrize("extra", ['<!DOCTYPE document [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;">]>', '<!DOCTYPE document SYSTEM "file:///etc/passwd">'])
+    @pytest.mark.parametrize(
+        "extra",
+        [
+            '<!DOCTYPE document [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;">]>',
+            '<!DOCTYPE document SYSTEM "file:///etc/passwd">',
+        ],
+    )
     def test_document_types_and_entities(self, capsys, tmp_path, extra):
         (tmp_path / "cameras.xml").write_text(metashape_xml(fly(), metashape_lens(), extra=extra))
         self.check(capsys, tmp_path, tmp_path / "cameras.xml", "document type")
 
-    @pytest.mark.parametrize("change, word", [
-        (("<f>503.25</f>", ""), "focal length"), (('type="frame"', 'type="spherical"'), "spherical"), (("</chunk>", ""), "not valid XML"),
-        (("<k1>", "<b2>0.4</b2><k1>"), "skew"), (("<k1>", "<p3>0.4</p3><k1>"), "p3"), (("<transform>", "<transform>x "), "16 finite numbers")])
+    @pytest.mark.parametrize(
+        "change, word",
+        [
+            (("<f>503.25</f>", ""), "focal length"),
+            (('type="frame"', 'type="spherical"'), "spherical"),
+            (("</chunk>", ""), "not valid XML"),
+            (("<k1>", "<b2>0.4</b2><k1>"), "skew"),
+            (("<k1>", "<p3>0.4</p3><k1>"), "p3"),
+            (("<transform>", "<transform>x "), "16 finite numbers"),
+        ],
+    )
     def test_metashape(self, capsys, tmp_path, change, word):
         (tmp_path / "cameras.xml").write_text(metashape_xml(fly(), metashape_lens()).replace(*change))
         self.check(capsys, tmp_path, tmp_path / "cameras.xml", word)
 
-    @pytest.mark.parametrize("change, word", [
-        (lambda content: content["frames"][0].pop("file_path"), "file_path"), (lambda content: content.update(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR"),
-        (lambda content: content["frames"][1].update(transform_matrix=[[1, 2], [3, 4]]), "frame 1"), (lambda content: content.pop("fl_x"), "fl_x"),
-        (lambda content: content["frames"][2].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "no rotation"),
-        (lambda content: content.update(fl_x="wide"), "fl_x"), (lambda content: content.update(k4=4, k3=-3), "radial polynomial")])
+    @pytest.mark.parametrize(
+        "change, word",
+        [
+            (lambda content: content["frames"][0].pop("file_path"), "file_path"),
+            (lambda content: content.update(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR"),
+            (lambda content: content["frames"][1].update(transform_matrix=[[1, 2], [3, 4]]), "frame 1"),
+            (lambda content: content.pop("fl_x"), "fl_x"),
+            (
+                lambda content: content["frames"][2].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()),
+                "no rotation",
+            ),
+            (lambda content: content.update(fl_x="wide"), "fl_x"),
+            (lambda content: content.update(k4=4, k3=-3), "radial polynomial"),
+        ],
+    )
     def test_nerfstudio(self, capsys, tmp_path, change, word):
         content = json.loads((FILES / "nerfstudio_opencv" / "transforms.json").read_text())
         change(content)
         (tmp_path / "transforms.json").write_text(json.dumps(content))
         self.check(capsys, tmp_path, tmp_path / "transforms.json", word)
 
-    @pytest.mark.parametrize("change, word", [
-        (lambda part: part["cameras"]["v2 dji"].update(projection_type="spherical"), "spherical"), (lambda part: part["cameras"]["v2 dji"].pop("width"), "lacks"),
-        (lambda part: part["shots"]["shot_0.jpg"].update(rotation=[1, 2]), "shot_0"), (lambda part: part["points"]["100"].pop("coordinates"), "points"),
-        (lambda part: part.update(reference_lla={"latitude": 1}), "reference_lla")])
+    @pytest.mark.parametrize(
+        "change, word",
+        [
+            (lambda part: part["cameras"]["v2 dji"].update(projection_type="spherical"), "spherical"),
+            (lambda part: part["cameras"]["v2 dji"].pop("width"), "lacks"),
+            (lambda part: part["shots"]["shot_0.jpg"].update(rotation=[1, 2]), "shot_0"),
+            (lambda part: part["points"]["100"].pop("coordinates"), "points"),
+            (lambda part: part.update(reference_lla={"latitude": 1}), "reference_lla"),
+        ],
+    )
     def test_opensfm(self, capsys, tmp_path, change, word):
         content = opensfm_json(fly(), probe(3), PLACE)
         change(content[1])
@@ -415,17 +658,28 @@ class TestBadProjects:
         (tmp_path / "osfm" / "reconstruction.json").write_text(json.dumps(content))
         self.check(capsys, tmp_path, tmp_path / "osfm", word)
 
-    @pytest.mark.parametrize("change, word", [(("0 0 1\n", ""), "cut off"), (("camera model m", "model"), "as Pix4D writes"), (("640 480", "640"), "line 9"),
-                                              (("radial distortion [3x1]", "fisheye polynomial"), "fisheye")])
+    @pytest.mark.parametrize(
+        "change, word",
+        [
+            (("0 0 1\n", ""), "cut off"),
+            (("camera model m", "model"), "as Pix4D writes"),
+            (("640 480", "640"), "line 9"),
+            (("radial distortion [3x1]", "fisheye polynomial"), "fisheye"),
+        ],
+    )
     def test_pix4d(self, capsys, tmp_path, change, word):
-        (tmp_path / "a_calibrated_camera_parameters.txt").write_text(pix4d_text(fly()).replace(change[0], change[1], 1))
+        (tmp_path / "a_calibrated_camera_parameters.txt").write_text(
+            pix4d_text(fly()).replace(change[0], change[1], 1)
+        )
         self.check(capsys, tmp_path, tmp_path / "a_calibrated_camera_parameters.txt", word)
 
     def test_photos(self, capsys, tmp_path):
         views = fly()
         (tmp_path / "cameras.xml").write_text(metashape_xml(views, metashape_lens()))
         photos = write_photos(tmp_path / "photos", views[1:])
-        self.check(capsys, tmp_path, tmp_path / "cameras.xml", "shot_0", "--images", options=("--images", photos))
+        self.check(
+            capsys, tmp_path, tmp_path / "cameras.xml", "shot_0", "--images", options=("--images", photos)
+        )
         Image.new("RGB", (480, 640)).save(photos / "shot_0.jpg")
         self.check(capsys, tmp_path, tmp_path / "cameras.xml", "480x640", options=("--images", photos))
 
@@ -435,22 +689,39 @@ def test_photos_in_subfolders_are_found_by_their_label(tmp_path):
     (tmp_path / "cameras.xml").write_text(metashape_xml(views, metashape_lens()))
     photos = write_photos(tmp_path / "photos", [replace(view, name=f"flight/{view.name}") for view in views])
     run("import", tmp_path / "cameras.xml", tmp_path / "scene", "--images", photos)
-    assert {view.name for view in Scene(tmp_path / "scene").model.views} == {f"flight/{view.name}" for view in views}
+    assert {view.name for view in Scene(tmp_path / "scene").model.views} == {
+        f"flight/{view.name}" for view in views
+    }
     assert Scene(tmp_path / "scene").photo("flight/shot_0.jpg").is_file()
 
 
 def test_guessed_observations_are_the_nearest_points(tmp_path):
     views = fly()
     rng = np.random.default_rng(4)
-    points = np.vstack([rng.uniform([-14, -12, 0], [14, 12, 0.2], (4000, 3)), rng.uniform([-14, -12, -9], [14, 12, -8.8], (4000, 3))])  # a roof over a floor
+    # a roof over a floor
+    points = np.vstack(
+        [
+            rng.uniform([-14, -12, 0], [14, 12, 0.2], (4000, 3)),
+            rng.uniform([-14, -12, -9], [14, 12, -8.8], (4000, 3)),
+        ]
+    )
     for view, (rows, pixels) in zip(views, guess_observations(views, points)):
         expected, depth = project(view, points)
         np.testing.assert_allclose(pixels, expected[rows])
-        assert (rows < 4000).mean() > 0.9 and len(rows) > 1000  # the floor shows beside the roof, and between points of it
+        # the floor shows beside the roof, and between points of it
+        assert (rows < 4000).mean() > 0.9 and len(rows) > 1000
         cells = {}
-        for row in np.flatnonzero(np.isfinite(expected).all(axis=1) & (expected >= 0).all(axis=1) & (expected < SIZE).all(axis=1)):  # the plain twin
+        # the plain twin
+        for row in np.flatnonzero(
+            np.isfinite(expected).all(axis=1) & (expected >= 0).all(axis=1) & (expected < SIZE).all(axis=1)
+        ):
             cells.setdefault(tuple((expected[row] * 64 / 640).astype(int)), []).append(row)
-        twin = [row for members in cells.values() for row in members if depth[row] <= min(depth[other] for other in members) * 1.03]
+        twin = [
+            row
+            for members in cells.values()
+            for row in members
+            if depth[row] <= min(depth[other] for other in members) * 1.03
+        ]
         assert sorted(twin) == sorted(rows)
 
 
@@ -510,14 +781,20 @@ class TestClouds:
         scene, truth = Scene(tmp_path / "scene"), probe(400)
         write_model(scene.sparse, fly())
         write_georeference(scene, from_origin(PLACE))
-        run("import", write_las(tmp_path / "cloud.laz", from_origin(PLACE).to_crs(truth), None), tmp_path / "scene")
+        run(
+            "import",
+            write_las(tmp_path / "cloud.laz", from_origin(PLACE).to_crs(truth), None),
+            tmp_path / "scene",
+        )
         np.testing.assert_allclose(attributes(scene.cloud)["positions"], truth, atol=1e-3)
         run("import", write_las(tmp_path / "local.laz", truth, None), tmp_path / "scene")
         np.testing.assert_allclose(attributes(scene.cloud)["positions"], truth, atol=1e-3)
 
     def test_cloud_with_crs_needs_to_know_where_the_cameras_are(self, capsys, tmp_path):
         write_model(tmp_path / "scene" / "sparse" / "0", fly())
-        assert "sc3d georeference" in fails(capsys, "import", write_las(tmp_path / "cloud.laz", surveyed()), tmp_path / "scene")
+        assert "sc3d georeference" in fails(
+            capsys, "import", write_las(tmp_path / "cloud.laz", surveyed()), tmp_path / "scene"
+        )
 
     def test_las_in_degrees_is_refused(self, capsys, tmp_path):
         write_las(tmp_path / "cloud.las", surveyed(), 4326)
@@ -532,21 +809,32 @@ class TestClouds:
         o3d.t.io.write_point_cloud(str(tmp_path / "in.ply"), cloud)
         run("import", tmp_path / "in.ply", tmp_path / "scene", "--epsg", 32615)
         table = attributes(tmp_path / "scene" / "cloud.ply")
-        np.testing.assert_allclose(read_georeference(Scene(tmp_path / "scene")).to_crs(table["positions"]), surveyed(), atol=1e-6)
+        np.testing.assert_allclose(
+            read_georeference(Scene(tmp_path / "scene")).to_crs(table["positions"]), surveyed(), atol=1e-6
+        )
         np.testing.assert_array_equal(table["classification"].ravel(), np.arange(500) % 9)
         np.testing.assert_allclose(table["curvature"].ravel(), np.linspace(0, 2, 500))
         assert table["classification"].dtype == np.uint8 and (table["colors"] == [1, 2, 3]).all()
 
-    @pytest.mark.parametrize("name, lines", [
-        ("a.xyz", ["{0} {1} {2} 10 20 30"]), ("a.txt", ["//X Y Z R G B", "{0},{1},{2},10,20,30"]), ("a.csv", ["x;y;z;r;g;b", "{0};{1};{2};10;20;30"]),
-        ("a.pts", ["500", "{0} {1} {2} -1200 10 20 30"])])
+    @pytest.mark.parametrize(
+        "name, lines",
+        [
+            ("a.xyz", ["{0} {1} {2} 10 20 30"]),
+            ("a.txt", ["//X Y Z R G B", "{0},{1},{2},10,20,30"]),
+            ("a.csv", ["x;y;z;r;g;b", "{0};{1};{2};10;20;30"]),
+            ("a.pts", ["500", "{0} {1} {2} -1200 10 20 30"]),
+        ],
+    )
     def test_text(self, tmp_path, name, lines):
         rows = [lines[-1].format(*(f"{value:.3f}" for value in point)) for point in surveyed()]
         (tmp_path / name).write_text("\n".join([*lines[:-1], *rows]))
         run("import", tmp_path / name, tmp_path / "scene")
         table = attributes(tmp_path / "scene" / "cloud.ply")
-        np.testing.assert_array_equal(table["positions"], surveyed())  # no CRS is stated: they stay as they are
-        assert (table["colors"] == [10, 20, 30]).all() and read_georeference(Scene(tmp_path / "scene")) is None
+        # no CRS is stated: they stay as they are
+        np.testing.assert_array_equal(table["positions"], surveyed())
+        assert (table["colors"] == [10, 20, 30]).all() and read_georeference(
+            Scene(tmp_path / "scene")
+        ) is None
 
     def test_pcd(self, tmp_path):
         points = probe(100).astype(np.float32)
@@ -558,9 +846,19 @@ class TestClouds:
         np.testing.assert_array_equal(table["positions"], points.astype(np.float64))
         np.testing.assert_array_equal(table["intensity"].ravel(), np.arange(100))
 
-    @pytest.mark.parametrize("name, content, word", [
-        ("a.xyz", "1 2\n3 4\n", "x y z"), ("a.xyz", "1 2 3\n1 2 x\n", "line 2"), ("a.xyz", "", "x y z"), ("a.las", "nothing", "is not a LAS file"), ("a.obj", "v 1 2 3\n", "no triangles"),
-        ("a.obj", "v 1 2 3\nf 1 2 9\n", "does not hold"), ("a.xyz", "nan 1 2\n1 2 3\n", "finite"), ("a.stl", "solid", "can be read")])
+    @pytest.mark.parametrize(
+        "name, content, word",
+        [
+            ("a.xyz", "1 2\n3 4\n", "x y z"),
+            ("a.xyz", "1 2 3\n1 2 x\n", "line 2"),
+            ("a.xyz", "", "x y z"),
+            ("a.las", "nothing", "is not a LAS file"),
+            ("a.obj", "v 1 2 3\n", "no triangles"),
+            ("a.obj", "v 1 2 3\nf 1 2 9\n", "does not hold"),
+            ("a.xyz", "nan 1 2\n1 2 3\n", "finite"),
+            ("a.stl", "solid", "can be read"),
+        ],
+    )
     def test_broken_files(self, capsys, tmp_path, name, content, word):
         (tmp_path / name).write_text(content)
         assert word in fails(capsys, "import", tmp_path / name, tmp_path / "scene", "--from", "cloud")
@@ -568,24 +866,49 @@ class TestClouds:
 
 
 class TestMeshes:
-    CORNERS = np.round(UTM + [[0, 0, 0], [1.25, 0, 0.125], [1.25, 1.5, 0.25], [0, 1.5, 0.001], [0.5, 0.5, 2]], 3)
+    CORNERS = np.round(
+        UTM + [[0, 0, 0], [1.25, 0, 0.125], [1.25, 1.5, 0.25], [0, 1.5, 0.001], [0.5, 0.5, 2]], 3
+    )
 
     def check(self, tmp_path):
         found = read_georeference(Scene(tmp_path / "scene"))
         mesh = o3d.io.read_triangle_mesh(str(tmp_path / "scene" / "mesh.ply"))
         np.testing.assert_allclose(found.to_crs(np.asarray(mesh.vertices)), self.CORNERS, atol=1e-6)
-        assert {tuple(triangle) for triangle in np.asarray(mesh.triangles)} == {(0, 1, 2), (0, 2, 3), (0, 1, 4)}
+        assert {tuple(triangle) for triangle in np.asarray(mesh.triangles)} == {
+            (0, 1, 2),
+            (0, 2, 3),
+            (0, 1, 4),
+        }
         assert (np.rint(np.asarray(mesh.vertex_colors) * 255) == [255, 128, 0]).all()
 
     def test_obj_with_quads_references_from_the_end_and_colours(self, tmp_path):
         vertices = [f"v {x:.3f} {y:.3f} {z:.3f} 1.0 0.502 0.0" for x, y, z in self.CORNERS]
-        (tmp_path / "m.obj").write_text("\n".join(["mtllib m.mtl", *vertices, "vt 0 0", "vn 0 0 1", "f 1/1/1 2/1/1 3/1/1 4/1/1", "f -5//1 -4//1 -1//1"]))
+        (tmp_path / "m.obj").write_text(
+            "\n".join(
+                [
+                    "mtllib m.mtl",
+                    *vertices,
+                    "vt 0 0",
+                    "vn 0 0 1",
+                    "f 1/1/1 2/1/1 3/1/1 4/1/1",
+                    "f -5//1 -4//1 -1//1",
+                ]
+            )
+        )
         run("import", tmp_path / "m.obj", tmp_path / "scene", "--epsg", 32615)
         self.check(tmp_path)
 
     def test_ply_in_double(self, tmp_path):
-        header = ["ply", "format ascii 1.0", "element vertex 5", *(f"property double {axis}" for axis in "xyz"), *(f"property uchar {color}" for color in ("red", "green", "blue")),
-                  "element face 3", "property list uchar int vertex_indices", "end_header"]
+        header = [
+            "ply",
+            "format ascii 1.0",
+            "element vertex 5",
+            *(f"property double {axis}" for axis in "xyz"),
+            *(f"property uchar {color}" for color in ("red", "green", "blue")),
+            "element face 3",
+            "property list uchar int vertex_indices",
+            "end_header",
+        ]
         vertices = [f"{x:.3f} {y:.3f} {z:.3f} 255 128 0" for x, y, z in self.CORNERS]
         (tmp_path / "m.ply").write_text("\n".join([*header, *vertices, "3 0 1 2", "3 0 2 3", "3 0 1 4", ""]))
         run("import", tmp_path / "m.ply", tmp_path / "scene", "--epsg", 32615)
@@ -604,16 +927,32 @@ class TestColmapInACrs:
         assert found.origin is None and found.offset[2] == 0
         centres = np.array([view.centre for view in scene.model.views])
         assert np.abs(centres[:, :2]).max() < 10
-        np.testing.assert_allclose(found.to_crs(centres), [view.centre for view in sorted(bare_views(), key=lambda view: view.name)], atol=1e-6)
+        np.testing.assert_allclose(
+            found.to_crs(centres),
+            [view.centre for view in sorted(bare_views(), key=lambda view: view.name)],
+            atol=1e-6,
+        )
 
     def test_without_a_code_they_stay_and_it_says_so(self, tmp_path, caplog):
         run("import", self.project(tmp_path), tmp_path / "scene")
         assert "--epsg" in caplog.text and read_georeference(Scene(tmp_path / "scene")) is None
-        np.testing.assert_allclose(Scene(tmp_path / "scene").model.views[0].centre, bare_views()[0].centre, atol=1e-6)
+        np.testing.assert_allclose(
+            Scene(tmp_path / "scene").model.views[0].centre, bare_views()[0].centre, atol=1e-6
+        )
 
     def test_imported_scene_can_be_labelled(self, tmp_path):
-        """COLMAP in UTM and a LAZ from elsewhere, with masks: labels on the same side of the line as the truth."""
-        run("import", self.project(tmp_path), tmp_path / "scene", "--epsg", 32615, "--cloud", write_las(tmp_path / "c.laz", ground()))
+        """COLMAP in UTM and a LAZ from elsewhere, with masks: labels on the same side of the line as the
+        truth.
+        """
+        run(
+            "import",
+            self.project(tmp_path),
+            tmp_path / "scene",
+            "--epsg",
+            32615,
+            "--cloud",
+            write_las(tmp_path / "c.laz", ground()),
+        )
         scene = tmp_path / "scene"
         (scene / "classes.json").write_text(json.dumps(CLASSES))
         (scene / "masks").mkdir()

@@ -11,7 +11,15 @@ from sc3d.labelling.fusion import Cloud, edge_distance, fuse, picture_of
 from sc3d.scene.labels import LOCKED, SEED, UNLOCKED, UNSEEN
 from sc3d.settings.labels import Label
 
-PLAIN = Label(voxel_size=0.2, edge_width=0, depth_excess=False, incidence=False, range=False, use_confidence=False, verify="no")
+PLAIN = Label(
+    voxel_size=0.2,
+    edge_width=0,
+    depth_excess=False,
+    incidence=False,
+    range=False,
+    use_confidence=False,
+    verify="no",
+)
 
 
 def plane(height: float = 0.0, half: float = 3.0, step: float = 0.1) -> np.ndarray:
@@ -25,8 +33,15 @@ def cloud_of(points: np.ndarray, up: float = 1.0) -> Cloud:
 
 def cameras_above(count: int, size: int = 120) -> list:
     rng = np.random.default_rng(7)
-    return [pinhole_view(f"view_{row:02d}.jpg", (size, size), (size, size, size / 2, size / 2), look_at(np.array([*rng.uniform(-2, 2, 2), 12.0]), np.zeros(3)))
-            for row in range(count)]
+    return [
+        pinhole_view(
+            f"view_{row:02d}.jpg",
+            (size, size),
+            (size, size, size / 2, size / 2),
+            look_at(np.array([*rng.uniform(-2, 2, 2), 12.0]), np.zeros(3)),
+        )
+        for row in range(count)
+    ]
 
 
 def constant(labels: dict[str, int], size: int = 120):
@@ -35,12 +50,27 @@ def constant(labels: dict[str, int], size: int = 120):
 
 def test_agreement_is_a_seed_everywhere():
     cloud, views = cloud_of(plane()), cameras_above(5)
-    labels = fuse(cloud, views, constant({view.name: 3 for view in views}), Surface.from_cloud(cloud.points, cloud.normals, np.zeros(3)), 5, PLAIN).labels
+    labels = fuse(
+        cloud,
+        views,
+        constant({view.name: 3 for view in views}),
+        Surface.from_cloud(cloud.points, cloud.normals, np.zeros(3)),
+        5,
+        PLAIN,
+    ).labels
     assert (labels.label == 3).all() and (labels.state == SEED).all()
     assert (labels.confidence == 1).all() and (labels.num_views == 5).all()
 
 
-@pytest.mark.parametrize(("votes", "consensus", "state"), [([1, 1, 1, 2], 0.8, LOCKED), ([1, 1, 1, 1, 2], 0.8, SEED), ([1, 1, 1, 1, 2], 1.0, LOCKED), ([2], 1.0, SEED)])
+@pytest.mark.parametrize(
+    ("votes", "consensus", "state"),
+    [
+        ([1, 1, 1, 2], 0.8, LOCKED),
+        ([1, 1, 1, 1, 2], 0.8, SEED),
+        ([1, 1, 1, 1, 2], 1.0, LOCKED),
+        ([2], 1.0, SEED),
+    ],
+)
 def test_consensus_threshold_decides_between_seed_and_lock(votes, consensus, state):
     cloud, views = cloud_of(plane()), cameras_above(len(votes))
     read = constant({view.name: vote for view, vote in zip(views, votes, strict=True)})
@@ -52,7 +82,10 @@ def test_consensus_threshold_decides_between_seed_and_lock(votes, consensus, sta
 def test_paper_locks_on_any_disagreement():
     cloud, views = cloud_of(plane()), cameras_above(10)
     read = constant({view.name: 2 if row == 9 else 1 for row, view in enumerate(views)})
-    assert (fuse(cloud, views, read, None, 5, replace(PLAIN, method="paper", reproject=False)).labels.state == LOCKED).all()
+    assert (
+        fuse(cloud, views, read, None, 5, replace(PLAIN, method="paper", reproject=False)).labels.state
+        == LOCKED
+    ).all()
 
 
 def test_label_zero_never_votes():
@@ -75,7 +108,9 @@ def test_no_label_leaks_behind_a_wall(method):
     ground, roof = plane(0.0, 6.0), plane(4.0, 2.0)
     points = np.concatenate([ground, roof])
     cloud = cloud_of(points)
-    view = pinhole_view("a.jpg", (300, 300), (300, 300, 150, 150), look_at(np.array([0.0, 0, 12.0]), np.zeros(3)))
+    view = pinhole_view(
+        "a.jpg", (300, 300), (300, 300, 150, 150), look_at(np.array([0.0, 0, 12.0]), np.zeros(3))
+    )
     mask = np.full((300, 300), 4, np.uint8)
     edge = int(300 * 2 / 8) + 1
     mask[150 - edge : 150 + edge, 150 - edge : 150 + edge] = 1  # the roof as this camera sees it
@@ -83,7 +118,7 @@ def test_no_label_leaks_behind_a_wall(method):
     labels = fuse(cloud, [view], lambda _: (mask, None), surface, 5, replace(PLAIN, method=method)).labels
     hidden = np.abs(ground[:, :2]).max(axis=1) < 2.5  # the roof's shadow reaches 3.0
     assert (labels.label[: len(ground)][hidden] == 0).all()
-    assert (labels.label[len(ground):] == 1).all()
+    assert (labels.label[len(ground) :] == 1).all()
     assert not (labels.label[: len(ground)] == 1).any()
     leaking = fuse(cloud, [view], lambda _: (mask, None), None, 5, replace(PLAIN, method=method)).labels
     assert (leaking.label[: len(ground)][hidden] == 1).all()
@@ -95,10 +130,20 @@ def test_thin_wall_keeps_a_label_on_each_side():
     points = np.concatenate([top, bottom])
     cloud = Cloud(points, np.concatenate([cloud_of(top).normals, cloud_of(bottom, -1.0).normals]))
     above = cameras_above(3)
-    below = [pinhole_view(f"below_{row}.jpg", (120, 120), (120, 120, 60, 60), look_at(np.array([0.3 * row, 0, -12.0]), np.zeros(3))) for row in range(3)]
+    below = [
+        pinhole_view(
+            f"below_{row}.jpg",
+            (120, 120),
+            (120, 120, 60, 60),
+            look_at(np.array([0.3 * row, 0, -12.0]), np.zeros(3)),
+        )
+        for row in range(3)
+    ]
     read = constant({view.name: 1 for view in above} | {view.name: 2 for view in below})
-    labels = fuse(cloud, above + below, read, Surface.from_cloud(points, cloud.normals, np.zeros(3)), 5, PLAIN).labels
-    assert (labels.label[: len(top)] == 1).all() and (labels.label[len(top):] == 2).all()
+    labels = fuse(
+        cloud, above + below, read, Surface.from_cloud(points, cloud.normals, np.zeros(3)), 5, PLAIN
+    ).labels
+    assert (labels.label[: len(top)] == 1).all() and (labels.label[len(top) :] == 2).all()
     assert (labels.state == SEED).all()
 
 
@@ -106,13 +151,28 @@ def test_votes_do_not_depend_on_the_order_of_views_or_points():
     rng = np.random.default_rng(0)
     points = plane() + rng.normal(0, 0.02, plane().shape)
     cloud, views = cloud_of(points), cameras_above(8)
-    masks = {view.name: (rng.integers(0, 5, (120, 120)).astype(np.uint8), rng.integers(0, 256, (120, 120)).astype(np.uint8)) for view in views}
+    masks = {
+        view.name: (
+            rng.integers(0, 5, (120, 120)).astype(np.uint8),
+            rng.integers(0, 256, (120, 120)).astype(np.uint8),
+        )
+        for view in views
+    }
     settings = Label(voxel_size=0.2)
     surface = Surface.from_cloud(points, cloud.normals, np.zeros(3))
     first = fuse(cloud, views, lambda view: masks[view.name], surface, 5, settings)
     order, point_order = rng.permutation(8), rng.permutation(len(points))
-    second = fuse(Cloud(points[point_order], cloud.normals[point_order]), [views[row] for row in order], lambda view: masks[view.name], surface, 5, settings)
-    np.testing.assert_array_equal(first.field.votes[first.cells][point_order], second.field.votes[second.cells])
+    second = fuse(
+        Cloud(points[point_order], cloud.normals[point_order]),
+        [views[row] for row in order],
+        lambda view: masks[view.name],
+        surface,
+        5,
+        settings,
+    )
+    np.testing.assert_array_equal(
+        first.field.votes[first.cells][point_order], second.field.votes[second.cells]
+    )
     for name in ("label", "confidence", "state", "num_views"):
         np.testing.assert_array_equal(getattr(first.labels, name)[point_order], getattr(second.labels, name))
 
@@ -126,11 +186,18 @@ def test_reprojection_unlocks_what_only_mask_edges_disputed():
         mask[:, 60 + rng.integers(-1, 2) :] = 2
         return mask, None
 
-    straight = [pinhole_view(f"s{row:02d}.jpg", (120, 120), (120, 120, 60, 60), look_at(np.array([0.0, 0, 12.0]), np.zeros(3))) for row in range(12)]
+    straight = [
+        pinhole_view(
+            f"s{row:02d}.jpg", (120, 120), (120, 120, 60, 60), look_at(np.array([0.0, 0, 12.0]), np.zeros(3))
+        )
+        for row in range(12)
+    ]
     rng = np.random.default_rng(0)
     locked = fuse(cloud, straight, read, None, 5, replace(PLAIN, consensus=0.95, reproject=False)).labels
     rng = np.random.default_rng(0)
-    again = fuse(cloud, straight, read, None, 5, replace(PLAIN, consensus=0.95, edge_width=0.9, reproject=True)).labels
+    again = fuse(
+        cloud, straight, read, None, 5, replace(PLAIN, consensus=0.95, edge_width=0.9, reproject=True)
+    ).labels
     assert (locked.state == LOCKED).sum() > 0
     assert (again.state == UNLOCKED).sum() > 0
     assert (again.label[again.state == UNLOCKED] > 0).all()
@@ -153,7 +220,9 @@ def test_a_second_vote_of_a_single_view_unlocks_nothing():
     cloud, views = cloud_of(plane()), cameras_above(3)
     tilted = np.full((120, 120), 1, np.uint8)
     masks = {view.name: (tilted * (2 - (row == 0)), None) for row, view in enumerate(views)}
-    labels = fuse(cloud, views, lambda view: masks[view.name], None, 5, replace(PLAIN, consensus=1.0, reproject=True)).labels
+    labels = fuse(
+        cloud, views, lambda view: masks[view.name], None, 5, replace(PLAIN, consensus=1.0, reproject=True)
+    ).labels
     assert (labels.state == LOCKED).all()
 
 

@@ -47,31 +47,52 @@ def test_votes_are_weighed_by_the_square_of_the_share_that_agrees():
     assert reliability > MIN_RELIABILITY
     np.testing.assert_array_equal(votes[np.arange(100), labels], round(FULL * reliability**2))
     assert (votes[:, 0] == 7).all()  # the number of views stays
-    np.testing.assert_array_equal(passed, labels == 2)  # where the label rests on this view alone, it is doubted
+    # where the label rests on this view alone, it is doubted
+    np.testing.assert_array_equal(passed, labels == 2)
 
 
 def test_a_view_that_errs_all_around_a_place_is_overruled_there_by_one_that_does_not():
-    """Where only two views look they contradict each other; elsewhere in the block the other views show which of them errs."""
+    """Where only two views look they contradict each other; elsewhere in the block the other views show which
+    of them errs.
+    """
     count = 200
     good, bad = np.full(count, 1), np.full(count, 2)
     others = np.where(np.arange(count) < 150, 1, 0)
     winner = np.where(np.arange(count) < 150, 1, 2).astype(np.uint8)  # a tie at first: the wrong one won
     votes = np.zeros((count, 3), np.int32)
     weights = np.full(count, FULL)
-    verify(log_of((bad, weights), (good, weights), (others, weights), (others, weights)), winner, one_block(count), FULL, votes)
+    verify(
+        log_of((bad, weights), (good, weights), (others, weights), (others, weights)),
+        winner,
+        one_block(count),
+        FULL,
+        votes,
+    )
     assert (votes[150:, 1] > 5 * votes[150:, 2]).all()
 
 
 def test_reliability_is_a_matter_of_place():
     """A view that errs in one block keeps its say in a block far away, and less of it next door."""
-    points = np.array([[0.5, 0.5, 0.5], [BLOCK + 0.5, 0.5, 0.5], [5 * BLOCK + 0.5, 0.5, 0.5]]).repeat(50, axis=0)
+    points = np.array([[0.5, 0.5, 0.5], [BLOCK + 0.5, 0.5, 0.5], [5 * BLOCK + 0.5, 0.5, 0.5]]).repeat(
+        50, axis=0
+    )
     sorting = sort_by_voxel(points, 1.0, np.zeros(3))
     keys = np.unique(sorting.keys // VOXELS)
     neighbors = neighbor_blocks(keys)
-    assert (neighbors[:, 13] == [0, 1, 2]).all() and sorted(neighbors[0][neighbors[0] >= 0]) == [0, 1] and (neighbors[2] >= 0).sum() == 1
+    assert (
+        (neighbors[:, 13] == [0, 1, 2]).all()
+        and sorted(neighbors[0][neighbors[0] >= 0]) == [0, 1]
+        and (neighbors[2] >= 0).sum() == 1
+    )
     labels = np.r_[np.full(50, 2), np.full(100, 1)]
     votes = np.zeros((150, 3), np.int32)
-    verify(log_of((labels, np.full(150, FULL))), np.full(150, 1, np.uint8), Places(np.arange(3).repeat(50), neighbors), FULL, votes)
+    verify(
+        log_of((labels, np.full(150, FULL))),
+        np.full(150, 1, np.uint8),
+        Places(np.arange(3).repeat(50), neighbors),
+        FULL,
+        votes,
+    )
     here, next_door, far = votes[0, 2], votes[50, 1], votes[100, 1]
     assert here < 0.3 * FULL and 0.3 * FULL < next_door < 0.6 * FULL and far > 0.95 * FULL
 

@@ -19,8 +19,12 @@ from sc3d.scene.labels import LOCKED
 from sc3d.settings.labels import Label
 
 MODELS = {
-    "SIMPLE_PINHOLE": [110, 80, 60], "PINHOLE": [110, 112, 80, 60], "SIMPLE_RADIAL": [110, 80, 60, 0.05], "RADIAL": [110, 80, 60, 0.05, -0.02],
-    "OPENCV": [110, 112, 80, 60, 0.05, -0.02, 1e-3, -2e-3], "OPENCV_FISHEYE": [90, 92, 80, 60, 0.02, -0.01, 0, 0],
+    "SIMPLE_PINHOLE": [110, 80, 60],
+    "PINHOLE": [110, 112, 80, 60],
+    "SIMPLE_RADIAL": [110, 80, 60, 0.05],
+    "RADIAL": [110, 80, 60, 0.05, -0.02],
+    "OPENCV": [110, 112, 80, 60, 0.05, -0.02, 1e-3, -2e-3],
+    "OPENCV_FISHEYE": [90, 92, 80, 60, 0.02, -0.01, 0, 0],
 }
 SETTINGS = Label(voxel_size=0.25, incidence=True, verify="no")
 
@@ -36,28 +40,48 @@ def world(seed: int = 0) -> tuple[Cloud, Surface]:
     a, b, c = (corners[triangles[chosen, k]] for k in range(3))
     sides = a + u[:, None] * (b - a) + v[:, None] * (c - a)
     leaves = rng.normal([3, 3, 1.5], 0.4, (1500, 3))
-    normals = np.concatenate([np.tile([0, 0, 1.0], (6000, 1)), np.cross(b - a, c - a), rng.normal(size=(1500, 3))])
+    normals = np.concatenate(
+        [np.tile([0, 0, 1.0], (6000, 1)), np.cross(b - a, c - a), rng.normal(size=(1500, 3))]
+    )
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
     floor = np.array([[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0]])
-    surface = Surface.from_mesh(np.concatenate([corners, floor]), np.concatenate([triangles, [[8, 9, 10], [8, 10, 11]]]), np.zeros(3))
+    surface = Surface.from_mesh(
+        np.concatenate([corners, floor]), np.concatenate([triangles, [[8, 9, 10], [8, 10, 11]]]), np.zeros(3)
+    )
     return Cloud(np.concatenate([ground, sides, leaves]), normals), surface
 
 
 def views_of(model: str, count: int = 6) -> list[View]:
     camera = pycolmap.Camera(model=model, width=160, height=120, params=MODELS[model])
     angles = np.arange(count) * 1.1
-    return [View(f"{row}.jpg", camera, look_at(np.array([7 * np.cos(a), 7 * np.sin(a), 6 + row % 3]), np.zeros(3))) for row, a in enumerate(angles)]
+    return [
+        View(
+            f"{row}.jpg", camera, look_at(np.array([7 * np.cos(a), 7 * np.sin(a), 6 + row % 3]), np.zeros(3))
+        )
+        for row, a in enumerate(angles)
+    ]
 
 
 def noise_masks(views: list[View], seed: int = 1) -> dict:
     rng = np.random.default_rng(seed)
-    coarse = {view.name: (rng.integers(0, 5, (12, 16)).astype(np.uint8), rng.integers(0, 256, (120, 160)).astype(np.uint8)) for view in views}
-    return {name: (np.kron(mask, np.ones((10, 10), np.uint8)), confidence) for name, (mask, confidence) in coarse.items()}
+    coarse = {
+        view.name: (
+            rng.integers(0, 5, (12, 16)).astype(np.uint8),
+            rng.integers(0, 256, (120, 160)).astype(np.uint8),
+        )
+        for view in views
+    }
+    return {
+        name: (np.kron(mask, np.ones((10, 10), np.uint8)), confidence)
+        for name, (mask, confidence) in coarse.items()
+    }
 
 
 def slow_votes(cloud: Cloud, views: list[View], masks: dict, surface: Surface, settings: Label) -> np.ndarray:
     """(N, 5) votes of each point's cell, from `see_points` and numpy."""
-    ballot, _ = open_ballot(cloud, voxel_origin(cloud.points.min(axis=0), settings.voxel_size), settings.voxel_size, 5)
+    ballot, _ = open_ballot(
+        cloud, voxel_origin(cloud.points.min(axis=0), settings.voxel_size), settings.voxel_size, 5
+    )
     cells = ballot.to_points(np.arange(len(ballot.votes)))
     facing = ballot.to_points(ballot.cloud.facing)
     votes = np.zeros((len(ballot.votes), 5), np.int64)
@@ -70,7 +94,12 @@ def slow_votes(cloud: Cloud, views: list[View], masks: dict, surface: Surface, s
         for turn in (1, -1):  # see_points drops what faces away; scattered voxels take it as well
             seen = see_points(view, cloud.points, turn * cloud.normals, first, settings.voxel_size)
             keep = (mask[seen.rows, seen.columns] > 0) & ((turn == 1) | ~facing[seen.points])
-            weight = weights[seen.rows, seen.columns] * np.exp(-seen.excess) * seen.incidence * np.minimum(reference / seen.depth, 1)
+            weight = (
+                weights[seen.rows, seen.columns]
+                * np.exp(-seen.excess)
+                * seen.incidence
+                * np.minimum(reference / seen.depth, 1)
+            )
             weight = np.floor(np.clip(weight, MIN_WEIGHT, 1) * SCALE + 0.5).astype(np.int64)
             chosen = cells[seen.points[keep]]
             np.add.at(sums, (chosen, mask[seen.rows, seen.columns][keep]), weight[keep])
@@ -94,14 +123,21 @@ def test_votes_are_those_of_the_slow_twin(model):
 
 @pytest.mark.parametrize("model", [model for model in MODELS if "FISHEYE" not in model])
 def test_kernel_projects_like_pycolmap(model):
-    camera = pycolmap.Camera(model=model, width=1600, height=1200, params=[10 * p if k < len(MODELS[model]) and p > 1 else p for k, p in enumerate(MODELS[model])])
+    camera = pycolmap.Camera(
+        model=model,
+        width=1600,
+        height=1200,
+        params=[10 * p if k < len(MODELS[model]) and p > 1 else p for k, p in enumerate(MODELS[model])],
+    )
     view = View("a", camera, look_at(np.array([4.0, -3, 6]), np.zeros(3)))
     points = np.random.default_rng(0).normal(0, 3, (2000, 3))
     lens = lens_of(view, points)
     assert not lens.pixels.size
     expected, _ = project(view, points)
     known = np.isfinite(expected[:, 0])
-    found = np.array([to_pixel.py_func(lens.parameters, *to_camera.py_func(lens, *point)) for point in points[known]])
+    found = np.array(
+        [to_pixel.py_func(lens.parameters, *to_camera.py_func(lens, *point)) for point in points[known]]
+    )
     assert known.sum() > 1000 and np.abs(found - expected[known]).max() < 1e-9
 
 
@@ -109,7 +145,9 @@ def labels_of(cloud: Cloud, views: list[View], masks: dict, surface: Surface, se
     return fuse(cloud, views, lambda view: masks[view.name], surface, 5, settings).labels
 
 
-@pytest.mark.parametrize(("scale", "offset"), [(100.0, [0, 0, 0]), (1.0, [512345.25, 5187654.5, 210.125]), (0.01, [-3, 7, 1e3])])
+@pytest.mark.parametrize(
+    ("scale", "offset"), [(100.0, [0, 0, 0]), (1.0, [512345.25, 5187654.5, 210.125]), (0.01, [-3, 7, 1e3])]
+)
 def test_scale_and_position_of_the_world_do_not_matter(scale, offset):
     (cloud, surface), views, offset = world(), views_of("OPENCV"), np.array(offset)
     masks, settings = noise_masks(views), replace(Label(), voxel_size=0.25)
@@ -120,23 +158,45 @@ def test_scale_and_position_of_the_world_do_not_matter(scale, offset):
         pose[:3, 3] = -pose[:3, :3] @ (scale * view.centre + offset)
         moved.append(replace(view, cam_from_world=pose))
     box = o3d.t.geometry.TriangleMesh.create_box(2, 2, 2)
-    vertices = np.concatenate([box.vertex.positions.numpy().astype(np.float64) - [1, 1, 0], [[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0]]])
+    vertices = np.concatenate(
+        [
+            box.vertex.positions.numpy().astype(np.float64) - [1, 1, 0],
+            [[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0]],
+        ]
+    )
     triangles = np.concatenate([box.triangle.indices.numpy(), [[8, 9, 10], [8, 10, 11]]])
     there = Surface.from_mesh(scale * vertices + offset, triangles, offset)
-    found = labels_of(Cloud(scale * cloud.points + offset, cloud.normals), moved, masks, there, replace(settings, voxel_size=0.25 * scale))
+    found = labels_of(
+        Cloud(scale * cloud.points + offset, cloud.normals),
+        moved,
+        masks,
+        there,
+        replace(settings, voxel_size=0.25 * scale),
+    )
     for name in ("label", "state", "num_views"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
 def test_one_or_two_threads_views_and_points_in_any_order_give_the_same_bits():
     (cloud, surface), views = world(), views_of("RADIAL")
-    masks, settings, rng = noise_masks(views), replace(Label(), voxel_size=0.25, reproject=True), np.random.default_rng(5)
+    masks, settings, rng = (
+        noise_masks(views),
+        replace(Label(), voxel_size=0.25, reproject=True),
+        np.random.default_rng(5),
+    )
     expected = fuse(cloud, views, lambda view: masks[view.name], surface, 5, settings)
     order = rng.permutation(len(cloud.points))
     before = numba.get_num_threads()
     try:
         numba.set_num_threads(1)
-        found = fuse(Cloud(cloud.points[order], cloud.normals[order]), views[::-1], lambda view: masks[view.name], surface, 5, settings)
+        found = fuse(
+            Cloud(cloud.points[order], cloud.normals[order]),
+            views[::-1],
+            lambda view: masks[view.name],
+            surface,
+            5,
+            settings,
+        )
     finally:
         numba.set_num_threads(before)
     for name in ("label", "confidence", "state", "num_views"):
@@ -144,12 +204,23 @@ def test_one_or_two_threads_views_and_points_in_any_order_give_the_same_bits():
     np.testing.assert_array_equal(found.field.votes[found.cells], expected.field.votes[expected.cells][order])
 
 
-@pytest.mark.parametrize("switch", [{"incidence": False}, {"range": False}, {"depth_excess": False}, {"use_confidence": False}, {"edge_width": 0.0}])
+@pytest.mark.parametrize(
+    "switch",
+    [
+        {"incidence": False},
+        {"range": False},
+        {"depth_excess": False},
+        {"use_confidence": False},
+        {"edge_width": 0.0},
+    ],
+)
 def test_every_weight_is_a_switch(switch):
     (cloud, surface), views = world(), views_of("PINHOLE")
     masks = noise_masks(views)
     read = lambda view: masks[view.name]
-    on, off = (fuse(cloud, views, read, surface, 5, settings) for settings in (SETTINGS, replace(SETTINGS, **switch)))
+    on, off = (
+        fuse(cloud, views, read, surface, 5, settings) for settings in (SETTINGS, replace(SETTINGS, **switch))
+    )
     assert (on.field.votes[:, 0] == off.field.votes[:, 0]).all()  # the same sightings
     assert on.field.votes[:, 1:].sum() < off.field.votes[:, 1:].sum()  # each factor only takes weight away
 
@@ -159,12 +230,22 @@ def test_grazing_sightings_take_no_part_in_the_second_vote():
     ballot, _ = open_ballot(cloud, voxel_origin(cloud.points.min(axis=0), 0.25), 0.25, 5)
     mask = np.ones((120, 160), np.uint8)
     first = first_surface(surface, views[0])
-    ballot.cast(views[0], picture_of(mask, None, edge_distance(mask), first.range, Label()), Rules(0.25, 9.0, True, True, True, False, True))
-    cosine = np.abs(np.einsum("ij,ij->i", cloud.normals, views[0].centre - cloud.points)) / np.linalg.norm(views[0].centre - cloud.points, axis=1)
+    ballot.cast(
+        views[0],
+        picture_of(mask, None, edge_distance(mask), first.range, Label()),
+        Rules(0.25, 9.0, True, True, True, False, True),
+    )
+    cosine = np.abs(np.einsum("ij,ij->i", cloud.normals, views[0].centre - cloud.points)) / np.linalg.norm(
+        views[0].centre - cloud.points, axis=1
+    )
     steepest = np.zeros(len(ballot.votes))
     np.maximum.at(steepest, ballot.to_points(np.arange(len(ballot.votes))), cosine)
     strict = ballot.strict[:, 0] > 0
-    assert strict.any() and (steepest[strict] >= GRAZING).all() and (ballot.votes[:, 0] > ballot.strict[:, 0]).any()
+    assert (
+        strict.any()
+        and (steepest[strict] >= GRAZING).all()
+        and (ballot.votes[:, 0] > ballot.strict[:, 0]).any()
+    )
 
 
 def test_a_floater_of_low_opacity_has_less_than_a_hundredth_of_the_vote():
@@ -174,10 +255,15 @@ def test_a_floater_of_low_opacity_has_less_than_a_hundredth_of_the_vote():
     flat = np.tile(np.float32([0.15, 0.15, 0.001]), (21, 1))
     opacities = np.r_[np.full(20, 0.9), 0.01].astype(np.float32)
     gaussians = GaussianField(points, np.tile(np.eye(3, dtype=np.float32), (21, 1, 1)), flat, opacities)
-    shares = voxel_shares(gaussian_density(points, gaussians, 1.0), sort_by_voxel(points, 1.0, np.zeros(3))).astype(int)
+    shares = voxel_shares(
+        gaussian_density(points, gaussians, 1.0), sort_by_voxel(points, 1.0, np.zeros(3))
+    ).astype(int)
     assert shares.max() == FULL and shares[-1] < 0.01 * shares.sum()
     near = np.argsort(np.linalg.norm(points - points[-1], axis=1))[:12]
-    brute = sum(opacities[k] * np.exp(-0.5 * (((points[-1] - points[k]) / np.maximum(flat[k], 0.25)) ** 2).sum()) for k in near)
+    brute = sum(
+        opacities[k] * np.exp(-0.5 * (((points[-1] - points[k]) / np.maximum(flat[k], 0.25)) ** 2).sum())
+        for k in near
+    )
     assert gaussian_density(points, gaussians, 1.0)[-1] == pytest.approx(brute, rel=1e-4)
 
 
@@ -195,7 +281,11 @@ def test_density_decides_between_the_points_of_a_voxel():
     """Two points of one voxel under different mask labels: the vote is their mean, weighted by density."""
     points = np.array([[0.3, 0.5, 0.0], [0.7, 0.5, 0.0]])
     cloud = Cloud(points, np.tile(np.float32([0, 0, 1]), (2, 1)), np.float32([1, 0.25]))
-    view = View("a", pycolmap.Camera(model="PINHOLE", width=160, height=120, params=[400, 400, 80, 60]), look_at(np.array([0.5, 0.5, 4.0]), np.array([0.5, 0.5, 0])))
+    view = View(
+        "a",
+        pycolmap.Camera(model="PINHOLE", width=160, height=120, params=[400, 400, 80, 60]),
+        look_at(np.array([0.5, 0.5, 4.0]), np.array([0.5, 0.5, 0])),
+    )
     mask = np.ones((120, 160), np.uint8)
     mask[:, 80:] = 2
     settings = Label(method="majority", voxel_size=2.0)
@@ -208,6 +298,14 @@ def test_the_paper_preset_locks_whatever_the_other_options_say():
     (cloud, surface), views = world(), views_of("PINHOLE")
     masks = noise_masks(views)
     one = labels_of(cloud, views, masks, surface, Label(method="paper", voxel_size=0.25))
-    other = labels_of(cloud, views, masks, surface, Label(method="paper", voxel_size=0.25, consensus=0.5, incidence=False, verify="no", edge_width=0))
+    other = labels_of(
+        cloud,
+        views,
+        masks,
+        surface,
+        Label(method="paper", voxel_size=0.25, consensus=0.5, incidence=False, verify="no", edge_width=0),
+    )
     np.testing.assert_array_equal(one.state, other.state)
-    assert (one.state == LOCKED).mean() > (labels_of(cloud, views, masks, surface, SETTINGS).state == LOCKED).mean()
+    assert (one.state == LOCKED).mean() > (
+        labels_of(cloud, views, masks, surface, SETTINGS).state == LOCKED
+    ).mean()

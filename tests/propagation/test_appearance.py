@@ -15,7 +15,9 @@ LAWN, ROOF, ROAD = 1, 2, 3
 
 
 def village(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points, normals, colours and truth of a lawn with a road and flat roofs 5 high; spacing about 0.5. Lawn and roofs share half of their colours."""
+    """Points, normals, colours and truth of a lawn with a road and flat roofs 5 high; spacing about 0.5. Lawn
+    and roofs share half of their colours.
+    """
     rng = np.random.default_rng(seed)
     flat = rng.uniform(0, 100, (40_000, 2))
     roof = ((flat // 10).astype(int) % 3 == 1).all(axis=1)
@@ -32,7 +34,12 @@ def evidence_of(points: np.ndarray, colors: np.ndarray, label: np.ndarray) -> Ev
     votes[np.arange(len(label)), label] = 1.5
     votes[:, 0] = 0
     seen = label > 0
-    seeds = Labels(label, seen.astype(np.float32), np.where(seen, SEED, UNSEEN).astype(np.uint8), np.where(seen, 5, 0).astype(np.int32))
+    seeds = Labels(
+        label,
+        seen.astype(np.float32),
+        np.where(seen, SEED, UNSEEN).astype(np.uint8),
+        np.where(seen, 5, 0).astype(np.int32),
+    )
     return Evidence(points, seeds, votes, colors)
 
 
@@ -57,7 +64,11 @@ def scene():
 def solve(scene, settings: Propagate, order=slice(None), transform=lambda points: points) -> Labels:
     points, normals, colors, _, label = scene
     moved = transform(points[order])
-    return propagate(build_graph(moved, normals[order], 16, colors[order]), evidence_of(moved, colors[order], label[order]), settings)
+    return propagate(
+        build_graph(moved, normals[order], 16, colors[order]),
+        evidence_of(moved, colors[order], label[order]),
+        settings,
+    )
 
 
 def test_relief_is_height_over_the_ground_in_spacings_whatever_the_unit_and_the_order(scene):
@@ -76,10 +87,15 @@ def test_relief_is_height_over_the_ground_in_spacings_whatever_the_unit_and_the_
 def test_errors_that_all_views_share_are_cured_and_only_by_the_raters(scene):
     truth, label = scene[3], scene[4]
     before = (label != truth).mean()
-    with_raters, without = ((solve(scene, Propagate(appearance=learn)).label != truth).mean() for learn in (True, False))
+    with_raters, without = (
+        (solve(scene, Propagate(appearance=learn)).label != truth).mean() for learn in (True, False)
+    )
     assert before > 0.05 and without > 0.9 * before and with_raters < 0.1 * before
     for method in ("geometry", "knn"):
-        verified, trusting = ((solve(scene, Propagate(method=method, verify_seeds=verify)).label != truth).mean() for verify in (True, False))
+        verified, trusting = (
+            (solve(scene, Propagate(method=method, verify_seeds=verify)).label != truth).mean()
+            for verify in (True, False)
+        )
         assert trusting > 0.9 * before and verified < 0.3 * before
 
 
@@ -104,7 +120,9 @@ def test_product_of_raters_by_hand_on_two_independent_features():
     colors[:, 0] = 255 * second
     raters = Raters.of(relief, colors)
     rating = raters.learn(label, np.ones(len(label), bool), 2)
-    odds = (0.7 * np.where(first, 0.2, 0.8) * np.where(second, 0.3, 0.7)) / (0.3 * np.where(first, 0.6, 0.4) * np.where(second, 0.9, 0.1))
+    odds = (0.7 * np.where(first, 0.2, 0.8) * np.where(second, 0.3, 0.7)) / (
+        0.3 * np.where(first, 0.6, 0.4) * np.where(second, 0.9, 0.1)
+    )
     np.testing.assert_allclose(rating[:, 0] - rating[:, 1], np.log(odds), atol=0.1)
     np.testing.assert_allclose(np.exp(rating).sum(axis=1), 1, atol=1e-4)
 
@@ -121,16 +139,21 @@ def test_a_class_with_few_examples_is_left_to_the_votes():
 
 @pytest.mark.parametrize("method", ["map", "geometry", "knn"])
 def test_a_class_that_few_views_saw_is_not_erased(scene, method):
-    """Roofs seen by one view, the rest by five: roofs would have no examples, and the raters, which would not know them, would call them something else."""
+    """Roofs seen by one view, the rest by five: roofs would have no examples, and the raters, which would not
+    know them, would call them something else.
+    """
     points, normals, colors, truth, _ = scene
     evidence = evidence_of(points, colors, truth)
     evidence.seeds.num_views[truth == ROOF] = 1
     assert evidence.agreed.all()
     label = propagate(build_graph(points, normals, 16, colors), evidence, Propagate(method=method)).label
     assert (label[truth == ROOF] == ROOF).mean() > 0.98 and (label == truth).mean() > 0.98
-    rare = (truth != ROOF) | (np.abs(points[:, :2] - 15).max(axis=1) < 4)  # one roof, too few points at all: left to the votes
+    # one roof, too few points at all: left to the votes
+    rare = (truth != ROOF) | (np.abs(points[:, :2] - 15).max(axis=1) < 4)
     points, normals, colors, truth = points[rare], normals[rare], colors[rare], truth[rare]
-    label = propagate(build_graph(points, normals, 16, colors), evidence_of(points, colors, truth), Propagate(method=method)).label
+    label = propagate(
+        build_graph(points, normals, 16, colors), evidence_of(points, colors, truth), Propagate(method=method)
+    ).label
     assert (label[truth == ROOF] == ROOF).mean() > 0.95
 
 
@@ -140,6 +163,10 @@ def test_same_labels_for_any_order_unit_and_offset(scene):
         expected = solve(scene, Propagate(method=method))
         permuted = solve(scene, Propagate(method=method), order)
         for name in ("label", "confidence", "state", "num_views"):
-            np.testing.assert_array_equal(getattr(expected, name)[order], getattr(permuted, name), err_msg=name)
+            np.testing.assert_array_equal(
+                getattr(expected, name)[order], getattr(permuted, name), err_msg=name
+            )
         for transform in (lambda points: points * 100, lambda points: points + [5e5, 5e6, 100]):
-            np.testing.assert_array_equal(solve(scene, Propagate(method=method), transform=transform).label, expected.label)
+            np.testing.assert_array_equal(
+                solve(scene, Propagate(method=method), transform=transform).label, expected.label
+            )

@@ -24,7 +24,12 @@ def plane(height: float = 0.0, count: int = 40, offset: float = 0.0) -> np.ndarr
 
 
 def seeds_of(label: np.ndarray) -> Labels:
-    return Labels(label, (label > 0).astype(np.float32), np.where(label > 0, SEED, UNSEEN).astype(np.uint8), (label > 0).astype(np.int32))
+    return Labels(
+        label,
+        (label > 0).astype(np.float32),
+        np.where(label > 0, SEED, UNSEEN).astype(np.uint8),
+        (label > 0).astype(np.int32),
+    )
 
 
 def up(points: np.ndarray) -> np.ndarray:
@@ -45,9 +50,11 @@ def test_one_seed_fills_its_plane_and_not_the_sheet_above(method):
     label = np.zeros(len(points), np.uint8)
     label[0], label[-1] = 1, 2
     graph = build_graph(points, up(points), 16)
-    result = propagate(graph, Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method=method))
+    result = propagate(
+        graph, Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method=method)
+    )
     if method != "knn":  # votes by distance alone cannot know the sheets
-        assert (result.label[: len(low)] == 1).all() and (result.label[len(low):] == 2).all()
+        assert (result.label[: len(low)] == 1).all() and (result.label[len(low) :] == 2).all()
     assert result.state[0] == SEED and (result.state[1:-1] == PROPAGATED).all()
     assert (result.confidence > 0).all() and (result.confidence <= 1).all()
 
@@ -58,10 +65,18 @@ def test_a_gap_stops_labels_unless_filled(method):
     label = np.zeros(len(points), np.uint8)
     label[5] = 3
     graph = build_graph(points, up(points), 16)
-    result = propagate(graph, Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method=method))
+    result = propagate(
+        graph, Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method=method)
+    )
     half = len(points) // 2
-    assert (result.label[:half] == 3).all() and (result.label[half:] == 0).all() and (result.state[half:] == UNSEEN).all()
-    filled = propagate(graph, Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method=method, fill=True))
+    assert (
+        (result.label[:half] == 3).all()
+        and (result.label[half:] == 0).all()
+        and (result.state[half:] == UNSEEN).all()
+    )
+    filled = propagate(
+        graph, Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method=method, fill=True)
+    )
     assert (filled.label == 3).all() and (filled.state[half:] == PROPAGATED).all()
 
 
@@ -71,7 +86,9 @@ def test_geometry_prefers_the_similar_surface_at_a_crease():
     wall = floor[:, [0, 2, 1]] + [0, 4.0, 0.1]
     points = np.concatenate([floor, wall])
     normals = np.concatenate([up(floor), np.tile(np.float32([0, -1, 0]), (len(wall), 1))])
-    label = np.concatenate([np.where(floor[:, 1] < 3.65, 1, 0), np.where(wall[:, 2] > 0.45, 2, 0)]).astype(np.uint8)
+    label = np.concatenate([np.where(floor[:, 1] < 3.65, 1, 0), np.where(wall[:, 2] > 0.45, 2, 0)]).astype(
+        np.uint8
+    )
     truth = np.concatenate([np.full(len(floor), 1), np.full(len(wall), 2)])
     graph = build_graph(points, normals, 16)
     grown = grow(graph, label[graph.order])[0][np.argsort(graph.order)]
@@ -84,8 +101,12 @@ def test_eq_7_by_hand():
     normals = np.float32([[0, 0, 1], [0, 0, 1], [1, 0, 0], [0, 0, -1]])
     bend = np.float32([0.0, 0.5, 0.0, 0.0])
     rows, columns = np.array([0, 0, 0]), np.array([1, 2, 3])
-    np.testing.assert_allclose(similarity(normals, bend, rows, columns), [0.6 + 0.4 * np.exp(-0.5), 0.6 * 0.5 + 0.4, 0.4], rtol=1e-6)
-    np.testing.assert_allclose(similarity(normals, bend, rows[2:], columns[2:], oriented=False), [1.0], rtol=1e-6)
+    np.testing.assert_allclose(
+        similarity(normals, bend, rows, columns), [0.6 + 0.4 * np.exp(-0.5), 0.6 * 0.5 + 0.4, 0.4], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        similarity(normals, bend, rows[2:], columns[2:], oriented=False), [1.0], rtol=1e-6
+    )
     assert curvature(normals[:2], np.array([[1], [0]])).max() == 0
 
 
@@ -95,9 +116,17 @@ def test_point_order_does_not_matter(method):
     points = plane() + rng.normal(0, 0.01, plane().shape)
     label = np.where(rng.uniform(size=len(points)) < 0.1, rng.integers(1, 4, len(points)), 0).astype(np.uint8)
     order = rng.permutation(len(points))
-    first = propagate(build_graph(points, up(points), 16), Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method=method))
+    first = propagate(
+        build_graph(points, up(points), 16),
+        Evidence(points, seeds_of(label), votes_of(label), None),
+        Propagate(method=method),
+    )
     moved = points[order]
-    second = propagate(build_graph(moved, up(moved), 16), Evidence(moved, seeds_of(label[order]), votes_of(label[order]), None), Propagate(method=method))
+    second = propagate(
+        build_graph(moved, up(moved), 16),
+        Evidence(moved, seeds_of(label[order]), votes_of(label[order]), None),
+        Propagate(method=method),
+    )
     np.testing.assert_array_equal(first.label[order], second.label)
     np.testing.assert_array_equal(first.state[order], second.state)
 
@@ -106,7 +135,16 @@ def graph_of(weights: np.ndarray) -> Graph:
     """A graph of given symmetric weights (N, N), without positions."""
     matrix, count = scipy.sparse.csr_matrix(weights.astype(np.float32)), len(weights)
     nothing = np.zeros(count, np.float32)
-    return Graph(np.arange(count), matrix.indptr.astype(np.int64), matrix.indices.astype(np.int32), matrix.data, np.ones(count, np.float32), np.zeros((count, 3), np.float32), nothing, nothing)
+    return Graph(
+        np.arange(count),
+        matrix.indptr.astype(np.int64),
+        matrix.indices.astype(np.int32),
+        matrix.data,
+        np.ones(count, np.float32),
+        np.zeros((count, 3), np.float32),
+        nothing,
+        nothing,
+    )
 
 
 def random_problem(seed: int, count: int = 10) -> tuple[np.ndarray, Graph, np.ndarray]:
@@ -123,7 +161,9 @@ def test_energy_counts_each_edge_once_and_mean_field_is_near_the_brute_force_min
     for row, column in zip(*np.nonzero(edges), strict=True):
         energies += edges[row, column] * (every[:, row] != every[:, column])
     sample = np.random.default_rng(0).integers(0, len(every), 50)
-    np.testing.assert_allclose([potts_energy(graph, unary, every[row], 1.0) for row in sample], energies[sample], rtol=1e-5)
+    np.testing.assert_allclose(
+        [potts_energy(graph, unary, every[row], 1.0) for row in sample], energies[sample], rtol=1e-5
+    )
     belief = mean_field(graph, unary, 1.0)
     assert potts_energy(graph, unary, belief.argmax(axis=1) + 1, 1.0) <= np.quantile(energies, 0.005)
     np.testing.assert_allclose(belief.sum(axis=1), 1, rtol=1e-5)
@@ -155,7 +195,11 @@ def test_map_corrects_a_wrong_seed_that_its_surroundings_contradict():
     label[820] = 1
     votes = votes_of(label)
     votes[820] = [0, 0.6, 0.4, 0, 0]
-    result = propagate(build_graph(points, up(points), 16), Evidence(points, seeds_of(label), votes, None), Propagate(method="map"))
+    result = propagate(
+        build_graph(points, up(points), 16),
+        Evidence(points, seeds_of(label), votes, None),
+        Propagate(method="map"),
+    )
     assert result.label[820] == 2 and result.state[820] == PROPAGATED and result.state[0] == SEED
 
 
@@ -167,14 +211,24 @@ def test_locked_points_are_completed_and_seeds_keep_their_label():
     label[0] = 1
     seeds = replace(seeds_of(label), state=state)
     for method in ("knn", "geometry"):
-        result = propagate(build_graph(points, up(points), 16), Evidence(points, seeds, None, None), Propagate(method=method))
-        assert (result.label[300:340] == 2).all() and (result.state[300:340] == PROPAGATED).all() and result.label[0] == 1
+        result = propagate(
+            build_graph(points, up(points), 16), Evidence(points, seeds, None, None), Propagate(method=method)
+        )
+        assert (
+            (result.label[300:340] == 2).all()
+            and (result.state[300:340] == PROPAGATED).all()
+            and result.label[0] == 1
+        )
 
 
 def test_two_points_and_no_neighbours():
     points = np.array([[0.0, 0, 0], [1.0, 0, 0]])
     label = np.uint8([1, 0])
-    result = propagate(build_graph(points, None, 16), Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method="geometry"))
+    result = propagate(
+        build_graph(points, None, 16),
+        Evidence(points, seeds_of(label), votes_of(label), None),
+        Propagate(method="geometry"),
+    )
     assert result.label[0] == 1
 
 
@@ -187,7 +241,9 @@ def test_graph_equals_scipy_union_of_both_directions():
     rows = np.repeat(np.arange(len(points)), 8)
     kept = (distances <= 3 * distances[:, 3:4]).ravel()
     weights = similarity(normals, curvature(normals, near), rows, near.ravel().astype(np.int64))
-    expected = scipy.sparse.csr_matrix((weights[kept], (rows[kept], near.ravel()[kept])), shape=(len(points),) * 2)
+    expected = scipy.sparse.csr_matrix(
+        (weights[kept], (rows[kept], near.ravel()[kept])), shape=(len(points),) * 2
+    )
     expected = expected.maximum(expected.T).toarray()
     graph = build_graph(points, normals, 8)
     back = np.argsort(graph.order)
@@ -215,8 +271,19 @@ def test_one_or_two_threads_give_the_same_bits():
         for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
             numba.set_num_threads(threads)
             graph = build_graph(points, None, 16)
-            found.append((graph.weights, *(propagate(graph, Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method=method)).confidence
-                                           for method in ("map", "geometry"))))
+            found.append(
+                (
+                    graph.weights,
+                    *(
+                        propagate(
+                            graph,
+                            Evidence(points, seeds_of(label), votes_of(label), None),
+                            Propagate(method=method),
+                        ).confidence
+                        for method in ("map", "geometry")
+                    ),
+                )
+            )
     finally:
         numba.set_num_threads(before)
     for first, second in zip(*found, strict=True):
@@ -225,10 +292,16 @@ def test_one_or_two_threads_give_the_same_bits():
 
 @pytest.mark.parametrize("method", ["geometry", "map"])
 def test_sheets_two_voxels_apart_keep_their_labels(method):
-    """Voxel = 2 spacings: sheets 4 spacings apart, each with its own class in its seeds, the rest locked or unseen."""
+    """Voxel = 2 spacings: sheets 4 spacings apart, each with its own class in its seeds, the rest locked or
+    unseen.
+    """
     rng = np.random.default_rng(0)
     low, high = (plane(height, 60) + rng.normal(0, 0.01, (3600, 3)) for height in (0.0, 0.4))
     points, truth = np.concatenate([low, high]), np.repeat(np.uint8([1, 2]), 3600)
     label = np.where(rng.uniform(size=len(points)) < 0.02, truth, 0).astype(np.uint8)
-    result = propagate(build_graph(points, up(points), 16), Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method=method))
+    result = propagate(
+        build_graph(points, up(points), 16),
+        Evidence(points, seeds_of(label), votes_of(label), None),
+        Propagate(method=method),
+    )
     np.testing.assert_array_equal(result.label, truth)

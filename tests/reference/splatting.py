@@ -1,4 +1,6 @@
-"""Slow dense twin of the renderer in plain torch: every pixel against every Gaussian. For tests, in any float type."""
+"""Slow dense twin of the renderer in plain torch: every pixel against every Gaussian. For tests, in any float
+type.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,13 @@ _MIN_ALPHA, _MAX_ALPHA, _MIN_TRANSMITTANCE = 1.0 / 255.0, 0.99, 1e-4
 
 
 def render_reference(
-    gaussians: Gaussians, view: View, sh_degree: int | None = None, background: Tensor | None = None,
+    gaussians: Gaussians,
+    view: View,
+    sh_degree: int | None = None,
+    background: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """color (H, W, 3), alpha (H, W), normal (H, W, 3), plane_distance (H, W) as in `render.Rendering`; gradients by torch autograd.
+    """color (H, W, 3), alpha (H, W), normal (H, W, 3), plane_distance (H, W) as in `render.Rendering`;
+    gradients by torch autograd.
 
     Memory grows with H * W * N: use a few thousand pixels and a few hundred Gaussians.
     """
@@ -33,39 +39,63 @@ def render_reference(
     weights = alphas * torch.where(reached >= _MIN_TRANSMITTANCE, reached, 0.0)
     normals, distances = _planes(means_cam, axes, gaussians.log_scales[order])
     directions = gaussians.means[order] - torch.tensor(view.centre, dtype=dtype)
-    colors = (0.5 + torch.einsum("nk,nkc->nc", *_basis_and_coefficients(directions, gaussians.sh[order], sh_degree))).clamp_min(0.0)
+    colors = (
+        0.5 + torch.einsum("nk,nkc->nc", *_basis_and_coefficients(directions, gaussians.sh[order], sh_degree))
+    ).clamp_min(0.0)
     alpha = weights.sum(1)
     color = weights @ colors
     if background is not None:
         color = color + (1 - alpha)[:, None] * background.to(dtype)
     size = (view.height, view.width)
-    return color.reshape(*size, 3), alpha.reshape(size), (weights @ normals).reshape(*size, 3), (weights @ distances).reshape(size)
+    return (
+        color.reshape(*size, 3),
+        alpha.reshape(size),
+        (weights @ normals).reshape(*size, 3),
+        (weights @ distances).reshape(size),
+    )
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """(N, 3, 3) rotations of (N, 4) wxyz quaternions, which are normalised first."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    return torch.stack([
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=1).reshape(-1, 3, 3)
+    return torch.stack(
+        [
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - w * z),
+            2 * (x * z + w * y),
+            2 * (x * y + w * z),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - w * x),
+            2 * (x * z - w * y),
+            2 * (y * z + w * x),
+            1 - 2 * (x * x + y * y),
+        ],
+        dim=1,
+    ).reshape(-1, 3, 3)
 
 
 def _alphas(means_cam: Tensor, axes: Tensor, scales: Tensor, opacities: Tensor, view: View) -> Tensor:
     """(H * W, N) alpha of every Gaussian at every pixel centre, 0 below 1/255."""
     dtype, matrix = means_cam.dtype, view.matrix
-    focal, principal = torch.tensor([matrix[0, 0], matrix[1, 1]], dtype=dtype), torch.tensor([matrix[0, 2], matrix[1, 2]], dtype=dtype)
+    focal, principal = (
+        torch.tensor([matrix[0, 0], matrix[1, 1]], dtype=dtype),
+        torch.tensor([matrix[0, 2], matrix[1, 2]], dtype=dtype),
+    )
     size = torch.tensor([view.width, view.height], dtype=dtype)
     depth = means_cam[:, 2:]
     slopes = means_cam[:, :2] / depth
     margin = (_MARGIN - 1) * size / (2 * focal)
-    limited = torch.maximum(torch.minimum(slopes, (size - principal) / focal + margin), -principal / focal - margin)
+    limited = torch.maximum(
+        torch.minimum(slopes, (size - principal) / focal + margin), -principal / focal - margin
+    )
     jacobian = torch.zeros(len(means_cam), 2, 3, dtype=dtype)
     jacobian[:, 0, 0], jacobian[:, 1, 1] = (focal / depth).unbind(1)
     jacobian[:, :, 2] = -focal * limited / depth
     rows = jacobian @ (axes * scales[:, None, :])
     covariance = rows @ rows.transpose(1, 2) + _DILATION * torch.eye(2, dtype=dtype)
-    columns, lines = torch.meshgrid(torch.arange(view.width) + 0.5, torch.arange(view.height) + 0.5, indexing="xy")
+    columns, lines = torch.meshgrid(
+        torch.arange(view.width) + 0.5, torch.arange(view.height) + 0.5, indexing="xy"
+    )
     pixels = torch.stack([columns, lines], dim=2).reshape(-1, 1, 2).to(dtype)
     offsets = pixels - (slopes * focal + principal)
     power = torch.einsum("pni,nij,pnj->pn", offsets, torch.linalg.inv(covariance), offsets)
@@ -87,11 +117,23 @@ def _basis_and_coefficients(directions: Tensor, sh: Tensor, sh_degree: int | Non
     degree = stored if sh_degree is None else min(sh_degree, stored)
     x, y, z = torch.nn.functional.normalize(directions, dim=1).unbind(1)
     a, b, c = 0.4886025119029199, 1.0925484305920792, 0.31539156525252005
-    values = [torch.full_like(x, 0.28209479177387814), -a * y, a * z, -a * x,
-              b * x * y, -b * y * z, c * (2 * z * z - x * x - y * y), -b * x * z, b / 2 * (x * x - y * y),
-              -0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z,
-              -0.4570457994644658 * y * (4 * z * z - x * x - y * y), 0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
-              -0.4570457994644658 * x * (4 * z * z - x * x - y * y), 1.445305721320277 * z * (x * x - y * y),
-              -0.5900435899266435 * x * (x * x - 3 * y * y)]
+    values = [
+        torch.full_like(x, 0.28209479177387814),
+        -a * y,
+        a * z,
+        -a * x,
+        b * x * y,
+        -b * y * z,
+        c * (2 * z * z - x * x - y * y),
+        -b * x * z,
+        b / 2 * (x * x - y * y),
+        -0.5900435899266435 * y * (3 * x * x - y * y),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+        1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    ]
     active = (degree + 1) ** 2
     return torch.stack(values[:active], dim=1), sh[:, :active]

@@ -78,21 +78,30 @@ def make_box() -> o3d.t.geometry.TriangleMesh:
 
 
 def make_views() -> list[View]:
-    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=160, height=120, params=[140, 80, 60, 0.02], camera_id=1)
+    camera = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=160, height=120, params=[140, 80, 60, 0.02], camera_id=1
+    )
     centres = [(-12, -12, 35), (12, -12, 35), (12, 12, 35), (-12, 12, 35)]
-    return [View(f"view{number}.jpg", camera, look_at(UTM + centre, UTM)) for number, centre in enumerate(centres)]
+    return [
+        View(f"view{number}.jpg", camera, look_at(UTM + centre, UTM)) for number, centre in enumerate(centres)
+    ]
 
 
 def label_points(points: np.ndarray) -> np.ndarray:
     local = points - UTM
-    return np.where((np.abs(local[..., 0]) < 5.01) & (np.abs(local[..., 1]) < 4.01), BUILDING, GRASS).astype(np.uint8)
+    return np.where((np.abs(local[..., 0]) < 5.01) & (np.abs(local[..., 1]) < 4.01), BUILDING, GRASS).astype(
+        np.uint8
+    )
 
 
 def write_model(path: Path, views: list[View]) -> None:
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(views[0].camera)
     for number, view in enumerate(views, start=1):
-        model.add_image_with_trivial_frame(pycolmap.Image(name=view.name, camera_id=1, image_id=number), pycolmap.Rigid3d(view.cam_from_world[:3]))
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(name=view.name, camera_id=1, image_id=number),
+            pycolmap.Rigid3d(view.cam_from_world[:3]),
+        )
     path.mkdir(parents=True)
     model.write(str(path))
 
@@ -104,11 +113,16 @@ def make_cloud(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.PointCloud:
     points, rng = np.asarray(sampled.points) + UTM, np.random.default_rng(0)
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
     label = label_points(points)
-    colors = np.where(label[:, None] == BUILDING, np.uint8([190, 90, 80]), np.uint8([110, 140, 80])).astype(np.uint8)
+    colors = np.where(label[:, None] == BUILDING, np.uint8([190, 90, 80]), np.uint8([110, 140, 80])).astype(
+        np.uint8
+    )
     attributes = {
-        "colors": colors, "normals": np.tile(np.float32([0, 0, 1]), (8000, 1)),
-        "label": label[:, None], "confidence": rng.uniform(0.4, 1, (8000, 1)).astype(np.float32),
-        "state": rng.choice(5, (8000, 1), p=[0.1, 0.6, 0.1, 0.15, 0.05]).astype(np.uint8), "num_views": np.full((8000, 1), 3, np.int32),
+        "colors": colors,
+        "normals": np.tile(np.float32([0, 0, 1]), (8000, 1)),
+        "label": label[:, None],
+        "confidence": rng.uniform(0.4, 1, (8000, 1)).astype(np.float32),
+        "state": rng.choice(5, (8000, 1), p=[0.1, 0.6, 0.1, 0.15, 0.05]).astype(np.uint8),
+        "num_views": np.full((8000, 1), 3, np.int32),
     }
     for name, values in attributes.items():
         cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(values))
@@ -132,15 +146,43 @@ def toy(tmp_path_factory) -> Scene:
         write_image(scene.truth / f"{Path(view.name).stem}.png", truth)
         write_image(scene.masks / f"{Path(view.name).stem}.png", mask)
         write_image(scene.photo(view.name), np.uint8([[0, 0, 0], [110, 140, 80], [190, 90, 80]])[truth])
-    write_json(scene.classes, [{"id": 1, "name": "grass", "color": [124, 179, 66]}, {"id": 2, "name": EVIL, "color": [214, 60, 60]}])
+    write_json(
+        scene.classes,
+        [
+            {"id": 1, "name": "grass", "color": [124, 179, 66]},
+            {"id": 2, "name": EVIL, "color": [214, 60, 60]},
+        ],
+    )
     write_geometry(scene.mesh, mesh)
     write_geometry(scene.labelled, make_cloud(mesh))
-    figures = {"oa": 0.93125, "miou": 0.871, "iou": {"grass": 0.95, EVIL: 0.792}, "coverage": 0.9876, "confusion": [[0, 900, 50], [10, 60, 700]]}
+    figures = {
+        "oa": 0.93125,
+        "miou": 0.871,
+        "iou": {"grass": 0.95, EVIL: 0.792},
+        "coverage": 0.9876,
+        "confusion": [[0, 900, 50], [10, 60, 700]],
+    }
     masks = figures | {"oa": 0.81, "miou": 0.7, "iou": {"grass": 0.8, EVIL: float("nan")}}
     believed = {"ece": 0.0321, "bins": [None] * 7 + [[0.75, 0.5, 200], [0.85, 0.9, 200], [0.97, 1.0, 600]]}
-    write_json(scene.metrics, {"photos": [view.name for view in views], "classes": ["grass", EVIL], "labels": figures, "masks": masks, "reliability": believed})
-    record = {"stage": "label", "settings": {"method": EVIL, "consensus": 0.8}, "versions": {"open3d": "0.20.0"}, "seconds": 12.34,
-              "peak_memory_mb": 2345, "summary": {"points": 8000, "note": EVIL}, "inputs": {"masks": "abc123"}}
+    write_json(
+        scene.metrics,
+        {
+            "photos": [view.name for view in views],
+            "classes": ["grass", EVIL],
+            "labels": figures,
+            "masks": masks,
+            "reliability": believed,
+        },
+    )
+    record = {
+        "stage": "label",
+        "settings": {"method": EVIL, "consensus": 0.8},
+        "versions": {"open3d": "0.20.0"},
+        "seconds": 12.34,
+        "peak_memory_mb": 2345,
+        "summary": {"points": 8000, "note": EVIL},
+        "inputs": {"masks": "abc123"},
+    }
     for name in ("seeds.ply.json", "votes.npz.json"):
         write_json(scene.path / name, record)
     write_json(scene.path / "sparse" / "0.json", record | {"stage": "reconstruct", "seconds": 3.0})
@@ -158,7 +200,9 @@ def test_page_is_well_formed_and_self_contained(page):
     assert parsed.sources
     assert all(source.startswith(("data:image/", "#")) for source in parsed.sources)
     assert not re.search(r"https?://|@import|url\(", page)
-    assert {source[1:] for source in parsed.sources if source.startswith("#")} == set(re.findall(r'<section id="(\w+)"', page))
+    assert {source[1:] for source in parsed.sources if source.startswith("#")} == set(
+        re.findall(r'<section id="(\w+)"', page)
+    )
 
 
 def test_text_from_files_is_escaped(page):
@@ -169,9 +213,31 @@ def test_text_from_files_is_escaped(page):
 
 
 def test_all_sections_and_figures_are_there(page):
-    assert re.findall(r'<section id="(\w+)"', page) == ["cloud", "found", "quality", "photos", "certainty", "flight", "processing"]
+    assert re.findall(r'<section id="(\w+)"', page) == [
+        "cloud",
+        "found",
+        "quality",
+        "photos",
+        "certainty",
+        "flight",
+        "processing",
+    ]
     text = " ".join(Page(page).text)
-    for figure in ("93.1%", "given masks 81.0%", "0.871", "98.8%", "8,000 points", "4 photos", "0.950", "0.792", "12.3", "2,345", "abc123", "0.20.0", "error 0.032"):
+    for figure in (
+        "93.1%",
+        "given masks 81.0%",
+        "0.871",
+        "98.8%",
+        "8,000 points",
+        "4 photos",
+        "0.950",
+        "0.792",
+        "12.3",
+        "2,345",
+        "abc123",
+        "0.20.0",
+        "error 0.032",
+    ):
         assert figure in text, figure
     assert "nan" not in text.lower().replace("alert", "")
 
@@ -225,7 +291,10 @@ def test_training_sheet_is_shown(tmp_path):
     Page(page)
     assert re.findall(r'<section id="(\w+)"', page) == ["training"]
     data, text = re.search(r'<img src="data:image/jpeg;base64,([^"]+)" alt="([^"]+)"', page).groups()
-    assert np.abs(decode(data).astype(int) - cv2.imread(str(tmp_path / "train.jpg"))).mean() < 5 and "depth and normals" in text
+    assert (
+        np.abs(decode(data).astype(int) - cv2.imread(str(tmp_path / "train.jpg"))).mean() < 5
+        and "depth and normals" in text
+    )
     (tmp_path / "train.jpg").write_bytes(b"nonsense")
     with pytest.raises(InputError, match="train.jpg"):
         write_report(Scene(tmp_path), tmp_path / "report.html")
@@ -256,15 +325,26 @@ def test_broken_metrics_are_an_input_error(tmp_path, content):
         write_report(Scene(tmp_path), tmp_path / "report.html")
 
 
-@pytest.mark.parametrize("metrics", [
-    {}, {"labels": None}, {"labels": {"oa": "high", "iou": [1], "confusion": "x"}}, {"photos": 3, "labels": {"oa": True}},
-    {"labels": {"iou": {"a": None}, "confusion": [[1], [2, 3]]}, "per_photo": [1]},
-    {"reliability": {"bins": [[1, 2], None]}}, {"reliability": {"ece": EVIL, "bins": [["x", None, EVIL]]}}, {"reliability": {"bins": [None]}},
-])
+@pytest.mark.parametrize(
+    "metrics",
+    [
+        {},
+        {"labels": None},
+        {"labels": {"oa": "high", "iou": [1], "confusion": "x"}},
+        {"photos": 3, "labels": {"oa": True}},
+        {"labels": {"iou": {"a": None}, "confusion": [[1], [2, 3]]}, "per_photo": [1]},
+        {"reliability": {"bins": [[1, 2], None]}},
+        {"reliability": {"ece": EVIL, "bins": [["x", None, EVIL]]}},
+        {"reliability": {"bins": [None]}},
+    ],
+)
 def test_odd_metrics_do_not_fail(tmp_path, metrics):
     write_json(tmp_path / "metrics.json", metrics)
     (tmp_path / "broken.ply.json").write_text("{")
-    write_json(tmp_path / "odd.ply.json", {"stage": "x", "settings": [1, EVIL], "versions": None, "seconds": "long", "summary": 3})
+    write_json(
+        tmp_path / "odd.ply.json",
+        {"stage": "x", "settings": [1, EVIL], "versions": None, "seconds": "long", "summary": 3},
+    )
     write_report(Scene(tmp_path), tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     Page(page)
@@ -285,9 +365,14 @@ def test_histogram_counts_every_value_once():
 def test_reliability_curve_has_its_dots_where_the_figures_say():
     chart = reliability_curve([(None, None, 0.0), (0.4, 0.25, 0.1), (0.6, 0.5, 0.3), (0.9, 1.0, 0.6)])
     places = np.array(re.findall(r'cx="([\d.]+)%" cy="([\d.]+)"', chart), float)
-    assert np.allclose(places[:, 0], [40, 60, 90]) and np.allclose(1 - places[:, 1] / 190, [0.25, 0.5, 1.0], atol=1e-3)
+    assert np.allclose(places[:, 0], [40, 60, 90]) and np.allclose(
+        1 - places[:, 1] / 190, [0.25, 0.5, 1.0], atol=1e-3
+    )
     bars = np.array(re.findall(r'class="track" x="([\d.]+)%"[^>]*height="([\d.]+)"', chart), float)
-    assert np.allclose(bars[:, 1] / bars[-1, 1], [1 / 6, 0.5, 1], atol=0.01) and (np.diff(bars[:, 0]) == 25).all()
+    assert (
+        np.allclose(bars[:, 1] / bars[-1, 1], [1 / 6, 0.5, 1], atol=0.01)
+        and (np.diff(bars[:, 0]) == 25).all()
+    )
     assert reliability_curve([(None, None, None)]).count("circle") == 0
 
 
@@ -305,7 +390,10 @@ def test_flight_map_has_north_up_and_east_right():
 def test_ground_picture_lies_where_the_points_are():
     grid = np.stack(np.meshgrid(np.linspace(0, 40, 200), np.linspace(0, 20, 100)), axis=-1).reshape(-1, 2)
     points = np.c_[grid, np.zeros(len(grid))] + UTM
-    colors = np.where(grid[:, :1] + 2 * grid[:, 1:] > 70, np.uint8([255, 0, 0]), np.uint8([0, 0, 255])).astype(np.uint8)  # red in the north-east
+    # red in the north-east
+    colors = np.where(
+        grid[:, :1] + 2 * grid[:, 1:] > 70, np.uint8([255, 0, 0]), np.uint8([0, 0, 255])
+    ).astype(np.uint8)
     uri, (x_low, y_low, x_high, y_high) = ground_picture(points, colors)
     picture = decode(uri.split(",")[1], cv2.IMREAD_UNCHANGED)
     assert np.allclose([x_low, y_low, x_high, y_high], [UTM[0], UTM[1], UTM[0] + 40, UTM[1] + 20], atol=1)
@@ -336,13 +424,24 @@ def test_areas_are_those_of_the_highest_surface():
     roof = ground[(ground[:, 0] < 10) & (ground[:, 1] < 10)] + [0, 0, 5]
     points, labels = np.concatenate([ground, roof]), np.repeat(np.uint8([3, 1]), [len(ground), len(roof)])
     areas = class_areas(points + [500000, 5200000, 0], labels)
-    assert areas[1] == pytest.approx(100, rel=0.06) and areas[3] == pytest.approx(700, rel=0.06) and areas.sum() == pytest.approx(800, rel=0.06)
+    assert (
+        areas[1] == pytest.approx(100, rel=0.06)
+        and areas[3] == pytest.approx(700, rel=0.06)
+        and areas.sum() == pytest.approx(800, rel=0.06)
+    )
 
 
 def test_counted_objects_are_in_the_report(tmp_path):
     (tmp_path / "export").mkdir()
-    features = [{"type": "Feature", "properties": {"area_m2": area, "height_m": height}, "geometry": None} for area, height in ((100, 4), (60, 6), (20, 9))]
-    (tmp_path / "export" / "trees_local.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    features = [
+        {"type": "Feature", "properties": {"area_m2": area, "height_m": height}, "geometry": None}
+        for area, height in ((100, 4), (60, 6), (20, 9))
+    ]
+    (tmp_path / "export" / "trees_local.geojson").write_text(
+        json.dumps({"type": "FeatureCollection", "features": features})
+    )
     (tmp_path / "export" / "buildings.geojson").write_text("[1]")
     table = found_section(Material(Scene(tmp_path)))
-    assert "buildings" not in table and all(f"<td>{value}</td>" in table for value in ("3", "180", "60", "6.0", "9.0"))
+    assert "buildings" not in table and all(
+        f"<td>{value}</td>" in table for value in ("3", "180", "60", "6.0", "9.0")
+    )

@@ -1,7 +1,10 @@
-"""By hand: `python tests/kill_run.py FOLDER --kills 50` kills `sc3d run` on a tiny synthetic site at random moments and runs it again.
+"""By hand: `python tests/kill_run.py FOLDER --kills 50` kills `sc3d run` on a tiny synthetic site at random
+moments and runs it again.
 
-Each time the second run must complete, leave no hidden files, and write the bytes of an uninterrupted run. A moment is a share of the processor time
-of that run, so that a busy machine does not shift it. One line of JSON per kill goes to FOLDER/kills.jsonl; what is there already is not repeated.
+Each time the second run must complete, leave no hidden files, and write the bytes of an uninterrupted run. A
+moment is a share of the processor time
+of that run, so that a busy machine does not shift it. One line of JSON per kill goes to FOLDER/kills.jsonl;
+what is there already is not repeated.
 `--signal INT` presses Ctrl-C instead: then the first run must also end with status 130 and one clear line.
 """
 
@@ -22,7 +25,18 @@ from pathlib import Path
 
 COMMAND = [sys.executable, "-c", "import sys; from sc3d.cli import main; main(sys.argv[1:])"]
 SITE = ["--views", "6", "--width", "240", "--extent", "50", "--altitude", "35", "--num-points", "20000"]
-OPTIONS = ["--train.iterations", "30", "--train.max-size", "240", "--train.max-gaussians", "5000", "--train.checkpoint-every", "10", "--extract.max-size", "240"]
+OPTIONS = [
+    "--train.iterations",
+    "30",
+    "--train.max-size",
+    "240",
+    "--train.max-gaussians",
+    "5000",
+    "--train.checkpoint-every",
+    "10",
+    "--extract.max-size",
+    "240",
+]
 COMPARED = ("labelled.ply", "seeds.ply", "mesh.ply", "cloud.ply", "gaussians.ply", "sparse/0/points3D.bin")
 TICK = os.sysconf("SC_CLK_TCK")
 
@@ -40,7 +54,11 @@ def main() -> None:
         subprocess.run([*COMMAND, "synthesize", str(folder / "site"), *SITE], check=True)
     reference = reference_run(folder)
     results = folder / "kills.jsonl"
-    done = {(row["signal"], row["number"]) for row in map(json.loads, results.read_text().splitlines())} if results.exists() else set()
+    done = (
+        {(row["signal"], row["number"]) for row in map(json.loads, results.read_text().splitlines())}
+        if results.exists()
+        else set()
+    )
     for number in range(arguments.kills):
         if (arguments.signal, number) not in done and time.time() - started < 60 * arguments.minutes:
             row = one_kill(folder, number, arguments.signal, reference)
@@ -51,13 +69,27 @@ def main() -> None:
 
 def run(folder: Path, scene: Path, log: Path) -> subprocess.Popen:
     site = folder / "site"
-    given = ["--masks", site / "masks", "--confidence", site / "confidence", "--classes", site / "classes.json"]
+    given = [
+        "--masks",
+        site / "masks",
+        "--confidence",
+        site / "confidence",
+        "--classes",
+        site / "classes.json",
+    ]
     with log.open("wb") as file:
-        return subprocess.Popen([*COMMAND, "run", *map(str, (site / "images", scene, *given)), *OPTIONS], stderr=file, stdout=file, start_new_session=True)
+        return subprocess.Popen(
+            [*COMMAND, "run", *map(str, (site / "images", scene, *given)), *OPTIONS],
+            stderr=file,
+            stdout=file,
+            start_new_session=True,
+        )
 
 
 def reference_run(folder: Path) -> dict:
-    """Digests and processor time of an uninterrupted run; kept in FOLDER/reference.json. Two runs: the first compiles, and both must write the same."""
+    """Digests and processor time of an uninterrupted run; kept in FOLDER/reference.json. Two runs: the first
+    compiles, and both must write the same.
+    """
     record, scene, found = folder / "reference.json", folder / "reference", []
     if not record.exists():
         for _ in range(2):
@@ -78,15 +110,29 @@ def one_kill(folder: Path, number: int, name: str, reference: dict) -> dict:
     process = run(folder, scene, log)
     while process.poll() is None and cpu_seconds(process.pid) < moment * reference["seconds"]:
         time.sleep(0.01)
-    reached = sorted(str(path.relative_to(scene)) for path in scene.glob("**/*.json")) if scene.exists() else []
+    reached = (
+        sorted(str(path.relative_to(scene)) for path in scene.glob("**/*.json")) if scene.exists() else []
+    )
     alive = process.poll() is None
     if alive:
         process.send_signal(getattr(signal, f"SIG{name}"))
     status, told = process.wait(), log.read_text(errors="replace").splitlines()
-    row = {"signal": name, "number": number, "moment": round(moment, 3), "alive": alive, "status": status, "finished": len(reached),
-           "left": hidden(scene), "last": told[-1][:160] if told else ""}
+    row = {
+        "signal": name,
+        "number": number,
+        "moment": round(moment, 3),
+        "alive": alive,
+        "status": status,
+        "finished": len(reached),
+        "left": hidden(scene),
+        "last": told[-1][:160] if told else "",
+    }
     if name == "INT" and alive:
-        row["clear"] = status == 130 and sum(line.startswith("sc3d:") for line in told) == 1 and "Traceback" not in "\n".join(told)
+        row["clear"] = (
+            status == 130
+            and sum(line.startswith("sc3d:") for line in told) == 1
+            and "Traceback" not in "\n".join(told)
+        )
     again = run(folder, scene, log)
     row |= {"rerun": again.wait(), "same": digests(scene) == reference["digests"], "hidden": hidden(scene)}
     if row["rerun"] == 0 and row["same"] and not row["hidden"] and row.get("clear", True):
@@ -104,7 +150,10 @@ def cpu_seconds(process: int) -> float:
 
 
 def digests(scene: Path) -> dict[str, str]:
-    return {name: hashlib.sha256((scene / name).read_bytes()).hexdigest() if (scene / name).exists() else "" for name in COMPARED}
+    return {
+        name: hashlib.sha256((scene / name).read_bytes()).hexdigest() if (scene / name).exists() else ""
+        for name in COMPARED
+    }
 
 
 def hidden(scene: Path) -> list[str]:

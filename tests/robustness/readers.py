@@ -1,4 +1,6 @@
-"""Every reader of sc3d with small valid files, for the fuzzers: `READERS[name].build(folder)`, damage one of `targets`, `read(folder)`."""
+"""Every reader of sc3d with small valid files, for the fuzzers: `READERS[name].build(folder)`, damage one of
+`targets`, `read(folder)`.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +70,9 @@ def _read_mesh(folder: Path) -> object:
 
     for file in sorted(folder.glob("*.ply")):
         mesh = read_mesh(file)
-        Surface.from_mesh(mesh.vertex.positions.numpy().astype(np.float64), mesh.triangle.indices.numpy(), np.zeros(3))
+        Surface.from_mesh(
+            mesh.vertex.positions.numpy().astype(np.float64), mesh.triangle.indices.numpy(), np.zeros(3)
+        )
 
 
 def _read_labelled(folder: Path) -> object:
@@ -100,11 +104,22 @@ def _trainer():
     from sc3d.splatting.trainer import Trainer
     from tests.splatting.test_trainer import SHORT, trace
 
-    views = [pinhole_view(f"{i}.png", (96, 64), (90, 90, 48, 32), look_at(np.array([4 * np.cos(i), 3 * np.sin(i), 9]), np.zeros(3))) for i in range(3)]
+    views = [
+        pinhole_view(
+            f"{i}.png",
+            (96, 64),
+            (90, 90, 48, 32),
+            look_at(np.array([4 * np.cos(i), 3 * np.sin(i), 9]), np.zeros(3)),
+        )
+        for i in range(3)
+    ]
     points = np.random.default_rng(0).uniform(-3, 3, (60, 3)) * [1, 1, 0.1]
     from dataclasses import replace
 
-    return Trainer(TrainingData(views, [trace(view)[0] for view in views], points, np.full((60, 3), 99, np.uint8)), replace(SHORT, fill=False, max_gaussians=60))
+    return Trainer(
+        TrainingData(views, [trace(view)[0] for view in views], points, np.full((60, 3), 99, np.uint8)),
+        replace(SHORT, fill=False, max_gaussians=60),
+    )
 
 
 def _build_checkpoint(folder: Path) -> None:
@@ -118,8 +133,15 @@ def _read_checkpoint(folder: Path) -> object:
 
 def _build_photos(folder: Path) -> None:
     details = {"exif": exif()}
-    _write(folder, a__jpg=picture("JPEG", **details), b__jpg=picture("JPEG", progressive=True, **details), c__png=picture("PNG", **details),
-           d__tif=picture("TIFF"), e__tif=picture("TIFF", compression="tiff_lzw"), f__tif=picture("TIFF", compression="jpeg"))
+    _write(
+        folder,
+        a__jpg=picture("JPEG", **details),
+        b__jpg=picture("JPEG", progressive=True, **details),
+        c__png=picture("PNG", **details),
+        d__tif=picture("TIFF"),
+        e__tif=picture("TIFF", compression="tiff_lzw"),
+        f__tif=picture("TIFF", compression="jpeg"),
+    )
 
 
 def _read_photos(folder: Path) -> object:
@@ -143,7 +165,10 @@ def _read_masks(folder: Path) -> object:
     from sc3d.scene.scene import match_masks
 
     table = parse_classes([{"id": i, "name": str(i), "color": [i, i, i]} for i in range(1, 4)], "test")
-    return [read_index_image(file) for file in match_masks(folder, {"a.jpg": (40, 30), "b.jpg": (80, 60)}, table).values()]
+    return [
+        read_index_image(file)
+        for file in match_masks(folder, {"a.jpg": (40, 30), "b.jpg": (80, 60)}, table).values()
+    ]
 
 
 def _read_classes(folder: Path) -> object:
@@ -162,8 +187,21 @@ def _read_georeference(folder: Path) -> object:
 
 
 def _build_sidecars(folder: Path) -> None:
-    record = {"stage": "label", "settings": {"consensus": 0.66}, "inputs": {"cloud.ply": "00"}, "versions": {"sc3d": "0.3.0"}, "seconds": 1.5, "peak_memory_mb": 10, "summary": {"points": 5}}
-    _write(folder, seeds__ply__json=json.dumps(record), metrics__json=json.dumps({"labels": {"oa": 0.5, "iou": {"road": 0.5}}, "photos": ["a.jpg"]}), seeds__ply=labelled_ply())
+    record = {
+        "stage": "label",
+        "settings": {"consensus": 0.66},
+        "inputs": {"cloud.ply": "00"},
+        "versions": {"sc3d": "0.3.0"},
+        "seconds": 1.5,
+        "peak_memory_mb": 10,
+        "summary": {"points": 5},
+    }
+    _write(
+        folder,
+        seeds__ply__json=json.dumps(record),
+        metrics__json=json.dumps({"labels": {"oa": 0.5, "iou": {"road": 0.5}}, "photos": ["a.jpg"]}),
+        seeds__ply=labelled_ply(),
+    )
 
 
 def _read_sidecars(folder: Path) -> object:
@@ -188,9 +226,17 @@ def _read_mask_files(folder: Path) -> object:
     from sc3d.segmentation.mask_formats.source import MaskFiles, read_masks
 
     table = _many_classes()
-    file = next(path for path in sorted(folder.iterdir()) if path.suffix in (".json", ".xml") and path.name != "mapping.json")
+    file = next(
+        path
+        for path in sorted(folder.iterdir())
+        if path.suffix in (".json", ".xml") and path.name != "mapping.json"
+    )
     mapping = folder / "mapping.json"
-    masks = read_masks(MaskFiles(file, "auto", mapping if mapping.exists() else None), {f"DJI_000{i}.jpg": (64, 48) for i in (1, 2)}, table)
+    masks = read_masks(
+        MaskFiles(file, "auto", mapping if mapping.exists() else None),
+        {f"DJI_000{i}.jpg": (64, 48) for i in (1, 2)},
+        table,
+    )
     return [mask.read() for mask in masks.values()]
 
 
@@ -217,15 +263,34 @@ def _read_colored(folder: Path) -> object:
         ids = folder.parent / f"{folder.name}-{kind}"
         ids.mkdir(exist_ok=True)
         shutil.copyfile(file, ids / "DJI_0001.png")
-        found += [mask.read() for mask in read_masks(MaskFiles(ids, kind), {"DJI_0001.jpg": (64, 48)}, table).values()]
+        found += [
+            mask.read()
+            for mask in read_masks(MaskFiles(ids, kind), {"DJI_0001.jpg": (64, 48)}, table).values()
+        ]
     return found
 
 
 def _build_strokes(folder: Path) -> None:
-    shapes = [{"label": "road", "shape_type": kind, "points": [[3.5 + row, 4], [20, 9.25], [30, 28], [9, 20]][:count], "width": width}
-              for row, (kind, count, width) in enumerate([("linestrip", 3, 5), ("polygon", 4, 0), ("point", 1, 9), ("rectangle", 2, 0), ("circle", 2, 0)])]
+    shapes = [
+        {
+            "label": "road",
+            "shape_type": kind,
+            "points": [[3.5 + row, 4], [20, 9.25], [30, 28], [9, 20]][:count],
+            "width": width,
+        }
+        for row, (kind, count, width) in enumerate(
+            [("linestrip", 3, 5), ("polygon", 4, 0), ("point", 1, 9), ("rectangle", 2, 0), ("circle", 2, 0)]
+        )
+    ]
     shapes.append({"label": "_background_", "shape_type": "line", "points": [[1, 1], [38, 29]]})
-    labelme = {"version": "5.5.0", "imagePath": "a.jpg", "imageWidth": 40, "imageHeight": 30, "imageData": None, "shapes": shapes}
+    labelme = {
+        "version": "5.5.0",
+        "imagePath": "a.jpg",
+        "imageWidth": 40,
+        "imageHeight": 30,
+        "imageData": None,
+        "shapes": shapes,
+    }
     colors = np.zeros((30, 40, 3), np.uint8)
     colors[:9] = [4, 0, 0]
     _write(folder, a__json=json.dumps(labelme))
@@ -243,14 +308,21 @@ def _many_classes():
     from sc3d.scene.class_table import parse_classes
 
     names = ["building", "house", "wall", "road", "car", "tree", "grass", "water"]
-    return parse_classes([{"id": 1 + row, "name": name, "color": [1 + row, 0, 0]} for row, name in enumerate(names)], "test")
+    return parse_classes(
+        [{"id": 1 + row, "name": name, "color": [1 + row, 0, 0]} for row, name in enumerate(names)], "test"
+    )
 
 
 def _copy_mask_file(name: str):
     def build(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(HERE.parent / "segmentation" / "mask_files" / name, folder / Path(name).name)
-        _write(folder, mapping__json=json.dumps({name: "road" for name in ("vehicle", "sky", "person", "roof", "lawn", "thing", "crown")}))
+        _write(
+            folder,
+            mapping__json=json.dumps(
+                {name: "road" for name in ("vehicle", "sky", "person", "roof", "lawn", "thing", "crown")}
+            ),
+        )
 
     return build
 
@@ -262,10 +334,21 @@ def _read_project(folder: Path) -> object:
     from sc3d.importers.project import project_files, read_project
     from sc3d.settings.reconstruction import Import
 
-    path = next((file for file in folder.iterdir() if file.suffix in (".xml",) or file.name.endswith("parameters.txt")), folder)
+    path = next(
+        (
+            file
+            for file in folder.iterdir()
+            if file.suffix in (".xml",) or file.name.endswith("parameters.txt")
+        ),
+        folder,
+    )
     project_files(path, Import())
     project, _ = locate_photos(near_origin(read_project(path, Import()), 32615), None)
-    return guess_observations(project.views[:1], project.points) if project.observations is None else project.observations
+    return (
+        guess_observations(project.views[:1], project.points)
+        if project.observations is None
+        else project.observations
+    )
 
 
 def _build_project(kind: str):
@@ -275,11 +358,23 @@ def _build_project(kind: str):
         views, points = made.fly(), made.probe(20)
         folder.mkdir(parents=True, exist_ok=True)
         if kind == "nerfstudio":
-            shutil.copytree(HERE.parent / "importers" / "files" / "nerfstudio_opencv", folder, dirs_exist_ok=True)
+            shutil.copytree(
+                HERE.parent / "importers" / "files" / "nerfstudio_opencv", folder, dirs_exist_ok=True
+            )
             shutil.rmtree(folder / "colmap", ignore_errors=True)
         elif kind.startswith("opensfm"):
-            tracks = "OPENSFM_TRACKS_VERSION_v2\n" + "".join(f"{view.name}\t{100 + row}\t{row}\t0.01\t-0.02\t0.001\t1\t2\t3\t-1\t-1\n" for view in views for row in range(9))
-            _write(folder, reconstruction__json=json.dumps(made.opensfm_json(views, points, PLACE if kind.endswith("place") else None)), tracks__csv=tracks)
+            tracks = "OPENSFM_TRACKS_VERSION_v2\n" + "".join(
+                f"{view.name}\t{100 + row}\t{row}\t0.01\t-0.02\t0.001\t1\t2\t3\t-1\t-1\n"
+                for view in views
+                for row in range(9)
+            )
+            _write(
+                folder,
+                reconstruction__json=json.dumps(
+                    made.opensfm_json(views, points, PLACE if kind.endswith("place") else None)
+                ),
+                tracks__csv=tracks,
+            )
         elif kind == "metashape":
             reference = 'LOCAL_CS["Local",LOCAL_DATUM["x",0],UNIT["metre",1]]'
             _write(folder, cameras__xml=made.metashape_xml(views, made.metashape_lens(), reference))
@@ -314,16 +409,25 @@ def _build_pcd(form: str):
         import open3d as o3d
 
         folder.mkdir(parents=True, exist_ok=True)
-        cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)))
+        cloud = o3d.t.geometry.PointCloud(
+            o3d.core.Tensor(np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32))
+        )
         cloud.point.colors = o3d.core.Tensor(np.full((30, 3), 9, np.uint8))
-        o3d.t.io.write_point_cloud(str(folder / "cloud.pcd"), cloud, write_ascii=form == "ascii", compressed=form == "compressed")
+        o3d.t.io.write_point_cloud(
+            str(folder / "cloud.pcd"), cloud, write_ascii=form == "ascii", compressed=form == "compressed"
+        )
 
     return build
 
 
 def _build_texts(folder: Path) -> None:
     rows = "\n".join(f"{row}.5 {row % 7} 1.25 10 20 {row}" for row in range(30))
-    _write(folder, a__xyz=rows, b__txt="x,y,z,r,g,b\n" + rows.replace(" ", ","), d__obj="v 0 0 0 0.1 0.2 0.3\nv 1 0 0 0 0 0\nv 0 1 0 1 1 1\nv 1 1 0 1 1 1\nf 1 2 3\nf 1/1 2/2 3/3 -1\n")
+    _write(
+        folder,
+        a__xyz=rows,
+        b__txt="x,y,z,r,g,b\n" + rows.replace(" ", ","),
+        d__obj="v 0 0 0 0.1 0.2 0.3\nv 1 0 0 0 0 0\nv 0 1 0 1 1 1\nv 1 1 0 1 1 1\nf 1 2 3\nf 1/1 2/2 3/3 -1\n",
+    )
 
 
 def _read_control_points(folder: Path) -> object:
@@ -333,21 +437,49 @@ def _read_control_points(folder: Path) -> object:
 
 
 def _one(name: str, content) -> object:
-    return lambda folder: _write(folder, **{name.replace(".", "__"): content() if callable(content) else content})
+    return lambda folder: _write(
+        folder, **{name.replace(".", "__"): content() if callable(content) else content}
+    )
 
 
-GCP = "EPSG:32615\n" + "".join(f"{576000 + 10 * i} {5188000 + 7 * i * i} {200 + i} {100 + i} {90 + i} {photo} gcp{i}\n" for i in range(4) for photo in ("a.jpg", "b.jpg"))
-GEOREFERENCE = json.dumps({"epsg": 32615, "offset": [576000, 5188000, 0], "origin": list(PLACE), "local_from_world": np.eye(4).tolist(), "altitude_offset": 0.5, "figures": {"gps": {"rms": 1}}})
+GCP = "EPSG:32615\n" + "".join(
+    f"{576000 + 10 * i} {5188000 + 7 * i * i} {200 + i} {100 + i} {90 + i} {photo} gcp{i}\n"
+    for i in range(4)
+    for photo in ("a.jpg", "b.jpg")
+)
+GEOREFERENCE = json.dumps(
+    {
+        "epsg": 32615,
+        "offset": [576000, 5188000, 0],
+        "origin": list(PLACE),
+        "local_from_world": np.eye(4).tolist(),
+        "altitude_offset": 0.5,
+        "figures": {"gps": {"rms": 1}},
+    }
+)
 PARTS = ("cameras", "images", "points3D")
-PROJECT_FILES = {"opensfm-place": ("reconstruction.json",), "nerfstudio": ("transforms.json", "sparse_pc.ply"), "opensfm": ("reconstruction.json", "tracks.csv"), "metashape": ("cameras.xml",),
-                 "pix4d": ("x_calibrated_camera_parameters.txt", "x_wkt.prj", "x_offset.xyz")}
+PROJECT_FILES = {
+    "opensfm-place": ("reconstruction.json",),
+    "nerfstudio": ("transforms.json", "sparse_pc.ply"),
+    "opensfm": ("reconstruction.json", "tracks.csv"),
+    "metashape": ("cameras.xml",),
+    "pix4d": ("x_calibrated_camera_parameters.txt", "x_wkt.prj", "x_offset.xyz"),
+}
 
 READERS: dict[str, Reader] = {
-    "colmap-binary": Reader(lambda folder: _build_model(folder, False), _read_model, tuple(f"{name}.bin" for name in (*PARTS, "rigs", "frames"))),
-    "colmap-text": Reader(lambda folder: _build_model(folder, True), _read_model, tuple(f"{name}.txt" for name in PARTS)),
+    "colmap-binary": Reader(
+        lambda folder: _build_model(folder, False),
+        _read_model,
+        tuple(f"{name}.bin" for name in (*PARTS, "rigs", "frames")),
+    ),
+    "colmap-text": Reader(
+        lambda folder: _build_model(folder, True), _read_model, tuple(f"{name}.txt" for name in PARTS)
+    ),
     "ply-cloud": Reader(_one("cloud.ply", labelled_ply), _read_cloud, ("cloud.ply",)),
     "ply-cloud-text": Reader(_one("cloud.ply", lambda: labelled_ply("ascii")), _read_cloud, ("cloud.ply",)),
-    "ply-cloud-big": Reader(_one("cloud.ply", lambda: labelled_ply("binary_big_endian")), _read_cloud, ("cloud.ply",)),
+    "ply-cloud-big": Reader(
+        _one("cloud.ply", lambda: labelled_ply("binary_big_endian")), _read_cloud, ("cloud.ply",)
+    ),
     "ply-mesh": Reader(_one("mesh.ply", lambda: mesh_ply(LITTLE)), _read_mesh, ("mesh.ply",)),
     "ply-mesh-text": Reader(_one("mesh.ply", lambda: mesh_ply("ascii")), _read_mesh, ("mesh.ply",)),
     "labelled": Reader(_one("seeds.ply", labelled_ply), _read_labelled, ("seeds.ply",)),
@@ -356,19 +488,36 @@ READERS: dict[str, Reader] = {
     "photos": Reader(_build_photos, _read_photos, ("a.jpg", "b.jpg", "c.png", "d.tif", "e.tif", "f.tif")),
     "masks": Reader(_build_masks, _read_masks, ("a.png", "b.png")),
     "classes": Reader(_one("classes.json", json.dumps(CLASSES)), _read_classes, ("classes.json",)),
-    "georeference": Reader(_one("georeference.json", GEOREFERENCE), _read_georeference, ("georeference.json",)),
+    "georeference": Reader(
+        _one("georeference.json", GEOREFERENCE), _read_georeference, ("georeference.json",)
+    ),
     "sidecars": Reader(_build_sidecars, _read_sidecars, ("seeds.ply.json", "metrics.json")),
-    "weights": Reader(lambda folder: _write(folder / "model", config__json='{"model_type": "sam2", "architectures": ["A"]}', a__safetensors=b""), _read_weights, ("model/config.json",)),
+    "weights": Reader(
+        lambda folder: _write(
+            folder / "model",
+            config__json='{"model_type": "sam2", "architectures": ["A"]}',
+            a__safetensors=b"",
+        ),
+        _read_weights,
+        ("model/config.json",),
+    ),
     "coco": Reader(_copy_mask_file("coco.json"), _read_mask_files, ("coco.json", "mapping.json")),
-    "coco-compressed": Reader(_copy_mask_file("coco_compressed.json"), _read_mask_files, ("coco_compressed.json",)),
+    "coco-compressed": Reader(
+        _copy_mask_file("coco_compressed.json"), _read_mask_files, ("coco_compressed.json",)
+    ),
     "labelme": Reader(_copy_mask_file("labelme/DJI_0001.json"), _read_mask_files, ("DJI_0001.json",)),
-    "masks-colour": Reader(_build_colored, _read_colored, tuple(f"DJI_000{number}.png" for number in range(1, 4))),
+    "masks-colour": Reader(
+        _build_colored, _read_colored, tuple(f"DJI_000{number}.png" for number in range(1, 4))
+    ),
     "strokes": Reader(_build_strokes, _read_strokes, ("a.json", "b.png")),
     "cvat": Reader(_copy_mask_file("cvat.xml"), _read_mask_files, ("cvat.xml",)),
     **{kind: Reader(_build_project(kind), _read_project, files) for kind, files in PROJECT_FILES.items()},
     "las": Reader(_build_las("las"), _read_geometries, ("cloud.las",)),
     "laz": Reader(_build_las("laz"), _read_geometries, ("cloud.laz",)),
-    **{f"pcd-{form}": Reader(_build_pcd(form), _read_geometries, ("cloud.pcd",)) for form in ("ascii", "binary", "compressed")},
+    **{
+        f"pcd-{form}": Reader(_build_pcd(form), _read_geometries, ("cloud.pcd",))
+        for form in ("ascii", "binary", "compressed")
+    },
     "text-clouds": Reader(_build_texts, _read_geometries, ("a.xyz", "b.txt", "d.obj")),
     "control-points": Reader(_one("gcp_list.txt", GCP), _read_control_points, ("gcp_list.txt",)),
 }

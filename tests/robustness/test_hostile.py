@@ -1,4 +1,6 @@
-"""Broken and malicious scenes: COLMAP models, photos, masks, tables, links; and what must not be in the source: one clear line within a second, little memory."""
+"""Broken and malicious scenes: COLMAP models, photos, masks, tables, links; and what must not be in the
+source: one clear line within a second, little memory.
+"""
 
 from __future__ import annotations
 
@@ -41,10 +43,23 @@ def test_no_pickle_and_every_torch_load_takes_weights_only():
                 given = {keyword.arg: getattr(keyword.value, "value", None) for keyword in node.keywords}
                 if node.func.attr == "load" and getattr(node.func.value, "id", "") == "torch":
                     assert given.get("weights_only") is True, file
-                assert given.get("allow_pickle") is not True and given.get("trust_remote_code") is not True, file
-                assert node.func.attr not in ("from_file", "read_pickle") and (node.func.attr, getattr(node.func.value, "id", "")) not in (("load", "yaml"), ("loads", "marshal")), file
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module] if isinstance(node, ast.ImportFrom) else []
-            assert not {"pickle", "cPickle", "dill", "joblib", "shelve", "marshal"} & {name.split(".")[0] for name in names if name}, file
+                assert given.get("allow_pickle") is not True and given.get("trust_remote_code") is not True, (
+                    file
+                )
+                assert node.func.attr not in ("from_file", "read_pickle") and (
+                    node.func.attr,
+                    getattr(node.func.value, "id", ""),
+                ) not in (("load", "yaml"), ("loads", "marshal")), file
+            names = (
+                [alias.name for alias in node.names]
+                if isinstance(node, ast.Import)
+                else [node.module]
+                if isinstance(node, ast.ImportFrom)
+                else []
+            )
+            assert not {"pickle", "cPickle", "dill", "joblib", "shelve", "marshal"} & {
+                name.split(".")[0] for name in names if name
+            }, file
 
 
 # ---- COLMAP
@@ -88,8 +103,14 @@ def test_every_prefix_of_a_model_is_refused(model, name):
 
 
 def test_values_of_a_model(model):
-    for position, form, value, match in ((16, "<Q", 2**40, "sizes from"), (16, "<Q", 0, "sizes from"), (16, "<Q", 99_999_999, "sizes from"), (32, "<d", np.nan, "finite"), (32, "<d", -5.0, "positive"),
-                                         (12, "<i", 99, "unknown model 99")):
+    for position, form, value, match in (
+        (16, "<Q", 2**40, "sizes from"),
+        (16, "<Q", 0, "sizes from"),
+        (16, "<Q", 99_999_999, "sizes from"),
+        (32, "<d", np.nan, "finite"),
+        (32, "<d", -5.0, "positive"),
+        (12, "<i", 99, "unknown model 99"),
+    ):
         tracked_model().write_binary(str(model))
         patch(model / "cameras.bin", position, form, value)
         refused(match, read_sparse_model, model)
@@ -116,10 +137,14 @@ def test_observations_of_points_that_were_filtered_out(model):
     whole = read_sparse_model(model)
     patch(model / "points3D.bin", 0, "<Q", 0)
     (model / "points3D.bin").write_bytes(bytes(8))
-    assert all(len(track) == 0 for track in read_sparse_model(model).tracks) and max(map(len, whole.tracks)) == 5
+    assert (
+        all(len(track) == 0 for track in read_sparse_model(model).tracks) and max(map(len, whole.tracks)) == 5
+    )
 
 
-@pytest.mark.parametrize("name", ["../a.jpg", "/etc/passwd", "a/../../b.jpg", "..", ".", "a\\b.jpg", "a\nb.jpg", "\x1b[31m.jpg"])
+@pytest.mark.parametrize(
+    "name", ["../a.jpg", "/etc/passwd", "a/../../b.jpg", "..", ".", "a\\b.jpg", "a\nb.jpg", "\x1b[31m.jpg"]
+)
 def test_photo_names_that_lead_out_or_act_on_terminals(tmp_path, name):
     evil = views()
     object.__setattr__(evil[0], "name", name)
@@ -139,8 +164,16 @@ def _chunk(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
 
-def _png(width: int, height: int, depth: int = 8, color: int = 0, extra: bytes = b"", data: bytes = b"\0" * 100) -> bytes:
-    return b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)) + extra + _chunk(b"IDAT", zlib.compress(data)) + _chunk(b"IEND", b"")
+def _png(
+    width: int, height: int, depth: int = 8, color: int = 0, extra: bytes = b"", data: bytes = b"\0" * 100
+) -> bytes:
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0))
+        + extra
+        + _chunk(b"IDAT", zlib.compress(data))
+        + _chunk(b"IEND", b"")
+    )
 
 
 def _jpeg_of_size(width: int, height: int) -> bytes:
@@ -149,7 +182,18 @@ def _jpeg_of_size(width: int, height: int) -> bytes:
     return bytes(content)
 
 
-@pytest.mark.parametrize("content", [_png(60000, 60000), _png(60000, 60000, color=2), _png(13000, 13000), _png(2**31 - 1, 1), _png(100_001, 1), _jpeg_of_size(60000, 60000), _jpeg_of_size(13000, 13000)])
+@pytest.mark.parametrize(
+    "content",
+    [
+        _png(60000, 60000),
+        _png(60000, 60000, color=2),
+        _png(13000, 13000),
+        _png(2**31 - 1, 1),
+        _png(100_001, 1),
+        _jpeg_of_size(60000, 60000),
+        _jpeg_of_size(13000, 13000),
+    ],
+)
 def test_decompression_bombs(tmp_path, content):
     for name in ("a.png", "a.jpg"):
         (tmp_path / name).write_bytes(content)
@@ -159,14 +203,22 @@ def test_decompression_bombs(tmp_path, content):
 
 def test_bombs_in_the_details_of_a_png(tmp_path):
     packed = zlib.compress(bytes(200 << 20))
-    for extra in (_chunk(b"zTXt", b"a\0\0" + packed), _chunk(b"iCCP", b"a\0\0" + packed), _chunk(b"iTXt", b"a\0\1\0\0\0" + packed)):
+    for extra in (
+        _chunk(b"zTXt", b"a\0\0" + packed),
+        _chunk(b"iCCP", b"a\0\0" + packed),
+        _chunk(b"iTXt", b"a\0\1\0\0\0" + packed),
+    ):
         (tmp_path / "a.png").write_bytes(_png(4, 4, extra=extra, data=bytes(20)))
         refused("cannot read the mask", read_index_image, tmp_path / "a.png")
 
 
 def test_every_prefix_of_a_photo_is_refused(tmp_path):
     """Decoders fill what is missing of a JPEG with grey and say nothing."""
-    for name, content in (("a.jpg", picture("JPEG")), ("b.jpg", picture("JPEG", progressive=True)), ("c.png", picture("PNG"))):
+    for name, content in (
+        ("a.jpg", picture("JPEG")),
+        ("b.jpg", picture("JPEG", progressive=True)),
+        ("c.png", picture("PNG")),
+    ):
         read_image_bytes(tmp_path / name, content)
         for length in range(0, len(content) - (12 if name == "c.png" else 1), 7):
             (tmp_path / name).write_bytes(content[:length])
@@ -182,7 +234,17 @@ def read_image_bytes(path: Path, content: bytes) -> None:
     assert read_image(path).shape == (30, 40, 3)
 
 
-@pytest.mark.parametrize("content", [b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\nshowpage\n", b"P6 2 2 255\n" + bytes(12), b"GIF89a" + bytes(30), b"BM" + bytes(60), b"", b"\0" * 99])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\nshowpage\n",
+        b"P6 2 2 255\n" + bytes(12),
+        b"GIF89a" + bytes(30),
+        b"BM" + bytes(60),
+        b"",
+        b"\0" * 99,
+    ],
+)
 def test_other_formats_are_not_opened(tmp_path, content):
     (tmp_path / "a.png").write_bytes(content)
     for read in (image_size, read_image, read_index_image):
@@ -197,7 +259,10 @@ def test_masks_of_sixteen_bits_and_of_an_absurd_size(tmp_path):
 
 
 def test_multi_picture_jpegs_of_drones_are_read(tmp_path):
-    first, second = Image.fromarray(np.zeros((30, 40, 3), np.uint8)), Image.fromarray(np.ones((15, 20, 3), np.uint8))
+    first, second = (
+        Image.fromarray(np.zeros((30, 40, 3), np.uint8)),
+        Image.fromarray(np.ones((15, 20, 3), np.uint8)),
+    )
     first.save(tmp_path / "a.jpg", "MPO", save_all=True, append_images=[second])
     assert image_size(tmp_path / "a.jpg") == (40, 30) and read_image(tmp_path / "a.jpg").shape == (30, 40, 3)
 
@@ -227,7 +292,9 @@ def test_class_names_cannot_lead_exports_out_of_the_scene(tmp_path):
     from sc3d.exporters.clouds import file_name
 
     for name in ("../../evil", "/etc/passwd", "..", "a/b", "C:\\x", "con", "\u202egpj"):
-        assert "/" not in file_name(name) and "\\" not in file_name(name) and not file_name(name).startswith(".")
+        assert (
+            "/" not in file_name(name) and "\\" not in file_name(name) and not file_name(name).startswith(".")
+        )
 
 
 def test_links_out_of_a_folder(tmp_path):
@@ -248,7 +315,9 @@ def test_links_out_of_a_folder(tmp_path):
 
 @pytest.mark.parametrize("place", ["masks/photo_0.png", "seeds.ply"])
 def test_scene_whose_files_are_links(tmp_path, capsys, place):
-    """A mask that is a link out of the scene is not read; an output that is one is replaced, not what it leads to."""
+    """A mask that is a link out of the scene is not read; an output that is one is replaced, not what it
+    leads to.
+    """
     scene, outside = write_bare_scene(tmp_path / "scene"), tmp_path / "outside"
     outside.write_bytes((scene / "masks" / "photo_0.png").read_bytes())
     (scene / place).unlink(missing_ok=True)
@@ -264,8 +333,14 @@ def test_scene_whose_files_are_links(tmp_path, capsys, place):
     assert outside.read_bytes() == before
 
 
-@pytest.mark.parametrize(("link", "arguments"), [("export", ["export", "SCENE", "--format", "masks", "--labelled", "SCENE/seeds.ply"]), ("sparse", ["georeference", "SCENE", "--epsg", "32615", "--offset", "1", "2", "3"]),
-                                                 ("masks", ["synthesize", "SCENE", "--views", "2", "--width", "64"])])
+@pytest.mark.parametrize(
+    ("link", "arguments"),
+    [
+        ("export", ["export", "SCENE", "--format", "masks", "--labelled", "SCENE/seeds.ply"]),
+        ("sparse", ["georeference", "SCENE", "--epsg", "32615", "--offset", "1", "2", "3"]),
+        ("masks", ["synthesize", "SCENE", "--views", "2", "--width", "64"]),
+    ],
+)
 def test_folders_that_lead_out_of_the_scene_are_not_written(tmp_path, capsys, link, arguments):
     scene, outside = write_bare_scene(tmp_path / "scene"), tmp_path / "outside"
     if (scene / link).exists():

@@ -1,4 +1,6 @@
-"""Runs that are killed, interrupted or out of disk space: nothing half-written passes for finished, earlier outputs stay, the next run gives the same bytes."""
+"""Runs that are killed, interrupted or out of disk space: nothing half-written passes for finished, earlier
+outputs stay, the next run gives the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,11 @@ LABELS = (["label"], ["propagate", "--method", "knn"])
 
 
 def contents(scene: Path) -> dict[str, str]:
-    return {str(file.relative_to(scene)): hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(scene.rglob("*")) if file.is_file()}
+    return {
+        str(file.relative_to(scene)): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in sorted(scene.rglob("*"))
+        if file.is_file()
+    }
 
 
 def hidden(scene: Path) -> list[Path]:
@@ -36,7 +42,9 @@ def results(scene: Path) -> dict[str, str]:
 
 
 def label_and_propagate(scene: Path, kill_at: int = -1) -> None:
-    """Both stages in this process, which kills itself at the write `kill_at`: even numbers before its renaming, odd ones behind it."""
+    """Both stages in this process, which kills itself at the write `kill_at`: even numbers before its
+    renaming, odd ones behind it.
+    """
     replace, count = files._replace, iter(range(0, 1000, 2))
 
     def deadly(temporary: Path, path: Path) -> None:
@@ -54,9 +62,13 @@ def label_and_propagate(scene: Path, kill_at: int = -1) -> None:
 
 @pytest.fixture(scope="module")
 def processes():
-    """Children of a process that has loaded everything and computed nothing, so that they start quickly and may use threads."""
+    """Children of a process that has loaded everything and computed nothing, so that they start quickly and
+    may use threads.
+    """
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.robustness.test_interrupted", "sc3d.stages.label", "sc3d.stages.propagate"])
+    context.set_forkserver_preload(
+        ["tests.robustness.test_interrupted", "sc3d.stages.label", "sc3d.stages.propagate"]
+    )
 
     def run(scene: Path, kill_at: int = -1, seconds: float | None = None) -> int:
         child = context.Process(target=label_and_propagate, args=(scene, kill_at))
@@ -87,7 +99,9 @@ def finished(bare, processes) -> Path:
 SLOW = pytest.mark.slow
 
 
-@pytest.mark.parametrize("kill_at", [0, 1, 3, 6, 9, *(pytest.param(number, marks=SLOW) for number in (2, 4, 5, 7, 8, 10, 11))])
+@pytest.mark.parametrize(
+    "kill_at", [0, 1, 3, 6, 9, *(pytest.param(number, marks=SLOW) for number in (2, 4, 5, 7, 8, 10, 11))]
+)
 def test_killed_before_and_behind_every_write(bare, finished, processes, tmp_path, kill_at):
     scene = tmp_path / "scene"
     shutil.copytree(bare, scene)
@@ -124,7 +138,18 @@ def test_killed_at_any_moment(bare, finished, processes, tmp_path):
 @pytest.mark.slow
 def test_fifty_kills_of_a_whole_run(tmp_path):
     """Half an hour on two cores: `kill_run.py` does the same by hand and goes on where it was stopped."""
-    subprocess.run([sys.executable, Path(__file__).parent / "kill_run.py", tmp_path, "--kills", "50", "--minutes", "600"], check=True)
+    subprocess.run(
+        [
+            sys.executable,
+            Path(__file__).parent / "kill_run.py",
+            tmp_path,
+            "--kills",
+            "50",
+            "--minutes",
+            "600",
+        ],
+        check=True,
+    )
     rows = [json.loads(line) for line in (tmp_path / "kills.jsonl").read_text().splitlines()]
     assert len(rows) == 50 and all(row["rerun"] == 0 and row["same"] and not row["hidden"] for row in rows)
 
@@ -139,7 +164,8 @@ def test_ctrl_c_is_one_clear_line(finished, tmp_path, monkeypatch, capsys):
     shutil.copytree(finished, scene)
     before = contents(scene)
     monkeypatch.setattr(label, "fuse", lambda *_: signal.raise_signal(signal.SIGINT))
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts background jobs deaf to Ctrl-C
+    # a shell starts background jobs deaf to Ctrl-C
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(SystemExit) as stopped:
             main(["label", str(scene), "--overwrite"])
@@ -159,7 +185,9 @@ def small_disk(tmp_path):
     """A file system of 8 MiB of its own, and a function that leaves so many bytes of it free."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", disk], capture_output=True).returncode:
+    if subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", disk], capture_output=True
+    ).returncode:
         pytest.skip("mounting a file system needs root")
 
     def fill(free: int) -> None:
@@ -171,8 +199,16 @@ def small_disk(tmp_path):
 
 
 @pytest.mark.parametrize("free", [0, 100_000])
-@pytest.mark.parametrize("arguments", [["label", "SCENE", "--overwrite"], ["propagate", "SCENE", "--method", "knn", "--overwrite"], ["evaluate", "SCENE", "--truth", "SCENE/truth"],
-                                       *(["export", "SCENE", "--format", form] for form in ("masks", "clouds", "colmap-text"))], ids=" ".join)
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["label", "SCENE", "--overwrite"],
+        ["propagate", "SCENE", "--method", "knn", "--overwrite"],
+        ["evaluate", "SCENE", "--truth", "SCENE/truth"],
+        *(["export", "SCENE", "--format", form] for form in ("masks", "clouds", "colmap-text")),
+    ],
+    ids=" ".join,
+)
 def test_full_disk_is_said_and_earlier_outputs_stay(finished, small_disk, capsys, arguments, free):
     disk, fill = small_disk
     scene = disk / "scene"
@@ -205,8 +241,12 @@ def test_full_disk_in_other_words(small_disk):
 
 def test_content_is_on_the_disk_before_it_gets_its_name(tmp_path, monkeypatch):
     done, fsync, replace = [], os.fsync, os.replace
-    monkeypatch.setattr(os, "fsync", lambda handle: (done.append(os.readlink(f"/proc/self/fd/{handle}")), fsync(handle)))
-    monkeypatch.setattr(os, "replace", lambda source, target: (done.append("replace"), replace(source, target)))
+    monkeypatch.setattr(
+        os, "fsync", lambda handle: (done.append(os.readlink(f"/proc/self/fd/{handle}")), fsync(handle))
+    )
+    monkeypatch.setattr(
+        os, "replace", lambda source, target: (done.append("replace"), replace(source, target))
+    )
     with atomic_path(tmp_path / "a.txt") as temporary:
         temporary.write_text("a")
     assert done == [str(temporary), "replace", str(tmp_path)]
@@ -214,7 +254,9 @@ def test_content_is_on_the_disk_before_it_gets_its_name(tmp_path, monkeypatch):
     with atomic_path(tmp_path / "folder") as temporary:
         (temporary / "inner").mkdir(parents=True)
         (temporary / "inner" / "b.txt").write_text("b")
-    assert {str(temporary / "inner" / "b.txt"), str(temporary / "inner"), str(temporary)} == set(done[:-2]) and done[-2:] == ["replace", str(tmp_path)]
+    assert {str(temporary / "inner" / "b.txt"), str(temporary / "inner"), str(temporary)} == set(
+        done[:-2]
+    ) and done[-2:] == ["replace", str(tmp_path)]
 
 
 def test_leftovers_of_a_process_of_the_same_number(tmp_path):

@@ -1,6 +1,8 @@
-"""Masks made elsewhere: files of each format's own library, brute-force twins, one-line errors, hostile files, the whole stage.
+"""Masks made elsewhere: files of each format's own library, brute-force twins, one-line errors, hostile
+files, the whole stage.
 
-tests/mask_files holds what LabelMe, Datumaro, CVAT's SDK and pycocotools wrote, and what they draw from it (make.py there).
+tests/mask_files holds what LabelMe, Datumaro, CVAT's SDK and pycocotools wrote, and what they draw from it
+(make.py there).
 """
 
 from __future__ import annotations
@@ -49,7 +51,9 @@ TABLE = parse_classes(
 )
 
 
-def _import(tmp_path: Path, path: Path, format: str = "auto", mapping: object = None, photos: dict = PHOTOS) -> dict[str, np.ndarray]:
+def _import(
+    tmp_path: Path, path: Path, format: str = "auto", mapping: object = None, photos: dict = PHOTOS
+) -> dict[str, np.ndarray]:
     """Masks in the scene by photo stem."""
     file = None
     if mapping is not None:
@@ -73,7 +77,14 @@ def _near_edges(labels: np.ndarray) -> np.ndarray:
     """Pixels with another label among their eight neighbours."""
     padded = np.pad(labels, 1, mode="edge")
     height, width = labels.shape
-    return np.any([padded[1 + row : 1 + row + height, 1 + column : 1 + column + width] != labels for row in (-1, 0, 1) for column in (-1, 0, 1)], axis=0)
+    return np.any(
+        [
+            padded[1 + row : 1 + row + height, 1 + column : 1 + column + width] != labels
+            for row in (-1, 0, 1)
+            for column in (-1, 0, 1)
+        ],
+        axis=0,
+    )
 
 
 # ---- files of the formats' own libraries
@@ -81,10 +92,17 @@ def _near_edges(labels: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("source", "format", "exact"),
-    [("labelme", "labelme", 0.97), ("coco.json", "coco", 0.995), ("coco_compressed.json", "coco", 1), ("cvat.xml", "cvat", 0.98)],
+    [
+        ("labelme", "labelme", 0.97),
+        ("coco.json", "coco", 0.995),
+        ("coco_compressed.json", "coco", 1),
+        ("cvat.xml", "cvat", 0.98),
+    ],
 )
 def test_files_of_reference_libraries(tmp_path, source, format, exact):
-    """The same labels as the library draws, but for pixels on outlines, where libraries differ; run-length codes to the pixel."""
+    """The same labels as the library draws, but for pixels on outlines, where libraries differ; run-length
+    codes to the pixel.
+    """
     masks = _import(tmp_path, FILES / source)
     assert detect(FILES / source) == format and masks.keys() == {"DJI_0001", "DJI_0002"}
     for name, labels in masks.items():
@@ -117,11 +135,15 @@ def test_pycocotools_agrees():
             mask = random.random((height, width)) < density
             code = coco_masks.encode(np.asfortranarray(mask.astype(np.uint8)))
             counts = decompress(code["counts"].decode())
-            np.testing.assert_array_equal(_image(runs(counts, (0, 0, width, height), True, (width, height)), (width, height)), mask)
+            np.testing.assert_array_equal(
+                _image(runs(counts, (0, 0, width, height), True, (width, height)), (width, height)), mask
+            )
     for _ in range(50):  # polygons: the same up to the pixels on the outline
         ring = random.uniform(-5, 80, (int(random.integers(3, 8)), 2))
         ring[0] = random.uniform(5, 55, 2)
-        expected = coco_masks.decode(coco_masks.frPyObjects([ring.ravel().tolist()], 60, 70))[..., 0].astype(bool)
+        expected = coco_masks.decode(coco_masks.frPyObjects([ring.ravel().tolist()], 60, 70))[..., 0].astype(
+            bool
+        )
         drawn = _image(polygons([ring], (70, 60)), (70, 60))
         assert ((drawn == expected) | _near_edges(expected) | _near_edges(drawn)).all()
 
@@ -152,7 +174,8 @@ def test_polygons_equal_brute_force(monkeypatch):
     random, size = np.random.default_rng(1), (13, 9)
     for index in range(60):
         ring = random.uniform(-6, 17, (int(random.integers(3, 9)), 2))
-        ring = ring.round() if index % 3 == 1 else ring.round() + 0.5 if index % 3 == 2 else ring  # corners on pixels' corners and centres
+        # corners on pixels' corners and centres
+        ring = ring.round() if index % 3 == 1 else ring.round() + 0.5 if index % 3 == 2 else ring
         try:
             outline = polygons([ring], size)
         except OutlineError:
@@ -168,7 +191,10 @@ def test_polygons_that_share_edges_cover_every_pixel_once():
     for points in (random.uniform(0, 1, (60, 2)) * size, (random.uniform(0, 1, (60, 2)) * 29).round() + 0.5):
         points = np.concatenate([corners, points])
         triangles = Delaunay(points).simplices
-        count = sum(_image(polygons([points[triangle][:: 1 - 2 * (index % 2)]], size), size).astype(int) for index, triangle in enumerate(triangles))
+        count = sum(
+            _image(polygons([points[triangle][:: 1 - 2 * (index % 2)]], size), size).astype(int)
+            for index, triangle in enumerate(triangles)
+        )
         assert (count == 1).all()
 
 
@@ -176,14 +202,17 @@ def test_rings_of_one_region_are_united():
     size = (20, 10)
     square = [[2, 2], [10, 2], [10, 8], [2, 8]]
     assert _image(polygons([square, square], size), size).sum() == 48
-    assert _image(polygons([np.ravel(square), [8, 0, 15, 0, 15, 10, 8, 10]], size), size).sum() == 48 + 70 - 12
+    assert (
+        _image(polygons([np.ravel(square), [8, 0, 15, 0, 15, 10, 8, 10]], size), size).sum() == 48 + 70 - 12
+    )
 
 
 def test_turned_rectangles_and_ellipses_are_analytic():
     size = (80, 60)
     x, y = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
     for degrees in (0.0, 25.0, 90.0, 330.0):
-        # The same vector as seen by the shape: turned back, with y down, so that positive degrees are clockwise as seen
+        # The same vector as seen by the shape: turned back, with y down, so that positive degrees are
+        # clockwise as seen
         cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         u, v = cos * (x - 41.3) + sin * (y - 28.7), -sin * (x - 41.3) + cos * (y - 28.7)
         box = _image(rectangle([21.3, 20.7], [61.3, 36.7], degrees, size), size)
@@ -196,24 +225,46 @@ def test_turned_rectangles_and_ellipses_are_analytic():
 def test_runs_in_boxes_by_row_and_by_column():
     random = np.random.default_rng(3)
     for _ in range(30):
-        box = (int(random.integers(0, 9)), int(random.integers(0, 9)), int(random.integers(1, 12)), int(random.integers(1, 12)))
+        box = (
+            int(random.integers(0, 9)),
+            int(random.integers(0, 9)),
+            int(random.integers(1, 12)),
+            int(random.integers(1, 12)),
+        )
         mask = random.random((box[3], box[2])) < random.choice([0, 0.1, 0.9, 1])
         expected = np.zeros((21, 22), bool)
         expected[box[1] : box[1] + box[3], box[0] : box[0] + box[2]] = mask
-        for counts, by_column in ((encode(mask), False), (encode(mask.T), True), ([0, 0, *encode(mask)], False)):
+        for counts, by_column in (
+            (encode(mask), False),
+            (encode(mask.T), True),
+            ([0, 0, *encode(mask)], False),
+        ):
             np.testing.assert_array_equal(_image(runs(counts, box, by_column, (22, 21)), (22, 21)), expected)
-    patch = draw(runs(encode(np.eye(1000, dtype=bool)[:, 300:310]), (5, 0, 10, 1000), False, (1000, 1000)), (1000, 1000))
+    patch = draw(
+        runs(encode(np.eye(1000, dtype=bool)[:, 300:310]), (5, 0, 10, 1000), False, (1000, 1000)),
+        (1000, 1000),
+    )
     assert patch.mask.shape == (10, 10) and patch.top == 300  # only the lines that hold pixels
 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("counts", "box"),
-    [([1, 2, 3], (0, 0, 3, 3)), ([-1, 10], (0, 0, 3, 3)), ([1.5, 7.5], (0, 0, 3, 3)), ([10**15, 9], (0, 0, 3, 3)), ([1e308] * 3, (0, 0, 3, 3)),
-     ([10**400], (0, 0, 3, 3)),
-     (["a"], (0, 0, 3, 3)),
-     ([], (0, 0, 3, 3)), ([9], (8, 8, 3, 3)), ([9], (-1, 0, 3, 3)), ([0], (0, 0, 0, 3)),
-     ([float("nan"), 9], (0, 0, 3, 3)), ([[9], [0, 0]], (0, 0, 3, 3))],
+    [
+        ([1, 2, 3], (0, 0, 3, 3)),
+        ([-1, 10], (0, 0, 3, 3)),
+        ([1.5, 7.5], (0, 0, 3, 3)),
+        ([10**15, 9], (0, 0, 3, 3)),
+        ([1e308] * 3, (0, 0, 3, 3)),
+        ([10**400], (0, 0, 3, 3)),
+        (["a"], (0, 0, 3, 3)),
+        ([], (0, 0, 3, 3)),
+        ([9], (8, 8, 3, 3)),
+        ([9], (-1, 0, 3, 3)),
+        ([0], (0, 0, 0, 3)),
+        ([float("nan"), 9], (0, 0, 3, 3)),
+        ([[9], [0, 0]], (0, 0, 3, 3)),
+    ],
 )
 def test_runs_that_do_not_fit_are_refused(counts, box):
     with pytest.raises(OutlineError):
@@ -229,13 +280,23 @@ def test_damaged_compressed_codes_are_refused(text):
 # ---- overlaps
 
 
-def _coco(*annotations: tuple, categories: tuple[str, ...] = ("building", "road", "tree"), **image: object) -> dict:
+def _coco(
+    *annotations: tuple, categories: tuple[str, ...] = ("building", "road", "tree"), **image: object
+) -> dict:
     """A COCO file of one photo; annotations: (category name, segmentation)."""
     return {
         "images": [{"id": 5, "file_name": "a\\b\\DJI_0001.JPG", "width": 96, "height": 72} | image],
         "categories": [{"id": 10 + index, "name": name} for index, name in enumerate(categories)],
-        "annotations": [{"id": index, "image_id": 5, "category_id": 10 + categories.index(name), "segmentation": segmentation, "iscrowd": 0}
-                        for index, (name, segmentation) in enumerate(annotations)],
+        "annotations": [
+            {
+                "id": index,
+                "image_id": 5,
+                "category_id": 10 + categories.index(name),
+                "segmentation": segmentation,
+                "iscrowd": 0,
+            }
+            for index, (name, segmentation) in enumerate(annotations)
+        ],
     }
 
 
@@ -250,7 +311,12 @@ def _square(left: float, top: float, side: float) -> list[list[float]]:
 
 
 def test_coco_smaller_regions_win_in_any_order(tmp_path):
-    annotations = [("road", _square(10, 10, 40)), ("building", _square(20, 20, 10)), ("tree", _square(25, 25, 40)), ("road", _square(25, 25, 10))]
+    annotations = [
+        ("road", _square(10, 10, 40)),
+        ("building", _square(20, 20, 10)),
+        ("tree", _square(25, 25, 40)),
+        ("road", _square(25, 25, 10)),
+    ]
     random = np.random.default_rng(0)
     for _ in range(4):
         order = [annotations[index] for index in random.permutation(4)]
@@ -261,11 +327,22 @@ def test_coco_smaller_regions_win_in_any_order(tmp_path):
 
 
 def _labelme(*shapes: dict, **fields: object) -> dict:
-    return {"version": "5.5.0", "shapes": list(shapes), "imagePath": "DJI_0001.JPG", "imageWidth": 96, "imageHeight": 72, "imageData": None} | fields
+    return {
+        "version": "5.5.0",
+        "shapes": list(shapes),
+        "imagePath": "DJI_0001.JPG",
+        "imageWidth": 96,
+        "imageHeight": 72,
+        "imageData": None,
+    } | fields
 
 
 def _polygon(label: str, left: float, top: float, side: float, **fields: object) -> dict:
-    return {"label": label, "points": np.reshape(_square(left, top, side), (4, 2)).tolist(), "shape_type": "polygon"} | fields
+    return {
+        "label": label,
+        "points": np.reshape(_square(left, top, side), (4, 2)).tolist(),
+        "shape_type": "polygon",
+    } | fields
 
 
 def test_labelme_later_shapes_win(tmp_path):
@@ -294,16 +371,29 @@ def test_cvat_z_order_wins_then_the_later(tmp_path):
 
 
 def test_names_and_mapping(tmp_path):
-    file = _write(tmp_path / "coco.json", _coco(("Wall", _square(0, 0, 10)), ("ROAD", _square(20, 0, 10)), ("sky", _square(40, 0, 10)),
-                                                 categories=("Wall", "ROAD", "sky")))
+    file = _write(
+        tmp_path / "coco.json",
+        _coco(
+            ("Wall", _square(0, 0, 10)),
+            ("ROAD", _square(20, 0, 10)),
+            ("sky", _square(40, 0, 10)),
+            categories=("Wall", "ROAD", "sky"),
+        ),
+    )
     _refused(tmp_path, file, "unknown classes: 'Wall', 'sky'; known are building, road, tree", "--mapping")
-    for mapping in ({"Wall": "building", "sky": None}, {"10": 1, "12": "ignore"}, {" Wall": "Building", "sky": 0, "never": "tree"}):
+    for mapping in (
+        {"Wall": "building", "sky": None},
+        {"10": 1, "12": "ignore"},
+        {" Wall": "Building", "sky": 0, "never": "tree"},
+    ):
         labels = _import(tmp_path, file, mapping=mapping)["DJI_0001"]
         assert (labels[5, 5], labels[5, 25], labels[5, 45]) == (1, 2, 0)
 
 
 def test_unlabelled_regions_hide_what_lies_below(tmp_path):
-    file = _write(tmp_path / "x" / "DJI_0001.json", _labelme(_polygon("tree", 0, 0, 40), _polygon("hole", 10, 10, 10)))
+    file = _write(
+        tmp_path / "x" / "DJI_0001.json", _labelme(_polygon("tree", 0, 0, 40), _polygon("hole", 10, 10, 10))
+    )
     assert (_import(tmp_path, file, mapping={"hole": None})["DJI_0001"] == 3).sum() == 1600 - 100
 
 
@@ -315,25 +405,41 @@ def test_mappings_are_checked(tmp_path, mapping):
 def test_annotations_of_another_resolution_keep_it(tmp_path):
     for scale in (0.5, 1, 3):
         size = {"imageWidth": int(96 * scale), "imageHeight": int(72 * scale)}
-        labels = _import(tmp_path, _write(tmp_path / "l" / "a.json", _labelme(_polygon("tree", 0, 0, 20 * scale), **size)))["DJI_0001"]
+        labels = _import(
+            tmp_path, _write(tmp_path / "l" / "a.json", _labelme(_polygon("tree", 0, 0, 20 * scale), **size))
+        )["DJI_0001"]
         assert labels.shape == (72 * scale, 96 * scale) and (labels == 3).sum() == 400 * scale**2
-    labels = _import(tmp_path, _write(tmp_path / "l" / "a.json", _labelme(_polygon("tree", 0, 0, 20), imageWidth=None)))["DJI_0001"]
+    labels = _import(
+        tmp_path, _write(tmp_path / "l" / "a.json", _labelme(_polygon("tree", 0, 0, 20), imageWidth=None))
+    )["DJI_0001"]
     assert labels.shape == (72, 96)
 
 
 def test_labelme_finds_the_photo_by_either_name(tmp_path):
     shape = _polygon("tree", 0, 0, 20)
-    for file, path in (("DJI_0001", "C:\\flight\\renamed.JPG"), ("anything", "../DJI_0001.JPG"), ("DJI_0001", None), ("DJI_0001", "DJI_0001.tif")):
+    for file, path in (
+        ("DJI_0001", "C:\\flight\\renamed.JPG"),
+        ("anything", "../DJI_0001.JPG"),
+        ("DJI_0001", None),
+        ("DJI_0001", "DJI_0001.tif"),
+    ):
         source = _write(tmp_path / file / f"{file}.json", _labelme(shape, imagePath=path))
         assert _import(tmp_path, source.parent).keys() == {"DJI_0001"}
     (tmp_path / "scene" / "masks" / "DJI_0001.png").unlink()
     (tmp_path / "scene" / "masks").rmdir()
     (tmp_path / "scene").rmdir()
-    _refused(tmp_path, _write(tmp_path / "b" / "DJI_0002.json", _labelme(shape)), "says that it belongs to another: DJI_0001.JPG or more/DJI_0002.JPG")
+    _refused(
+        tmp_path,
+        _write(tmp_path / "b" / "DJI_0002.json", _labelme(shape)),
+        "says that it belongs to another: DJI_0001.JPG or more/DJI_0002.JPG",
+    )
 
 
 def test_annotations_without_area_are_skipped_and_told(tmp_path, caplog):
-    line, point = ({"label": "nonsense", "points": [[1, 1], [5, 5]], "shape_type": kind} for kind in ("linestrip", "point"))
+    line, point = (
+        {"label": "nonsense", "points": [[1, 1], [5, 5]], "shape_type": kind}
+        for kind in ("linestrip", "point")
+    )
     file = _write(tmp_path / "l" / "a.json", _labelme(line, _polygon("tree", 0, 0, 9), point, line))
     assert (_import(tmp_path, file)["DJI_0001"] == 3).sum() == 81
     assert "skipped: linestrip (2), point (1)" in caplog.text
@@ -353,7 +459,10 @@ def test_colors(tmp_path):
     (tmp_path / "other").mkdir()
     alpha = np.where(labels == 3, 0, 255).astype(np.uint8)
     Image.fromarray(np.dstack([picture, alpha])).save(tmp_path / "other" / "DJI_0001.png")
-    np.testing.assert_array_equal(_import(tmp_path, tmp_path / "other")["DJI_0001"], np.where(labels == 3, 0, labels))  # transparent: unlabelled
+    # transparent: unlabelled
+    np.testing.assert_array_equal(
+        _import(tmp_path, tmp_path / "other")["DJI_0001"], np.where(labels == 3, 0, labels)
+    )
     indexed = Image.fromarray(labels * 7)  # a palette whose colours, not ids, are those of the table
     indexed.putpalette(np.repeat(palette[:4], 7, axis=0).ravel().tolist())
     indexed.save(tmp_path / "other" / "DJI_0001.png")
@@ -371,7 +480,12 @@ def test_colors_are_not_guessed(tmp_path):
     write_image(tmp_path / "rgb" / "DJI_0001.png", picture)
     write_image(tmp_path / "rgb" / "DJI_0002.png", picture)
     _refused(tmp_path, tmp_path / "rgb", "#010203", "4 px", "column 50, row 11", "(2 times)", "not guessed")
-    for mapping in ({"red": "tree"}, {"#12345": "tree"}, {"[1,2,300]": "tree"}, {"#010203": "tree", "1,2,3": "road"}):
+    for mapping in (
+        {"red": "tree"},
+        {"#12345": "tree"},
+        {"[1,2,300]": "tree"},
+        {"#010203": "tree", "1,2,3": "road"},
+    ):
         _refused(tmp_path, tmp_path / "rgb", "colour", mapping=mapping)
 
 
@@ -400,7 +514,9 @@ def test_masks_in_place_are_not_converted(tmp_path):
     before = (masks / "DJI_0001.png").read_bytes()
     assert import_masks(MaskFiles(masks), masks, PHOTOS, TABLE) == ["DJI_0001.JPG"]
     with pytest.raises(InputError, match="own folder"):
-        import_masks(MaskFiles(masks, "index", _write(tmp_path / "m.json", {"1": "tree"})), masks, PHOTOS, TABLE)
+        import_masks(
+            MaskFiles(masks, "index", _write(tmp_path / "m.json", {"1": "tree"})), masks, PHOTOS, TABLE
+        )
     assert (masks / "DJI_0001.png").read_bytes() == before
     write_image(masks / "DJI_0001.png", np.zeros((72, 96, 3), np.uint8))
     with pytest.raises(InputError, match="has colours"):
@@ -413,7 +529,12 @@ def test_masks_in_place_are_not_converted(tmp_path):
 def test_all_mismatches_come_in_one_line(tmp_path):
     folder = tmp_path / "l"
     good = _polygon("tree", 0, 0, 20)
-    bad = [_polygon("wall", 0, 0, 5), _polygon("sky", 0, 0, 5), _polygon("tree", 200, 0, 20), _polygon("road", 0, 300, 20)]
+    bad = [
+        _polygon("wall", 0, 0, 5),
+        _polygon("sky", 0, 0, 5),
+        _polygon("tree", 200, 0, 20),
+        _polygon("road", 0, 300, 20),
+    ]
     _write(folder / "DJI_0001.json", _labelme(good, *bad))
     _write(folder / "DJI_0002.json", _labelme(good, imagePath="DJI_0002.JPG", imageWidth=72, imageHeight=96))
     for name in ("DJI_0003", "DJI_0004", "DJI_0005"):
@@ -421,9 +542,14 @@ def test_all_mismatches_come_in_one_line(tmp_path):
     _write(folder / "empty.json", "")
     _write(folder / "other.json", {"version": 3})
     message = _refused(
-        tmp_path, folder, "unknown classes: 'wall', 'sky'; known are building, road, tree", "DJI_0002.json is 72x96, but its photo is 96x72",
-        "belongs to no photo: 2 photos are known, such as DJI_0001.JPG (3 times)", "lies outside of the image (2 times)",
-        "empty.json is not valid JSON", "(2 times)",
+        tmp_path,
+        folder,
+        "unknown classes: 'wall', 'sky'; known are building, road, tree",
+        "DJI_0002.json is 72x96, but its photo is 96x72",
+        "belongs to no photo: 2 photos are known, such as DJI_0001.JPG (3 times)",
+        "lies outside of the image (2 times)",
+        "empty.json is not valid JSON",
+        "(2 times)",
     )
     assert len(message) < 1500
 
@@ -481,10 +607,42 @@ def _png(mask: np.ndarray) -> str:
         ({"label": "tree", "shape_type": "circle", "points": [[1, 2]]}, "not complete"),
         ({"label": "tree", "shape_type": "mask", "points": [[1, 2], [5, 6]], "mask": None}, "not complete"),
         ({"label": "tree", "shape_type": "mask", "points": [[1, 2], [5, 6]], "mask": "!"}, "damaged picture"),
-        ({"label": "tree", "shape_type": "mask", "points": [[1, 2], [5, 6]], "mask": _png(np.ones((5, 5)))[:60]}, "damaged picture"),
-        ({"label": "tree", "shape_type": "mask", "points": [[1, 2], [5, 6]], "mask": _png(np.ones((2000, 2000)))}, "another size"),
-        ({"label": "tree", "shape_type": "mask", "points": [[1, 2], [1e300, 6]], "mask": _png(np.ones((5, 5)))}, "lies outside"),
-        ({"label": "tree", "shape_type": "mask", "points": [[91, 2], [96, 6]], "mask": _png(np.ones((5, 6)))}, "lies outside"),
+        (
+            {
+                "label": "tree",
+                "shape_type": "mask",
+                "points": [[1, 2], [5, 6]],
+                "mask": _png(np.ones((5, 5)))[:60],
+            },
+            "damaged picture",
+        ),
+        (
+            {
+                "label": "tree",
+                "shape_type": "mask",
+                "points": [[1, 2], [5, 6]],
+                "mask": _png(np.ones((2000, 2000))),
+            },
+            "another size",
+        ),
+        (
+            {
+                "label": "tree",
+                "shape_type": "mask",
+                "points": [[1, 2], [1e300, 6]],
+                "mask": _png(np.ones((5, 5))),
+            },
+            "lies outside",
+        ),
+        (
+            {
+                "label": "tree",
+                "shape_type": "mask",
+                "points": [[91, 2], [96, 6]],
+                "mask": _png(np.ones((5, 6))),
+            },
+            "lies outside",
+        ),
         ({"shape_type": "polygon", "points": [[1, 2], [5, 6], [7, 7]]}, "unknown classes: ''"),
     ],
 )
@@ -498,15 +656,24 @@ def test_labelme_errors(tmp_path, shape, part):
         (_cvat(_box("wall", 0, 0, 9)), "unknown classes: 'wall'"),
         (_cvat(_box("tree", 0, 0, 9), image='name="other.jpg"'), "other.jpg in "),
         (_cvat(_box("tree", 0, 0, 9), image=""), "belongs to no photo"),
-        (_cvat(_box("tree", 0, 0, 9), image='name="DJI_0001.JPG" width="97" height="80"'), "97x80, but its photo is 96x72"),
+        (
+            _cvat(_box("tree", 0, 0, 9), image='name="DJI_0001.JPG" width="97" height="80"'),
+            "97x80, but its photo is 96x72",
+        ),
         (_cvat(_box("tree", 300, 0, 9)), "lies outside"),
         (_cvat('<box label="tree" xtl="1"></box>'), "not complete"),
         (_cvat('<box label="tree" xtl="1" ytl="x" xbr="3" ybr="3"></box>'), "not numbers"),
         (_cvat('<box label="tree" xtl="1" ytl="2" xbr="3" ybr="3" rotation="nan"></box>'), "not finite"),
         (_cvat('<polygon label="tree" points="1,2;3;4,5"></polygon>'), "fewer than three"),
         (_cvat('<ellipse label="tree" cx="9" cy="9" rx="-3" ry="4"></ellipse>'), "radii"),
-        (_cvat('<mask label="tree" rle="3, 99999999999999" left="0" top="0" width="4" height="4"></mask>'), "does not add up"),
-        (_cvat(f'<mask label="tree" rle="16" left="0" top="0" width="{"9" * 5000}" height="4"></mask>'), "not complete"),
+        (
+            _cvat('<mask label="tree" rle="3, 99999999999999" left="0" top="0" width="4" height="4"></mask>'),
+            "does not add up",
+        ),
+        (
+            _cvat(f'<mask label="tree" rle="16" left="0" top="0" width="{"9" * 5000}" height="4"></mask>'),
+            "not complete",
+        ),
         (_cvat('<mask label="tree" rle="16" left="95" top="0" width="4" height="4"></mask>'), "lies outside"),
         (_cvat('<tag label="tree"></tag>'), "no annotation with an area"),
         (_cvat(_box("tree", 0, 0, 9).replace('z_order="0"', 'z_order="top"')), "z_order"),
@@ -515,8 +682,14 @@ def test_labelme_errors(tmp_path, shape, part):
         ("<annotations><track id='0' label='tree'></track></annotations>", "CVAT for images 1.1"),
         ("<html></html>", "<annotations> is expected"),
         ("", "not valid XML"),
-        ('<!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><annotations>&b;</annotations>', "document type declaration"),
-        ('<!DOCTYPE a [<!ENTITY a SYSTEM "file:///etc/passwd">]><annotations>&a;</annotations>', "document type declaration"),
+        (
+            '<!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><annotations>&b;</annotations>',
+            "document type declaration",
+        ),
+        (
+            '<!DOCTYPE a [<!ENTITY a SYSTEM "file:///etc/passwd">]><annotations>&a;</annotations>',
+            "document type declaration",
+        ),
     ],
 )
 def test_cvat_errors(tmp_path, content, part):
@@ -528,7 +701,14 @@ def test_png_errors(tmp_path):
     write_image(folder / "DJI_0001.png", np.full((72, 96), 9, np.uint8))
     write_image(folder / "DJI_0002.png", np.zeros((72, 72), np.uint8))
     write_image(folder / "DJI_0003.png", np.zeros((72, 96), np.uint8))
-    _refused(tmp_path, folder, "class id 9", "6912 px", "72x72, but its photo is 96x72", "DJI_0003.png belongs to no photo")
+    _refused(
+        tmp_path,
+        folder,
+        "class id 9",
+        "6912 px",
+        "72x72, but its photo is 96x72",
+        "DJI_0003.png belongs to no photo",
+    )
     (folder / "DJI_0004.png").write_bytes(b"")
     _refused(tmp_path, folder, "class id 9", "DJI_0003.png belongs to no photo", "(2 times)")
     write_image(tmp_path / "rgb" / "DJI_0001.png", np.zeros((72, 96, 3), np.uint8))
@@ -544,7 +724,13 @@ def test_png_errors(tmp_path):
 def test_messages_are_short_and_printable(tmp_path):
     names = ["a\nb\x1b[31m\ud800", "x" * 100_000]
     squares = [(name, _square(0, 0, 9)) for name in names]
-    message = _refused(tmp_path, _write(tmp_path / "coco.json", _coco(*squares, categories=tuple(names), file_name="\n" + "y" * 10_000)), "belongs to no photo")
+    message = _refused(
+        tmp_path,
+        _write(
+            tmp_path / "coco.json", _coco(*squares, categories=tuple(names), file_name="\n" + "y" * 10_000)
+        ),
+        "belongs to no photo",
+    )
     assert message.isprintable() and len(message) < 1500 and message.encode()
 
 
@@ -555,7 +741,9 @@ def test_one_photo_in_two_files(tmp_path):
 
 
 def test_hostile_files_need_no_memory(tmp_path):
-    """Sizes and sums are checked before anything of that size exists; zigzags that cross each row a thousand times are refused."""
+    """Sizes and sums are checked before anything of that size exists; zigzags that cross each row a thousand
+    times are refused.
+    """
     files = [
         _coco(("tree", {"size": [72, 96], "counts": [0, 10**13]})),
         _coco(("tree", {"size": [10**6, 10**6], "counts": [10**12]}), width=10**6, height=10**6),
@@ -573,16 +761,27 @@ def test_hostile_files_need_no_memory(tmp_path):
 def test_damaged_files_give_our_own_errors(tmp_path):
     """Bytes of the reference files changed, cut and repeated: every time masks, or an InputError of one line."""
     random, outcomes = np.random.default_rng(4), {"fine": 0, "refused": 0}
-    for source in (FILES / "coco.json", FILES / "coco_compressed.json", FILES / "cvat.xml", FILES / "labelme" / "DJI_0001.json"):
+    for source in (
+        FILES / "coco.json",
+        FILES / "coco_compressed.json",
+        FILES / "cvat.xml",
+        FILES / "labelme" / "DJI_0001.json",
+    ):
         original = source.read_bytes()
         for _ in range(60):
             content = bytearray(original)
             begin, length = int(random.integers(len(content))), int(random.integers(1, 4))
-            content[begin : begin + length] = random.choice(np.frombuffer(original, np.uint8), int(random.integers(0, 4))).tobytes()
+            content[begin : begin + length] = random.choice(
+                np.frombuffer(original, np.uint8), int(random.integers(0, 4))
+            ).tobytes()
             file = tmp_path / source.name
             file.write_bytes(content)
             try:
-                _import(tmp_path, file, "cvat" if file.suffix == ".xml" else "labelme" if "DJI" in file.name else "coco")
+                _import(
+                    tmp_path,
+                    file,
+                    "cvat" if file.suffix == ".xml" else "labelme" if "DJI" in file.name else "coco",
+                )
                 outcomes["fine"] += 1
             except InputError as error:
                 assert "\n" not in str(error)
@@ -627,7 +826,12 @@ def test_failed_import_leaves_earlier_masks(tmp_path):
     with pytest.raises(InputError, match="--masks, which is missing"):
         execute("segment", scene, Segment(mapping=_write(tmp_path / "m.json", {"1": "tree"})))
     assert before == {file.name: file.read_bytes() for file in scene.masks.iterdir()}
-    assert sorted(path.name for path in scene.path.iterdir()) == ["classes.json", "images", "masks", "masks.json"]
+    assert sorted(path.name for path in scene.path.iterdir()) == [
+        "classes.json",
+        "images",
+        "masks",
+        "masks.json",
+    ]
 
 
 def test_turned_photos_are_told(tmp_path, caplog):

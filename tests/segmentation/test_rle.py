@@ -57,20 +57,33 @@ def test_runs_equal_masks_in_every_operation():
         union = (mask | other).sum()
         assert iou(runs, other_runs, height) == ((mask & other).sum() / union if union else 0)
         crop = mask[top:bottom, left:right]
-        np.testing.assert_array_equal(find_runs(crop, height, int(top), int(left)), find_runs(mask & inside, height))
-        np.testing.assert_array_equal(move_runs(find_runs(crop, max(1, bottom - top)), max(1, bottom - top), height, int(top), int(left)),
-                                      find_runs(mask & inside, height))
+        np.testing.assert_array_equal(
+            find_runs(crop, height, int(top), int(left)), find_runs(mask & inside, height)
+        )
+        np.testing.assert_array_equal(
+            move_runs(
+                find_runs(crop, max(1, bottom - top)), max(1, bottom - top), height, int(top), int(left)
+            ),
+            find_runs(mask & inside, height),
+        )
         if mask.any():
             filled, box = fill_runs(runs, height)
             rows, columns = np.nonzero(mask)
-            assert box == bounds(runs, height) == (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+            assert (
+                box == bounds(runs, height) == (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+            )
             np.testing.assert_array_equal(filled, mask[box.top : box.bottom, box.left : box.right])
 
 
 def test_coco_encoding_equals_pycocotools():
     coco = pytest.importorskip("pycocotools.mask")
     masks = [mask for _, mask in _random_masks(300)]
-    masks += [np.indices((2000, 1500)).sum(axis=0) // 700 % 2 == 0, np.ones((3000, 1), bool), np.zeros((1, 3000), bool)]  # long runs: up to 5 digits
+    # long runs: up to 5 digits
+    masks += [
+        np.indices((2000, 1500)).sum(axis=0) // 700 % 2 == 0,
+        np.ones((3000, 1), bool),
+        np.zeros((1, 3000), bool),
+    ]
     for mask in masks:
         expected = coco.encode(np.asfortranarray(mask.astype(np.uint8)))
         assert encode_runs(find_runs(mask, mask.shape[0]), mask.shape) == expected["counts"].decode()
@@ -80,17 +93,37 @@ def test_instance_file_is_coco(tmp_path):
     coco_module = pytest.importorskip("pycocotools.coco")
     random = np.random.default_rng(0)
     masks = [ndimage.gaussian_filter(random.random((40, 60)), 4) > 0.5 for _ in range(3)]
-    table = parse_classes([{"id": 2, "name": "road", "color": [0, 0, 0]}, {"id": 9, "name": "tree", "color": [0, 0, 0]}], "test")
-    instances = tuple(Instance.from_mask(mask, class_id, 0.5, 0.25, "big tree") for mask, class_id in zip(masks, (9, 2, 9), strict=True))
+    table = parse_classes(
+        [{"id": 2, "name": "road", "color": [0, 0, 0]}, {"id": 9, "name": "tree", "color": [0, 0, 0]}], "test"
+    )
+    instances = tuple(
+        Instance.from_mask(mask, class_id, 0.5, 0.25, "big tree")
+        for mask, class_id in zip(masks, (9, 2, 9), strict=True)
+    )
     write_instances(tmp_path / "a.json", "a.jpg", (40, 60), instances, table)
     data = coco_module.COCO(str(tmp_path / "a.json"))
-    assert data.getCatIds(catNms=["tree"]) == [9] and data.loadImgs(1)[0] == {"id": 1, "file_name": "a.jpg", "width": 60, "height": 40}
-    assert [data.cats[annotation["category_id"]]["name"] for annotation in data.anns.values()] == ["tree", "road", "tree"]
+    assert data.getCatIds(catNms=["tree"]) == [9] and data.loadImgs(1)[0] == {
+        "id": 1,
+        "file_name": "a.jpg",
+        "width": 60,
+        "height": 40,
+    }
+    assert [data.cats[annotation["category_id"]]["name"] for annotation in data.anns.values()] == [
+        "tree",
+        "road",
+        "tree",
+    ]
     for mask, annotation in zip(masks, data.anns.values(), strict=True):
         np.testing.assert_array_equal(data.annToMask(annotation), mask)
         rows, columns = np.nonzero(mask)
-        assert annotation["bbox"] == [columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1] and annotation["area"] == mask.sum()
+        assert (
+            annotation["bbox"] == [columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1]
+            and annotation["area"] == mask.sum()
+        )
         assert (annotation["score"], annotation["box_score"], annotation["mask_score"]) == (0.125, 0.5, 0.25)
-        assert annotation["prompt"] == "big tree" and annotation["name"] == data.cats[annotation["category_id"]]["name"]
+        assert (
+            annotation["prompt"] == "big tree"
+            and annotation["name"] == data.cats[annotation["category_id"]]["name"]
+        )
     write_instances(tmp_path / "none.json", "a.jpg", (40, 60), (), table)
     assert json.loads((tmp_path / "none.json").read_text())["annotations"] == []

@@ -39,14 +39,26 @@ TABLE = parse_classes(
 # ---- merging
 
 
-def _merge_slowly(found: list[tuple[np.ndarray, Instance]], shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def _merge_slowly(
+    found: list[tuple[np.ndarray, Instance]], shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
     """The rule as it is written, pixel by pixel."""
     label, confidence = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     for row, column in np.ndindex(*shape):
-        covering = [(mask, instance) for mask, instance in found if mask[row, column] and instance.box_score * instance.mask_score > 0]
+        covering = [
+            (mask, instance)
+            for mask, instance in found
+            if mask[row, column] and instance.box_score * instance.mask_score > 0
+        ]
         if covering:
-            _, winner = min(covering, key=lambda pair: (-pair[1].box_score * pair[1].mask_score, pair[0].sum(), pair[1].class_id))
-            label[row, column], confidence[row, column] = winner.class_id, max(1, round(255 * winner.box_score * winner.mask_score))
+            _, winner = min(
+                covering,
+                key=lambda pair: (-pair[1].box_score * pair[1].mask_score, pair[0].sum(), pair[1].class_id),
+            )
+            label[row, column], confidence[row, column] = (
+                winner.class_id,
+                max(1, round(255 * winner.box_score * winner.mask_score)),
+            )
     return label, confidence
 
 
@@ -55,8 +67,18 @@ def test_merge_equals_reference_in_any_order():
     for _ in range(20):
         shape = (int(random.integers(1, 9)), int(random.integers(1, 9)))
         # Few different scores and areas, so that ties of every kind occur
-        masks = [random.random(shape) < random.choice([0.0, 0.3, 0.6]) for _ in range(int(random.integers(0, 9)))]
-        found = [(mask, Instance.from_mask(mask, int(random.integers(1, 256)), *random.choice([0.0, 0.25, 0.5, 1.0], 2))) for mask in masks]
+        masks = [
+            random.random(shape) < random.choice([0.0, 0.3, 0.6]) for _ in range(int(random.integers(0, 9)))
+        ]
+        found = [
+            (
+                mask,
+                Instance.from_mask(
+                    mask, int(random.integers(1, 256)), *random.choice([0.0, 0.25, 0.5, 1.0], 2)
+                ),
+            )
+            for mask in masks
+        ]
         expected = _merge_slowly(found, shape)
         for _ in range(6):
             result = merge_instances([found[number][1] for number in random.permutation(len(found))], shape)
@@ -67,7 +89,11 @@ def test_merge_equals_reference_in_any_order():
 def test_merge_ties_by_area_then_class():
     whole, half = np.ones((2, 4), bool), np.zeros((2, 4), bool)
     half[:, :2] = True
-    instances = [Instance.from_mask(whole, 1, 0.5, 0.8), Instance.from_mask(half, 9, 0.8, 0.5), Instance.from_mask(half, 4, 0.5, 0.8)]
+    instances = [
+        Instance.from_mask(whole, 1, 0.5, 0.8),
+        Instance.from_mask(half, 9, 0.8, 0.5),
+        Instance.from_mask(half, 4, 0.5, 0.8),
+    ]
     label, confidence = merge_instances(instances, (2, 4))
     assert label.tolist() == [[4, 4, 1, 1]] * 2
     assert (confidence == round(255 * 0.4)).all()
@@ -75,7 +101,9 @@ def test_merge_ties_by_area_then_class():
 
 def test_merge_ignores_worthless_and_marks_faint_instances():
     mask = np.ones((1, 2), bool)
-    label, confidence = merge_instances([Instance.from_mask(mask, 3, 0.9, float("nan")), Instance.from_mask(mask, 3, 0.9, -0.1)], (1, 2))
+    label, confidence = merge_instances(
+        [Instance.from_mask(mask, 3, 0.9, float("nan")), Instance.from_mask(mask, 3, 0.9, -0.1)], (1, 2)
+    )
     assert not label.any() and not confidence.any()
     label, confidence = merge_instances([Instance.from_mask(mask, 3, 0.01, 0.01)], (1, 2))
     assert (label == 3).all() and (confidence == 1).all()
@@ -85,36 +113,60 @@ def test_merge_ignores_worthless_and_marks_faint_instances():
 
 
 def test_areas_equal_reference_and_fill_only_gaps():
-    """The highest confidence of all concepts and looks wins, the lower class at equal ones, in any order; instances keep their pixels."""
+    """The highest confidence of all concepts and looks wins, the lower class at equal ones, in any order;
+    instances keep their pixels.
+    """
     random, shape = np.random.default_rng(2), (7, 9)
     for _ in range(30):
-        maps = [(int(class_id), random.integers(0, 4, shape).astype(np.uint8)) for class_id in random.integers(1, 5, 4)]
+        maps = [
+            (int(class_id), random.integers(0, 4, shape).astype(np.uint8))
+            for class_id in random.integers(1, 5, 4)
+        ]
         tile = (int(random.integers(0, 3)), int(random.integers(0, 4)))
         window = Window(tile[1], tile[0], tile[1] + 4, tile[0] + 3)
-        part = Areas(random.integers(1, 5, (3, 4)).astype(np.uint8), random.integers(0, 4, (3, 4)).astype(np.uint8))
+        part = Areas(
+            random.integers(1, 5, (3, 4)).astype(np.uint8), random.integers(0, 4, (3, 4)).astype(np.uint8)
+        )
         part.labels[part.confidence == 0] = 0
         expected = np.zeros((2, *shape), np.uint8)
         for row, column in np.ndindex(*shape):
             said = [(-int(values[row, column]), class_id) for class_id, values in maps if values[row, column]]
-            if window.top <= row < window.bottom and window.left <= column < window.right and part.confidence[row - window.top, column - window.left]:
-                said.append((-int(part.confidence[row - window.top, column - window.left]), int(part.labels[row - window.top, column - window.left])))
+            if (
+                window.top <= row < window.bottom
+                and window.left <= column < window.right
+                and part.confidence[row - window.top, column - window.left]
+            ):
+                said.append(
+                    (
+                        -int(part.confidence[row - window.top, column - window.left]),
+                        int(part.labels[row - window.top, column - window.left]),
+                    )
+                )
             if said:
                 expected[:, row, column] = min(said)[1], -min(said)[0]
         areas = Areas(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8))
-        steps = [lambda value=value: paint(areas, *value, Window(0, 0, 9, 7)) for value in maps] + [lambda: paint_areas(areas, part, window)]
+        steps = [lambda value=value: paint(areas, *value, Window(0, 0, 9, 7)) for value in maps] + [
+            lambda: paint_areas(areas, part, window)
+        ]
         for number in random.permutation(len(steps)):
             steps[number]()
         np.testing.assert_array_equal(areas, expected)
         labels = np.where(random.random(shape) < 0.5, 9, 0).astype(np.uint8)
         filled, confidence = labels.copy(), labels * 3
         fill_gaps(filled, confidence, areas)
-        np.testing.assert_array_equal([filled, confidence], np.where(labels > 0, np.array([labels, labels * 3]), expected))
+        np.testing.assert_array_equal(
+            [filled, confidence], np.where(labels > 0, np.array([labels, labels * 3]), expected)
+        )
 
 
 # ---- prompts
 
 # [CLS] building . parking lot . parking garage . road . [SEP]
-CAPTION = Caption(list(range(12)), [(1, 2), (3, 5), (6, 8), (9, 10)], [Prompt(str(class_id), class_id) for class_id in (1, 2, 7, 3)])
+CAPTION = Caption(
+    list(range(12)),
+    [(1, 2), (3, 5), (6, 8), (9, 10)],
+    [Prompt(str(class_id), class_id) for class_id in (1, 2, 7, 3)],
+)
 
 
 @pytest.mark.parametrize(
@@ -124,10 +176,13 @@ CAPTION = Caption(list(range(12)), [(1, 2), (3, 5), (6, 8), (9, 10)], [Prompt(st
         ([0, 0.6, 0, 0, 0, 0, 0, 0, 0, 0.7, 0, 0], 3, 0.7),  # merged phrase "building road": the better one
         ([0, 0.5, 0, 0, 0, 0, 0, 0, 0, 0.5, 0, 0], 1, 0.5),  # a tie: the lower class id
         ([0, 0, 0, 0.6, 0.5, 0, 0.6, 0.1, 0, 0, 0, 0], 2, 0.6),  # both words beat one
-        ([0, 0, 0, 0.5, 0.24, 0, 0.38, 0.35, 0, 0, 0, 0], 7, 0.38),  # 0.24 is below the text threshold and does not count
+        # 0.24 is below the text threshold and does not count
+        ([0, 0, 0, 0.5, 0.24, 0, 0.38, 0.35, 0, 0, 0, 0], 7, 0.38),
         ([0, 0.4, 0, 0.6, 0, 0, 0, 0, 0, 0, 0, 0], 1, 0.4),  # a whole prompt beats half of a longer one
-        ([0.9, 0.2, 0.9, 0, 0, 0.9, 0, 0, 0, 0.29, 0.9, 0.9], 0, 0.0),  # special tokens and full stops are no prompt
-        ([0, 0.29, 0, 0.9, 0, 0, 0, 0, 0, 0.1, 0, 0], 2, 0.9),  # only prompts above the box threshold are candidates
+        # special tokens and full stops are no prompt
+        ([0.9, 0.2, 0.9, 0, 0, 0.9, 0, 0, 0, 0.29, 0.9, 0.9], 0, 0.0),
+        # only prompts above the box threshold are candidates
+        ([0, 0.29, 0, 0.9, 0, 0, 0, 0, 0, 0.1, 0, 0], 2, 0.9),
     ],
 )
 def test_match_prompts(scores, expected, score):
@@ -141,7 +196,11 @@ def test_match_prompts_does_not_depend_on_prompt_order():
     scores = random.choice([0.1, 0.28, 0.5, 0.8], (200, 12))
     expected = match_prompts(scores, CAPTION, 0.3, 0.25)[0]
     for order in (random.permutation(4) for _ in range(10)):
-        shuffled = Caption(CAPTION.token_ids, [CAPTION.spans[number] for number in order], [CAPTION.prompts[number] for number in order])
+        shuffled = Caption(
+            CAPTION.token_ids,
+            [CAPTION.spans[number] for number in order],
+            [CAPTION.prompts[number] for number in order],
+        )
         numbers = match_prompts(scores, shuffled, 0.3, 0.25)[0]
         np.testing.assert_array_equal(np.where(numbers >= 0, order[numbers], -1), expected)
     assert match_prompts(np.zeros((0, 12)), CAPTION, 0.3, 0.25)[0].shape == (0,)
@@ -154,25 +213,43 @@ def test_match_prompts_needs_a_word_above_both_thresholds():
 
 
 def test_list_prompts():
-    assert [prompt.text for prompt in list_prompts(TABLE)] == ["building", "roof", "road", "parking lot", "tree"]
+    assert [prompt.text for prompt in list_prompts(TABLE)] == [
+        "building",
+        "roof",
+        "road",
+        "parking lot",
+        "tree",
+    ]
     silent = {"id": 3, "name": "other", "color": [0, 0, 0], "prompts": []}
     with pytest.raises(InputError, match="no class has a prompt"):
         list_prompts(parse_classes([silent], "test"))
     with pytest.raises(InputError, match="'roof' belongs to the classes 'house' and 'roof'"):
-        entries = [silent | {"name": "roof", "prompts": ["Roof"]}, silent | {"id": 1, "name": "house", "prompts": ["roof."]}]
+        entries = [
+            silent | {"name": "roof", "prompts": ["Roof"]},
+            silent | {"id": 1, "name": "house", "prompts": ["roof."]},
+        ]
         list_prompts(parse_classes(entries, "test"))
     with pytest.raises(InputError, match="empty prompt"):
         list_prompts(parse_classes([silent | {"prompts": [" . "]}], "test"))
 
 
 def test_captions_fit_the_text_length():
-    tokens = [(Prompt(str(index), index), [10 * index + word for word in range(index)]) for index in range(1, 6)]
+    tokens = [
+        (Prompt(str(index), index), [10 * index + word for word in range(index)]) for index in range(1, 6)
+    ]
     captions = build_captions(tokens, 101, 1012, 102, 9)
     assert [prompt.class_id for caption in captions for prompt in caption.prompts] == [1, 2, 3, 4, 5]
     for caption in captions:
-        assert len(caption.token_ids) <= 9 and caption.token_ids[0] == 101 and caption.token_ids[-2:] == [1012, 102]
+        assert (
+            len(caption.token_ids) <= 9
+            and caption.token_ids[0] == 101
+            and caption.token_ids[-2:] == [1012, 102]
+        )
         for (first, last), prompt in zip(caption.spans, caption.prompts, strict=True):
-            assert caption.token_ids[first:last] == tokens[prompt.class_id - 1][1] and caption.token_ids[last] == 1012
+            assert (
+                caption.token_ids[first:last] == tokens[prompt.class_id - 1][1]
+                and caption.token_ids[last] == 1012
+            )
     with pytest.raises(InputError, match="shorten"):
         build_captions(tokens, 101, 1012, 102, 7)
 
@@ -200,9 +277,14 @@ def test_import_masks(tmp_path):
     masks, maps = tmp_path / "scene" / "masks", tmp_path / "scene" / "confidence"
     assert import_masks(source, masks, SIZES, TABLE, confidence, maps) == ["a.jpg", "sub/b.JPG"]
     assert sorted(file.name for file in masks.iterdir()) == ["a.png", "b.png"]
-    assert (read_index_image(masks / "a.png") == 2).all() and read_index_image(masks / "a.png").shape == (12, 16)
+    assert (read_index_image(masks / "a.png") == 2).all() and read_index_image(masks / "a.png").shape == (
+        12,
+        16,
+    )
     assert (read_index_image(masks / "b.png") == 7).all() and Image.open(masks / "b.png").mode == "L"
-    assert [file.name for file in maps.iterdir()] == ["a.png"] and (read_index_image(maps / "a.png") == 200).all()
+    assert [file.name for file in maps.iterdir()] == ["a.png"] and (
+        read_index_image(maps / "a.png") == 200
+    ).all()
     # Masks in place are checked and left alone, with their confidence; other masks replace both
     assert import_masks(masks, masks, SIZES, TABLE, None, maps) == ["a.jpg", "sub/b.JPG"] and maps.exists()
     (source / "b.png").unlink()
@@ -225,7 +307,9 @@ def test_import_writes_nothing_if_a_mask_does_not_fit(tmp_path, stem, mask, mess
 
 
 def test_import_writes_nothing_if_a_mask_is_damaged(tmp_path):
-    source = _write_masks(tmp_path / "source", a=np.random.default_rng(0).integers(0, 3, (600, 800)).astype(np.uint8))
+    source = _write_masks(
+        tmp_path / "source", a=np.random.default_rng(0).integers(0, 3, (600, 800)).astype(np.uint8)
+    )
     content = (source / "a.png").read_bytes()
     for damaged in (content[: len(content) // 2], b"", b"no image"):
         (source / "a.png").write_bytes(damaged)
@@ -258,7 +342,10 @@ def _assert_refused(tmp_path: Path, source: Path, message: str, confidence: Path
     before = kept.read_bytes()
     with pytest.raises(InputError, match=message):
         import_masks(source, scene / "masks", SIZES, TABLE, confidence, scene / "confidence")
-    assert kept.read_bytes() == before and sorted(path.name for path in scene.rglob("*")) == ["a.png", "masks"]
+    assert kept.read_bytes() == before and sorted(path.name for path in scene.rglob("*")) == [
+        "a.png",
+        "masks",
+    ]
 
 
 # ---- photo by photo
@@ -276,7 +363,11 @@ class _Halves:
             raise KeyboardInterrupt
         label = np.zeros(image.shape[:2], np.uint8)
         label[:, : image.shape[1] // 2] = 2
-        return Segmentation(label, label * 100, (Instance.from_mask(label > 0, 2, 0.8, 0.5, "road"),) if self.instances else None)
+        return Segmentation(
+            label,
+            label * 100,
+            (Instance.from_mask(label > 0, 2, 0.8, 0.5, "road"),) if self.instances else None,
+        )
 
 
 def _write_photos(folder: Path, num_photos: int = 2) -> list[Path]:
@@ -294,10 +385,19 @@ def test_segment_photos_resumes(tmp_path):
     assert [file.name for file in folders.masks.iterdir()] == ["photo0.png"]
     segmenter = _Halves()
     summary = segment_photos(photos, folders, segmenter, TABLE)
-    assert (summary.segmented, summary.skipped) == (["photo1.jpg", "photo2.jpg"], ["photo0.jpg"]) and segmenter.num_calls == 2
-    assert summary.num_pixels.sum() == 80 * (64 + 80) and summary.num_pixels[2] == 40 * (64 + 80) and summary.num_instances == 0
+    assert (summary.segmented, summary.skipped) == (
+        ["photo1.jpg", "photo2.jpg"],
+        ["photo0.jpg"],
+    ) and segmenter.num_calls == 2
+    assert (
+        summary.num_pixels.sum() == 80 * (64 + 80)
+        and summary.num_pixels[2] == 40 * (64 + 80)
+        and summary.num_instances == 0
+    )
     assert read_index_image(folders.masks / "photo2.png").shape == (80, 80)
-    assert (read_index_image(folders.confidence / "photo2.png")[:, :40] == 200).all() and not folders.instances.exists()
+    assert (
+        read_index_image(folders.confidence / "photo2.png")[:, :40] == 200
+    ).all() and not folders.instances.exists()
     assert segment_photos(photos, folders, segmenter, TABLE).segmented == [] and segmenter.num_calls == 2
     assert len(segment_photos(photos, folders, segmenter, TABLE, overwrite=True).segmented) == 3
 
@@ -308,7 +408,12 @@ def test_instances_are_written_and_do_not_outlive_their_mask(tmp_path):
     content = json.loads((folders.instances / "photo1.json").read_text())
     assert content["images"][0] == {"id": 1, "file_name": "photo1.jpg", "width": 80, "height": 64}
     (annotation,) = content["annotations"]
-    assert (annotation["category_id"], annotation["name"], annotation["prompt"], annotation["score"]) == (2, "road", "road", 0.4)
+    assert (annotation["category_id"], annotation["name"], annotation["prompt"], annotation["score"]) == (
+        2,
+        "road",
+        "road",
+        0.4,
+    )
     assert annotation["bbox"] == [0, 0, 40, 64] and annotation["segmentation"]["size"] == [64, 80]
     segment_photos(photos, folders, _Halves(), TABLE, overwrite=True)
     assert not list(folders.instances.iterdir())
@@ -336,13 +441,37 @@ def _folders(scene: Path) -> Folders:
 # ---- weights
 
 
-@pytest.mark.parametrize(("backend", "words"), [
-    (GroundedSam, ("IDEA-Research/grounding-dino-tiny", "690 MB", "Apache-2.0", "{0}/grounding-dino-tiny", "{0}/IDEA-Research/grounding-dino-tiny")),
-    (Sam3, ("facebook/sam3", "3440 MB", "SAM licence, gated", "hf auth login", "{0}/sam3", "{0}/facebook/sam3")),
-])
+@pytest.mark.parametrize(
+    ("backend", "words"),
+    [
+        (
+            GroundedSam,
+            (
+                "IDEA-Research/grounding-dino-tiny",
+                "690 MB",
+                "Apache-2.0",
+                "{0}/grounding-dino-tiny",
+                "{0}/IDEA-Research/grounding-dino-tiny",
+            ),
+        ),
+        (
+            Sam3,
+            (
+                "facebook/sam3",
+                "3440 MB",
+                "SAM licence, gated",
+                "hf auth login",
+                "{0}/sam3",
+                "{0}/facebook/sam3",
+            ),
+        ),
+    ],
+)
 def test_missing_weights_say_what_to_do(tmp_path, monkeypatch, backend, words):
     pytest.importorskip("transformers")
-    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *args, **kwargs: pytest.fail("went to the network"))
+    monkeypatch.setattr(
+        "huggingface_hub.snapshot_download", lambda *args, **kwargs: pytest.fail("went to the network")
+    )
     monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *args, **kwargs: None)
     with pytest.raises(InputError) as raised:
         backend(Segment(model_dir=tmp_path), TABLE)
@@ -370,7 +499,8 @@ def test_weights_are_found_in_model_folder_then_hub_cache(tmp_path, monkeypatch)
         (folder / "config.json").write_text("{}")
     (snapshot.parents[1] / "refs").mkdir()
     (snapshot.parents[1] / "refs" / "main").write_text("0123abc")
-    with pytest.raises(InputError, match="not on this machine"):  # a configuration without weights is no model
+    # a configuration without weights is no model
+    with pytest.raises(InputError, match="not on this machine"):
         find_weights("owner/model", tmp_path / "own", download=False)
     for folder in reversed(folders):
         (folder / "model.safetensors").touch()
@@ -394,7 +524,9 @@ def test_missing_package(monkeypatch):
     import importlib.metadata
 
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "4.57.1")
-    with pytest.raises(MissingPackageError, match=r"transformers 5 or newer, not 4.57.1: pip install -U 'sc3d\[masks\]'"):
+    with pytest.raises(
+        MissingPackageError, match=r"transformers 5 or newer, not 4.57.1: pip install -U 'sc3d\[masks\]'"
+    ):
         GroundedSam(Segment(), TABLE)
 
     def missing(name):
@@ -406,7 +538,15 @@ def test_missing_package(monkeypatch):
 
 
 def test_settings_are_checked():
-    wrongs = ({"box_threshold": 1.0}, {"text_threshold": -0.1}, {"box_threshold": float("nan")}, {"tile": -5}, {"tile": 10}, {"overlap": 0.0}, {"overlap": 0.9})
+    wrongs = (
+        {"box_threshold": 1.0},
+        {"text_threshold": -0.1},
+        {"box_threshold": float("nan")},
+        {"tile": -5},
+        {"tile": 10},
+        {"overlap": 0.0},
+        {"overlap": 0.9},
+    )
     for wrong in wrongs:
         with pytest.raises(InputError, match=next(iter(wrong))):
             check_settings(Segment(**wrong))
@@ -419,4 +559,9 @@ import sys, sc3d.segmentation.mask_formats.import_masks, sc3d.segmentation.groun
 print([name for name in ("torch", "transformers", "huggingface_hub", "PIL", "cv2") if name in sys.modules])
 """
     root = Path(__file__).parents[2]
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root).stdout.strip() == "[]"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root
+        ).stdout.strip()
+        == "[]"
+    )

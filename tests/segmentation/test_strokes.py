@@ -17,7 +17,11 @@ from sc3d.segmentation.strokes.novelty import learn_novelty
 from sc3d.segmentation.strokes.pixel_classifier import best_temperature
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-CLASSES = [{"id": 1, "name": "road", "color": [150, 150, 160]}, {"id": 2, "name": "tree", "color": [40, 150, 60]}, {"id": 7, "name": "grass", "color": [170, 220, 110]}]
+CLASSES = [
+    {"id": 1, "name": "road", "color": [150, 150, 160]},
+    {"id": 2, "name": "tree", "color": [40, 150, 60]},
+    {"id": 7, "name": "grass", "color": [170, 220, 110]},
+]
 TABLE = parse_classes(CLASSES, "test")
 SIZE = (240, 160)
 QUICK = StrokesSettings(members=2, trees=10, steps=120)
@@ -33,8 +37,16 @@ def truth() -> np.ndarray:
 def photo(seed: int, label: np.ndarray | None = None) -> np.ndarray:
     """A photo of `truth`: flat grey, smooth green, and coarse green of nearly the same mean colour."""
     random, label = np.random.default_rng(seed), truth() if label is None else label
-    fine, coarse = random.normal(0, 1, (*label.shape, 1)), cv2.GaussianBlur(random.normal(0, 1, label.shape), (0, 0), 2.5)[..., None]
-    colors = {1: [150, 148, 155] + 4 * fine, 2: [90, 130, 60] + 200 * coarse, 7: [95, 135, 62] + 5 * fine, 9: [200, 60, 40] + 5 * fine}
+    fine, coarse = (
+        random.normal(0, 1, (*label.shape, 1)),
+        cv2.GaussianBlur(random.normal(0, 1, label.shape), (0, 0), 2.5)[..., None],
+    )
+    colors = {
+        1: [150, 148, 155] + 4 * fine,
+        2: [90, 130, 60] + 200 * coarse,
+        7: [95, 135, 62] + 5 * fine,
+        9: [200, 60, 40] + 5 * fine,
+    }
     image = np.zeros((*label.shape, 3))
     for value, color in colors.items():
         image[label == value] = color[label == value]
@@ -46,14 +58,27 @@ def shape(label: str, points: list, kind: str = "linestrip", **more) -> dict:
 
 
 SHAPES = [
-    shape("road", [[10, 20], [60, 60]], width=8), shape("road", [[20, 140], [60, 100]], width=8), shape("road", [[70, 5], [70, 150]], width=6),
-    shape("tree", [[150, 60], [180, 60], [180, 80], [150, 80]], "polygon"), shape("tree", [[150, 100], [190, 100]], width=10), shape("tree", [[170, 50], [200, 80]], width=8),
-    shape("grass", [[100, 10], [230, 10]], width=10), shape("grass", [[100, 20], [100, 140]], width=10), shape("grass", [[225, 60], [225, 150]], width=10),
+    shape("road", [[10, 20], [60, 60]], width=8),
+    shape("road", [[20, 140], [60, 100]], width=8),
+    shape("road", [[70, 5], [70, 150]], width=6),
+    shape("tree", [[150, 60], [180, 60], [180, 80], [150, 80]], "polygon"),
+    shape("tree", [[150, 100], [190, 100]], width=10),
+    shape("tree", [[170, 50], [200, 80]], width=8),
+    shape("grass", [[100, 10], [230, 10]], width=10),
+    shape("grass", [[100, 20], [100, 140]], width=10),
+    shape("grass", [[225, 60], [225, 150]], width=10),
 ]
 
 
 def labelme(shapes: list, **more) -> dict:
-    return {"version": "5.5.0", "imagePath": "a.png", "imageWidth": SIZE[0], "imageHeight": SIZE[1], "imageData": None, "shapes": shapes} | more
+    return {
+        "version": "5.5.0",
+        "imagePath": "a.png",
+        "imageWidth": SIZE[0],
+        "imageHeight": SIZE[1],
+        "imageData": None,
+        "shapes": shapes,
+    } | more
 
 
 @pytest.fixture
@@ -68,7 +93,9 @@ def scene(tmp_path):
 
 
 def iou(label: np.ndarray, value: int) -> float:
-    return float(((label == value) & (truth() == value)).sum() / ((label == value) | (truth() == value)).sum())
+    return float(
+        ((label == value) & (truth() == value)).sum() / ((label == value) | (truth() == value)).sum()
+    )
 
 
 def test_command_labels_photos_without_strokes(scene):
@@ -82,8 +109,10 @@ def test_command_labels_photos_without_strokes(scene):
 
 
 def test_same_seed_same_masks(scene):
-    first, second, other = (Strokes.learn(scene / "strokes", scene / "images", TABLE, settings).segment(photo(5)) for settings in
-                            (QUICK, QUICK, StrokesSettings(members=2, trees=10, steps=120, seed=1)))
+    first, second, other = (
+        Strokes.learn(scene / "strokes", scene / "images", TABLE, settings).segment(photo(5))
+        for settings in (QUICK, QUICK, StrokesSettings(members=2, trees=10, steps=120, seed=1))
+    )
     assert np.array_equal(first.labels, second.labels) and np.array_equal(first.confidence, second.confidence)
     assert not np.array_equal(first.confidence, other.confidence)
 
@@ -95,7 +124,10 @@ def test_what_no_stroke_shows_stays_unlabelled_and_background_too(scene):
     found = learned.segment(photo(3, label)).labels
     assert (found[115:, 5:65] == 0).mean() > 0.95 and (found[20:80, 5:65] == 1).mean() > 0.95
     Image.fromarray(photo(1, label)).save(scene / "images" / "b.png")
-    red = [shape("_background_", [[10, 120], [60, 120]], width=10), shape("_background_", [[10, 145], [60, 145]], width=10)]
+    red = [
+        shape("_background_", [[10, 120], [60, 120]], width=10),
+        shape("_background_", [[10, 145], [60, 145]], width=10),
+    ]
     (scene / "strokes" / "b.json").write_text(json.dumps(labelme(red, imagePath="b.png")))
     learned = Strokes.learn(scene / "strokes", scene / "images", TABLE, QUICK)
     found = learned.segment(photo(3, label))
@@ -112,20 +144,52 @@ def test_large_photos_are_looked_at_small_but_cut_finely(scene):
     assert np.abs(np.array(edges) - 320).max() <= 6  # 1.5 px of the reduced photo
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    (lambda folder: (folder / "a.json").unlink(), "no strokes in"),
-    (lambda folder: (folder / "c.json").write_text(json.dumps(labelme(SHAPES, imagePath="c.png"))), "belongs to no photo"),
-    (lambda folder: (folder / "a.json").write_text(json.dumps(labelme(SHAPES[:6]))), "show no 'grass'"),
-    (lambda folder: (folder / "a.json").write_text(json.dumps(labelme([shape("roof", [[1, 1]])]))), "class 'roof'"),
-    (lambda folder: (folder / "a.json").write_text(json.dumps(labelme([shape("road", [[1, 1]], "polygon")]))), "at least 3 points"),
-    (lambda folder: (folder / "a.json").write_text(json.dumps(labelme([shape("road", [[1, float("nan")]])]))), "list of [x, y]"),
-    (lambda folder: (folder / "a.json").write_text(json.dumps(labelme([shape("road", [[1, 1]], "mask")]))), "possible are"),
-    (lambda folder: (folder / "a.json").write_text(json.dumps(labelme(SHAPES, imageWidth=160, imageHeight=240))), "aspect"),
-    (lambda folder: (folder / "a.json").write_text(json.dumps({"imagePath": "a.png"})), "no list of shapes"),
-    (lambda folder: (folder / "a.json").write_text("{"), "not valid JSON"),
-    (lambda folder: Image.new("RGB", SIZE, (1, 2, 3)).save(folder / "b.png"), "colour #010203"),
-    (lambda folder: Image.new("RGB", (50, 50)).save(folder / "b.png"), "aspect"),
-])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda folder: (folder / "a.json").unlink(), "no strokes in"),
+        (
+            lambda folder: (folder / "c.json").write_text(json.dumps(labelme(SHAPES, imagePath="c.png"))),
+            "belongs to no photo",
+        ),
+        (lambda folder: (folder / "a.json").write_text(json.dumps(labelme(SHAPES[:6]))), "show no 'grass'"),
+        (
+            lambda folder: (folder / "a.json").write_text(json.dumps(labelme([shape("roof", [[1, 1]])]))),
+            "class 'roof'",
+        ),
+        (
+            lambda folder: (folder / "a.json").write_text(
+                json.dumps(labelme([shape("road", [[1, 1]], "polygon")]))
+            ),
+            "at least 3 points",
+        ),
+        (
+            lambda folder: (folder / "a.json").write_text(
+                json.dumps(labelme([shape("road", [[1, float("nan")]])]))
+            ),
+            "list of [x, y]",
+        ),
+        (
+            lambda folder: (folder / "a.json").write_text(
+                json.dumps(labelme([shape("road", [[1, 1]], "mask")]))
+            ),
+            "possible are",
+        ),
+        (
+            lambda folder: (folder / "a.json").write_text(
+                json.dumps(labelme(SHAPES, imageWidth=160, imageHeight=240))
+            ),
+            "aspect",
+        ),
+        (
+            lambda folder: (folder / "a.json").write_text(json.dumps({"imagePath": "a.png"})),
+            "no list of shapes",
+        ),
+        (lambda folder: (folder / "a.json").write_text("{"), "not valid JSON"),
+        (lambda folder: Image.new("RGB", SIZE, (1, 2, 3)).save(folder / "b.png"), "colour #010203"),
+        (lambda folder: Image.new("RGB", (50, 50)).save(folder / "b.png"), "aspect"),
+    ],
+)
 def test_errors_say_what_to_do(scene, capsys, change, words):
     change(scene / "strokes")
     with pytest.raises(SystemExit) as stopped:
@@ -137,14 +201,20 @@ def test_errors_say_what_to_do(scene, capsys, change, words):
 
 def test_shapes_cover_what_geometry_says():
     def covered(kind, points, width=0.0, scale=1):
-        labels, groups = PhotoStrokes(None, (400, 300), (Shape(5, kind, np.array(points, float), width),)).paint(400 * scale, 300 * scale)
+        labels, groups = PhotoStrokes(
+            None, (400, 300), (Shape(5, kind, np.array(points, float), width),)
+        ).paint(400 * scale, 300 * scale)
         assert ((labels == 5) == (groups == 1)).all() and set(np.unique(labels)) <= {NOTHING, 5}
-        return (labels == 5).sum() / scale**2, np.argwhere(labels == 5).mean(axis=0)[::-1] / scale + 0.5 / scale
+        return (labels == 5).sum() / scale**2, np.argwhere(labels == 5).mean(axis=0)[
+            ::-1
+        ] / scale + 0.5 / scale
 
     for scale in (1, 2):
         for kind, points, width, area, centre in [
-            ("polygon", [[50, 50], [250, 50], [250, 150], [50, 150]], 0, 200 * 100, (150, 100)), ("rectangle", [[250, 150], [50, 50]], 0, 200 * 100, (150, 100)),
-            ("circle", [[200, 150], [200, 50]], 0, np.pi * 100**2, (200, 150)), ("linestrip", [[100, 80], [300, 80]], 20, 200 * 20 + np.pi * 100, (200, 80)),
+            ("polygon", [[50, 50], [250, 50], [250, 150], [50, 150]], 0, 200 * 100, (150, 100)),
+            ("rectangle", [[250, 150], [50, 50]], 0, 200 * 100, (150, 100)),
+            ("circle", [[200, 150], [200, 50]], 0, np.pi * 100**2, (200, 150)),
+            ("linestrip", [[100, 80], [300, 80]], 20, 200 * 20 + np.pi * 100, (200, 80)),
             ("point", [[200, 100]], 30, np.pi * 15**2, (200, 100)),
         ]:
             found, middle = covered(kind, points, width, scale)
@@ -153,7 +223,10 @@ def test_shapes_cover_what_geometry_says():
 
 
 def test_later_shapes_lie_on_top_and_coordinates_follow_the_stated_size():
-    shapes = [shape("grass", [[0, 0], [120, 0], [120, 80], [0, 80]], "polygon"), shape("_background_", [[60, 0], [120, 0], [120, 80], [60, 80]], "polygon")]
+    shapes = [
+        shape("grass", [[0, 0], [120, 0], [120, 80], [0, 80]], "polygon"),
+        shape("_background_", [[60, 0], [120, 0], [120, 80], [60, 80]], "polygon"),
+    ]
     parsed = parse_shapes(labelme(shapes, imageWidth=120, imageHeight=80), "x", SIZE, TABLE)
     labels, groups = PhotoStrokes(None, SIZE, parsed).paint(*SIZE)
     assert (labels[:, :118] == 7).all() and (labels[:, 122:] == 0).all()
@@ -166,12 +239,15 @@ def test_colours_of_a_png_and_json_above_it(scene):
     picture[50:70, 10:13] = [40, 150, 60, 255]
     picture[90:99, 10:30] = [40, 150, 60, 0]  # transparent
     Image.fromarray(picture).save(scene / "strokes" / "a.png")
-    (scene / "strokes" / "a.json").write_text(json.dumps(labelme([shape("grass", [[20, 0], [20, 160]], width=4)])))
-    drawn, = read_strokes(scene / "strokes", scene / "images", TABLE)
+    (scene / "strokes" / "a.json").write_text(
+        json.dumps(labelme([shape("grass", [[20, 0], [20, 160]], width=4)]))
+    )
+    (drawn,) = read_strokes(scene / "strokes", scene / "images", TABLE)
     labels, groups = drawn.paint(*SIZE)
     assert labels[15, 12] == 1 and labels[60, 11] == 2 and labels[95, 12] == NOTHING and labels[15, 20] == 7
     assert len(np.unique(groups)) == 4  # nothing, two areas, one stroke
-    assert 2 in drawn.paint(SIZE[0] // 4, SIZE[1] // 4)[0]  # 3 px wide, less than one pixel of the reduced photo
+    # 3 px wide, less than one pixel of the reduced photo
+    assert 2 in drawn.paint(SIZE[0] // 4, SIZE[1] // 4)[0]
 
 
 def test_features_turn_with_the_photo_and_do_not_know_where_they_are():
@@ -188,9 +264,17 @@ def test_features_turn_with_the_photo_and_do_not_know_where_they_are():
 
 def test_guided_filter_equals_a_regression_in_every_window():
     random = np.random.default_rng(0)
-    guide, plane, radius, smoothing = random.random((14, 15, 3)).astype(np.float32), random.random((14, 15)).astype(np.float32), 2, 0.02
+    guide, plane, radius, smoothing = (
+        random.random((14, 15, 3)).astype(np.float32),
+        random.random((14, 15)).astype(np.float32),
+        2,
+        0.02,
+    )
     found = next(fit_lines(guide, plane[..., None], radius, smoothing)).apply(guide)
-    padded_guide, padded = (np.pad(values, [(4, 4), (4, 4)] + [(0, 0)] * (values.ndim - 2), mode="symmetric").astype(np.float64) for values in (guide, plane))
+    padded_guide, padded = (
+        np.pad(values, [(4, 4), (4, 4)] + [(0, 0)] * (values.ndim - 2), mode="symmetric").astype(np.float64)
+        for values in (guide, plane)
+    )
     expected = np.zeros((14 + 4, 15 + 4, 4))
     for row in range(2, 2 + 18):
         for column in range(2, 2 + 19):
@@ -199,15 +283,21 @@ def test_guided_filter_equals_a_regression_in_every_window():
             centred = colors - colors.mean(axis=0)
             slope = np.linalg.solve(centred.T @ centred / 25 + smoothing * np.eye(3), centred.T @ values / 25)
             expected[row - 2, column - 2] = *slope, values.mean() - slope @ colors.mean(axis=0)
-    means = np.stack([expected[row : row + 14, column : column + 15] for row in range(5) for column in range(5)]).mean(axis=0)
+    means = np.stack(
+        [expected[row : row + 14, column : column + 15] for row in range(5) for column in range(5)]
+    ).mean(axis=0)
     inner = (slice(4, -4), slice(4, -4))  # there both pad alike
-    assert np.allclose(found[inner], ((means[..., :3] * guide).sum(axis=-1) + means[..., 3])[inner], atol=2e-4)
+    assert np.allclose(
+        found[inner], ((means[..., :3] * guide).sum(axis=-1) + means[..., 3])[inner], atol=2e-4
+    )
 
 
 def test_guided_filter_keeps_edges_of_the_photo_only():
     guide = np.zeros((60, 60, 3), np.float32)
     guide[:, 30:] = 0.8
-    noisy = (np.random.default_rng(0).random((60, 60)) < np.where(np.arange(60) < 30, 0.2, 0.8)).astype(np.float32)
+    noisy = (np.random.default_rng(0).random((60, 60)) < np.where(np.arange(60) < 30, 0.2, 0.8)).astype(
+        np.float32
+    )
     smooth = next(fit_lines(guide, noisy[..., None], 8, 0.01)).apply(guide)
     assert np.abs(smooth[:, :29] - 0.2).max() < 0.2 and np.abs(smooth[:, 31:] - 0.8).max() < 0.2
     assert (smooth[:, 30] - smooth[:, 29]).mean() > 0.5
@@ -241,7 +331,10 @@ def test_temperature_is_recovered():
     probabilities = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
     codes = (probabilities.cumsum(axis=1) < random.random((20_000, 1))).sum(axis=1)
     blunt = probabilities**0.5 / (probabilities**0.5).sum(axis=1, keepdims=True)
-    assert abs(best_temperature(probabilities, codes) - 1) < 0.06 and abs(best_temperature(blunt, codes) - 0.5) < 0.04
+    assert (
+        abs(best_temperature(probabilities, codes) - 1) < 0.06
+        and abs(best_temperature(blunt, codes) - 0.5) < 0.04
+    )
     assert best_temperature(probabilities[:0], codes[:0]) == 1
 
 
@@ -249,7 +342,12 @@ def test_distance_decides_what_is_novel():
     random = np.random.default_rng(0)
     features = random.normal(0, 1, (3000, 12)).astype(np.float32)
     novelty = learn_novelty(features, np.arange(3000) % 3)
-    pixels = np.repeat(random.normal(0, 1, (20, 12)), 16, axis=0).reshape(20, 16, 12).repeat(4, axis=0).astype(np.float32)
+    pixels = (
+        np.repeat(random.normal(0, 1, (20, 12)), 16, axis=0)
+        .reshape(20, 16, 12)
+        .repeat(4, axis=0)
+        .astype(np.float32)
+    )
     far = pixels + 12
     assert novelty.share(pixels).mean() < 0.05 and novelty.share(far).min() > 0.99
     assert learn_novelty(features, np.full(3000, -1)) is None

@@ -27,6 +27,7 @@ def plane(normal, offset):
 
 def sphere(centre, radius):
     """Distances along unit rays from an origin outside to a sphere; inf where it is missed."""
+
     def distances(origin, directions):
         towards = directions @ (np.asarray(centre, float) - origin)
         inside = towards**2 - np.sum((np.asarray(centre, float) - origin) ** 2) + radius**2
@@ -38,39 +39,63 @@ def sphere(centre, radius):
 def colour(points, wave):
     """(N, 3) in [0, 1]: smooth waves about `wave` long, in all directions."""
     x, y, z = points.T * (2 * np.pi / wave)
-    waves = [np.sin(x + 0.3 * y + 0.5 * z), np.sin(0.6 * y - 0.4 * x + z), np.sin(0.8 * x - 0.5 * y + 0.7 * z)]
+    waves = [
+        np.sin(x + 0.3 * y + 0.5 * z),
+        np.sin(0.6 * y - 0.4 * x + z),
+        np.sin(0.8 * x - 0.5 * y + 0.7 * z),
+    ]
     return 0.5 + 0.25 * np.stack(waves, 1) + 0.12 * (np.sin(1.9 * x + z) * np.sin(2.1 * y + z))[:, None]
 
 
 def photographed(views, shapes, wave, noise, num_points=1500):
-    """Training data with sparse points (noise in world units) that the views see; (V, H, W) true depth and index of the shape that is seen."""
+    """Training data with sparse points (noise in world units) that the views see; (V, H, W) true depth and
+    index of the shape that is seen.
+    """
     random, photos, depths, indices, points = np.random.default_rng(0), [], [], [], []
     for view in views:
         directions, along = rays(view)
         distances = np.stack([shape(view.centre, directions) for shape in shapes])
         hits = view.centre + distances.min(0)[:, None] * directions
-        photos.append((np.clip(colour(hits, wave), 0, 1) * 255 + 0.5).astype(np.uint8).reshape(view.height, view.width, 3))
+        photos.append(
+            (np.clip(colour(hits, wave), 0, 1) * 255 + 0.5)
+            .astype(np.uint8)
+            .reshape(view.height, view.width, 3)
+        )
         depths.append((distances.min(0) * along).reshape(view.height, view.width))
         indices.append(distances.argmin(0).reshape(view.height, view.width))
         points.append(hits[random.choice(len(hits), num_points // len(views), replace=False)])
     points = np.concatenate(points)
     colors = (np.clip(colour(points, wave), 0, 1) * 255).astype(np.uint8)
-    return TrainingData(views, photos, points + random.normal(0, noise, points.shape), colors), np.stack(depths), np.stack(indices)
+    return (
+        TrainingData(views, photos, points + random.normal(0, noise, points.shape), colors),
+        np.stack(depths),
+        np.stack(indices),
+    )
 
 
 def ring(calibration=(90.0, 90.0, 50.0, 31.0)):
     """8 views of the origin from about 9 units above."""
     angles = np.arange(8) * np.pi / 4
     centres = [np.array([4 * np.cos(a), 3 * np.sin(a), 9 + np.cos(3 * a)]) for a in angles]
-    return [pinhole_view(f"{row}.png", SIZE, calibration, look_at(centre, centre * [0.2, 0, 0])) for row, centre in enumerate(centres)]
+    return [
+        pinhole_view(f"{row}.png", SIZE, calibration, look_at(centre, centre * [0.2, 0, 0]))
+        for row, centre in enumerate(centres)
+    ]
 
 
 def depth_errors(data, depths, **options):
     """(V, H, W) relative depth errors after a short training, NaN where alpha is below 0.9."""
-    settings = TrainSettings(**{"iterations": 300, "sh_degree": 0, "max_gaussians": 5000, "num_patches": 1024} | options)
+    settings = TrainSettings(
+        **{"iterations": 300, "sh_degree": 0, "max_gaussians": 5000, "num_patches": 1024} | options
+    )
     gaussians = train(data, settings, progress=False).gaussians
     maps = [depth_map(gaussians, view) for view in data.views]
-    return np.stack([np.where(alpha > 0.9, np.abs(depth - truth) / truth, np.nan) for (depth, alpha, _), truth in zip(maps, depths, strict=True)])
+    return np.stack(
+        [
+            np.where(alpha > 0.9, np.abs(depth - truth) / truth, np.nan)
+            for (depth, alpha, _), truth in zip(maps, depths, strict=True)
+        ]
+    )
 
 
 def valley():
@@ -106,8 +131,12 @@ def test_deep_scene_keeps_its_depth_at_any_scale(unit):
     """Ground from 20 m in front of the cameras to a wall that is 120 m away, in metres and in units of 100 m."""
     centres = np.array([(-14, 0, 20), (-8, 3, 23), (-3, -3, 18), (3, 2, 22), (8, -2, 19), (14, 1, 21)], float)
     poses = [look_at(centre * unit, np.array([0.3 * centre[0], 50, 0]) * unit) for centre in centres]
-    views = [pinhole_view(f"{row}.png", SIZE, (60.0, 60.0, 48.0, 32.0), pose) for row, pose in enumerate(poses)]
-    data, depths, _ = photographed(views, [plane([0, 0, 1], 0.0), plane([0, 1, 0], 105 * unit)], wave=20 * unit, noise=0.4 * unit)
+    views = [
+        pinhole_view(f"{row}.png", SIZE, (60.0, 60.0, 48.0, 32.0), pose) for row, pose in enumerate(poses)
+    ]
+    data, depths, _ = photographed(
+        views, [plane([0, 0, 1], 0.0), plane([0, 1, 0], 105 * unit)], wave=20 * unit, noise=0.4 * unit
+    )
     assert depths.min() < 23 * unit and depths.max() > 119 * unit
     errors = depth_errors(data, depths)
     for nearest, farthest in ((0, 35), (35, 70), (70, 130)):

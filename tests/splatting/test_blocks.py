@@ -1,4 +1,6 @@
-"""Training by blocks: the cut of the plane, what a block's photos show, and the merged model against training everything at once."""
+"""Training by blocks: the cut of the plane, what a block's photos show, and the merged model against training
+everything at once.
+"""
 
 import os
 import signal
@@ -57,14 +59,23 @@ def test_cores_fill_the_plane_and_hold_equal_shares(count):
     points = random.normal(size=(4000, 3)) * (30, 10, 1)
     blocks = split_blocks(points, count)
     assert len(blocks) == count and blocks[0].axes == (0, 1)
-    anywhere = np.concatenate([points, random.uniform(-1e4, 1e4, (4000, 3)), [[block.low[0], block.low[1], 0] for block in blocks if np.isfinite(block.low).all()] or points[:1]])
+    anywhere = np.concatenate(
+        [
+            points,
+            random.uniform(-1e4, 1e4, (4000, 3)),
+            [[block.low[0], block.low[1], 0] for block in blocks if np.isfinite(block.low).all()]
+            or points[:1],
+        ]
+    )
     assert (np.sum([block.holds(anywhere) for block in blocks], axis=0) == 1).all()
     held = np.array([block.holds(points).sum() for block in blocks])
     assert np.abs(held / (len(points) / count) - 1).max() < 0.02
     assert split_blocks(points[:, [0, 2, 1]], count)[0].axes == (0, 2)  # worlds whose y points up
     for block in blocks:
         around = block.holds(points, border=True)
-        assert (around >= block.holds(points)).all() and (count == 1 or around.sum() > block.holds(points).sum())
+        assert (around >= block.holds(points)).all() and (
+            count == 1 or around.sum() > block.holds(points).sum()
+        )
 
 
 def test_too_many_blocks_are_refused_before_work(site, tmp_path, capsys):
@@ -88,7 +99,12 @@ def test_masks_show_core_and_border_as_the_exact_depth_does(site):
         part = restrict(data, block, views)
         assert len(part.points) == block.holds(data.points, border=True).sum() and len(views) >= 2
         for row, (view, track) in enumerate(zip(part.views, part.tracks, strict=True)):
-            np.testing.assert_array_equal(part.points[track], data.points[data.tracks[views[row]]][block.holds(data.points, border=True)[data.tracks[views[row]]]])
+            np.testing.assert_array_equal(
+                part.points[track],
+                data.points[data.tracks[views[row]]][
+                    block.holds(data.points, border=True)[data.tracks[views[row]]]
+                ],
+            )
             directions, along = rays(view)
             depth = np.load(site / "depth" / f"{Path(view.name).stem}.npy").ravel()
             known = depth > 0
@@ -106,12 +122,23 @@ def test_pixels_outside_the_mask_leave_no_trace(site):
     block = split_blocks(data.points, 2)[0]
     views = views_of(data, block)
     part = restrict(data, block, views)
-    settings = share_settings(Train(iterations=40, max_gaussians=1500, surface_from=1.0, coarse_until=0.0, fill=False).training, data, block, views)
+    settings = share_settings(
+        Train(iterations=40, max_gaussians=1500, surface_from=1.0, coarse_until=0.0, fill=False).training,
+        data,
+        block,
+        views,
+    )
     noise = np.random.default_rng(0)
 
     def spoiled(row):
         image = part.image(row).copy()
-        inner = torch.nn.functional.max_pool2d(torch.from_numpy(part.mask(row))[None, None].float(), 31, 1, 15)[0, 0].numpy() > 0  # SSIM looks 5 px around, twice
+        # SSIM looks 5 px around, twice
+        inner = (
+            torch.nn.functional.max_pool2d(torch.from_numpy(part.mask(row))[None, None].float(), 31, 1, 15)[
+                0, 0
+            ].numpy()
+            > 0
+        )
         image[~inner] = noise.integers(0, 256, (int((~inner).sum()), 3))
         return image
 
@@ -140,7 +167,9 @@ def test_merged_blocks_are_as_good_as_the_whole_and_have_no_seam(site, blocked, 
     seam = np.array(counts)
     assert 0.8 < seam[1, 0] / seam[0, 0] < 1.25, seam  # twice as many if both blocks kept theirs
     assert sum(summaries[1]["block_gaussians"]) > seam[1, 1] + 0.5 * seam[1, 0]  # which they had
-    assert (blocked / "train.csv").read_text().splitlines()[0].startswith("block,iteration,") and (blocked / "train.jpg").exists()
+    assert (blocked / "train.csv").read_text().splitlines()[0].startswith("block,iteration,") and (
+        blocked / "train.jpg"
+    ).exists()
     assert not list(blocked.glob("train.*.blocks"))
 
 
@@ -150,7 +179,11 @@ def test_two_workers_of_which_one_is_killed_give_the_same_bytes(site, blocked, t
     def kill():
         while not killed:
             if list((tmp_path / "scene").glob("train.*.blocks/*.checkpoint")):
-                workers = [child for child in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(child.cmdline())]
+                workers = [
+                    child
+                    for child in psutil.Process().children(recursive=True)
+                    if "spawn_main" in " ".join(child.cmdline())
+                ]
                 os.kill(workers[0].pid, signal.SIGKILL)
                 killed.append(workers[0].pid)
             time.sleep(0.01)
@@ -179,8 +212,19 @@ def test_an_interrupted_run_goes_on_where_it_was(site, blocked, tmp_path, monkey
     (left,) = (tmp_path / "scene").glob("train.*.blocks")
     assert {file.name for file in left.iterdir()} == {"0.ply", "0.json", "1.checkpoint"}
     seen = []
-    monkeypatch.setattr(Trainer, "resume", lambda self, path, resume=Trainer.resume: (resume(self, path), seen.append((path.name, self.iteration))))
-    monkeypatch.setattr(block_tasks, "restrict", lambda data, block, views, known=restrict: (seen.append(block), known(data, block, views))[1])
+    monkeypatch.setattr(
+        Trainer,
+        "resume",
+        lambda self, path, resume=Trainer.resume: (
+            resume(self, path),
+            seen.append((path.name, self.iteration)),
+        ),
+    )
+    monkeypatch.setattr(
+        block_tasks,
+        "restrict",
+        lambda data, block, views, known=restrict: (seen.append(block), known(data, block, views))[1],
+    )
     folder = trained(site, tmp_path / "scene", "--blocks", "2")
     assert len(seen) == 2 and seen[1] == ("1.checkpoint", 20)  # block 0 was not trained again
     assert (folder / "gaussians.ply").read_bytes() == (blocked / "gaussians.ply").read_bytes()

@@ -39,8 +39,20 @@ def test_training_stays_on_its_device(functions, monkeypatch):  # noqa: F811
     monkeypatch.setattr(gsplat_backend, "cuda_functions", lambda: replace(functions, isect_tiles=isect_tiles))
     data, *_ = photographed([view.resized(32, 24) for view in ring()], valley(), 3.0, 0.05, 400)
     data = replace(data, masks=lambda index: np.ones((24, 32), bool))
-    settings = TrainSettings(8, 800, sh_degree=1, num_patches=16, test_every=8, fill=False, coarse_until=0.2, surface_from=0.3, densify_from=0.1, densify_until=1.0,
-                             gradient_threshold=1e-6, absolute_gradient_threshold=1e-6)
+    settings = TrainSettings(
+        8,
+        800,
+        sh_degree=1,
+        num_patches=16,
+        test_every=8,
+        fill=False,
+        coarse_until=0.2,
+        surface_from=0.3,
+        densify_from=0.1,
+        densify_until=1.0,
+        gradient_threshold=1e-6,
+        absolute_gradient_threshold=1e-6,
+    )
     with PretendDevice():
         result = train(data, settings, progress=False)
     assert result.gaussians.means.device.type == "cpu" and len(result.gaussians) > 400

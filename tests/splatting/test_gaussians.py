@@ -27,7 +27,9 @@ def test_scale_is_the_rms_distance_to_three_neighbours():
 def test_duplicate_points_get_a_finite_scale():
     points = np.concatenate([np.zeros((6, 3)), np.random.default_rng(0).random((50, 3))])
     assert torch.isfinite(Gaussians.from_points(points, np.zeros((56, 3), np.uint8)).log_scales).all()
-    assert torch.isfinite(Gaussians.from_points(np.zeros((9, 3)), np.zeros((9, 3), np.uint8)).log_scales).all()
+    assert torch.isfinite(
+        Gaussians.from_points(np.zeros((9, 3)), np.zeros((9, 3), np.uint8)).log_scales
+    ).all()
     assert len(Gaussians.from_points(np.eye(3)[:2], np.zeros((2, 3), np.uint8))) == 2
     with pytest.raises(InputError, match="sparse points"):
         Gaussians.from_points(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
@@ -81,7 +83,12 @@ def test_higher_harmonics_are_ordered_by_channel(tmp_path):
     header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     names = [line.split()[2].decode() for line in header.splitlines() if line.startswith(b"property")]
     table = np.frombuffer(body, "<f4").reshape(4, len(names))
-    assert names[:6] == ["x", "y", "z", "nx", "ny", "nz"] and names[-4:] == ["rot_0", "rot_1", "rot_2", "rot_3"]
+    assert names[:6] == ["x", "y", "z", "nx", "ny", "nz"] and names[-4:] == [
+        "rot_0",
+        "rot_1",
+        "rot_2",
+        "rot_3",
+    ]
     for channel in range(3):
         for k in range(1, 9):
             column = names.index(f"f_rest_{channel * 8 + k - 1}")

@@ -1,9 +1,14 @@
-"""The renderer against gsplat's pure-torch functions on the CPU, and the GPU backend with them in place of gsplat's CUDA kernels.
+"""The renderer against gsplat's pure-torch functions on the CPU, and the GPU backend with them in place of
+gsplat's CUDA kernels.
 
-gsplat's image is put together here: its projection, spherical harmonics and tile lists; the fragments of each pixel by the rules of its CUDA kernels
-(listed below in torch, because gsplat lists them on a GPU only); its `accumulate`, with a stand-in for the two nerfacc functions that it calls.
-Both renderers keep every fragment with alpha >= 1/255: gsplat's boxes of 3.33 sigma hold them all, since 255 exp(-3.33^2 / 2) < 1. They limit alpha
-differently (0.99 here, 0.999 there) and end a pixel one fragment apart, so opacities stay below 0.99 and transmittances above 1e-4.
+gsplat's image is put together here: its projection, spherical harmonics and tile lists; the fragments of each
+pixel by the rules of its CUDA kernels
+(listed below in torch, because gsplat lists them on a GPU only); its `accumulate`, with a stand-in for the
+two nerfacc functions that it calls.
+Both renderers keep every fragment with alpha >= 1/255: gsplat's boxes of 3.33 sigma hold them all, since 255
+exp(-3.33^2 / 2) < 1. They limit alpha
+differently (0.99 here, 0.999 there) and end a pixel one fragment apart, so opacities stay below 0.99 and
+transmittances above 1e-4.
 """
 
 import sys
@@ -48,19 +53,27 @@ def make_scene(count=1000, coefficients=16, seed=0, size=-2.6):
 
 
 def list_fragments(first, last, start, means2d, conics, opacities, width, height, tile_size, offsets, ids):
-    """`rasterize_to_indices_in_range` of one view in torch: every Gaussian of a tile against every pixel of it."""
+    """`rasterize_to_indices_in_range` of one view in torch: every Gaussian of a tile against every pixel of
+    it.
+    """
     assert (first, tile_size) == (0, TILE) and last > 1e6
     columns = offsets.shape[2]
     bounds = [*map(int, offsets.flatten()), len(ids)]
     found = []
     for tile, (begin, end) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
-        rows = torch.arange(tile // columns * TILE, min(tile // columns * TILE + TILE, height), device=ids.device)
-        cols = torch.arange(tile % columns * TILE, min(tile % columns * TILE + TILE, width), device=ids.device)
+        rows = torch.arange(
+            tile // columns * TILE, min(tile // columns * TILE + TILE, height), device=ids.device
+        )
+        cols = torch.arange(
+            tile % columns * TILE, min(tile % columns * TILE + TILE, width), device=ids.device
+        )
         pixels = (rows[:, None] * width + cols).reshape(-1)
         chosen = ids[begin:end].long()
         delta = torch.stack([pixels % width, pixels // width], 1)[:, None] + 0.5 - means2d[0, chosen]
         (x, y), (a, b, c) = delta.unbind(2), conics[0, chosen].unbind(1)
-        alpha = (opacities[0, chosen] * torch.exp(-0.5 * (a * x * x + c * y * y) - b * x * y)).clamp_max(0.999)
+        alpha = (opacities[0, chosen] * torch.exp(-0.5 * (a * x * x + c * y * y) - b * x * y)).clamp_max(
+            0.999
+        )
         kept = alpha >= 1 / 255
         after = start.reshape(-1)[pixels, None] * torch.cumprod(torch.where(kept, 1 - alpha, 1.0), 1)
         pixel, entry = torch.nonzero(kept & (after > 1e-4), as_tuple=True)
@@ -71,7 +84,10 @@ def list_fragments(first, last, start, means2d, conics, opacities, width, height
 
 
 def nerfacc_stand_in():
-    """A module with the two functions that gsplat's `accumulate` calls; fragments of a ray lie side by side, near to far."""
+    """A module with the two functions that gsplat's `accumulate` calls; fragments of a ray lie side by side,
+    near to far.
+    """
+
     def render_weight_from_alpha(alphas, ray_indices, n_rays):
         counts = torch.bincount(ray_indices, minlength=n_rays)
         rank = torch.arange(len(alphas), device=alphas.device) - (counts.cumsum(0) - counts)[ray_indices]
@@ -84,7 +100,10 @@ def nerfacc_stand_in():
         return values.new_zeros(n_rays, values.shape[1]).index_add(0, ray_indices, values)
 
     module = types.ModuleType("nerfacc")
-    module.render_weight_from_alpha, module.accumulate_along_rays = render_weight_from_alpha, accumulate_along_rays
+    module.render_weight_from_alpha, module.accumulate_along_rays = (
+        render_weight_from_alpha,
+        accumulate_along_rays,
+    )
     return module
 
 
@@ -101,20 +120,41 @@ def reference(monkeypatch):
 def gsplat_images(reference, gaussians, view, sh_degree):
     """color, alpha, normal, plane_distance of `render`, from gsplat's functions only."""
     pose, matrix = (torch.from_numpy(array).float()[None] for array in (view.cam_from_world, view.matrix))
-    covariances, _ = reference._quat_scale_to_covar_preci(gaussians.quats, gaussians.log_scales.exp(), compute_preci=False)
+    covariances, _ = reference._quat_scale_to_covar_preci(
+        gaussians.quats, gaussians.log_scales.exp(), compute_preci=False
+    )
     means_cam, _ = reference._world_to_cam(gaussians.means, covariances, pose)
-    radii, means2d, depths, conics, _ = reference._fully_fused_projection(gaussians.means, covariances, pose, matrix, view.width, view.height)
+    radii, means2d, depths, conics, _ = reference._fully_fused_projection(
+        gaussians.means, covariances, pose, matrix, view.width, view.height
+    )
     columns, rows = -(-view.width // TILE), -(-view.height // TILE)
     _, keys, ids = reference._isect_tiles(means2d.detach(), radii, depths.detach(), TILE, columns, rows)
     offsets = reference._isect_offset_encode(keys, 1, columns, rows)
     smallest = gaussians.log_scales.argmin(1)
-    normals = reference._quat_to_rotmat(gaussians.quats)[torch.arange(len(gaussians)), :, smallest] @ pose[0, :3, :3].T
+    normals = (
+        reference._quat_to_rotmat(gaussians.quats)[torch.arange(len(gaussians)), :, smallest]
+        @ pose[0, :3, :3].T
+    )
     facing = (normals * means_cam[0]).sum(1, keepdim=True)
-    colors = reference._spherical_harmonics(sh_degree, gaussians.means - torch.from_numpy(view.centre).float(), gaussians.sh) + 0.5
+    colors = (
+        reference._spherical_harmonics(
+            sh_degree, gaussians.means - torch.from_numpy(view.centre).float(), gaussians.sh
+        )
+        + 0.5
+    )
     features = torch.cat([colors.clamp_min(0), -normals * facing.sign(), facing.abs()], 1)[None]
     splats = means2d, conics, torch.sigmoid(gaussians.opacity_logits)[None]
-    fragments = list_fragments(0, 1 << 30, torch.ones(1, view.height, view.width), *(tensor.detach() for tensor in splats), view.width, view.height,
-                               TILE, offsets, ids)
+    fragments = list_fragments(
+        0,
+        1 << 30,
+        torch.ones(1, view.height, view.width),
+        *(tensor.detach() for tensor in splats),
+        view.width,
+        view.height,
+        TILE,
+        offsets,
+        ids,
+    )
     image, alpha = reference.accumulate(*splats, features, *fragments, view.width, view.height)
     return image[0, ..., :3], alpha[0, ..., 0], image[0, ..., 3:6], image[0, ..., 6]
 
@@ -122,20 +162,45 @@ def gsplat_images(reference, gaussians, view, sh_degree):
 @pytest.fixture
 def functions(reference):
     """Twins of the functions that the backend calls, with the same arguments."""
-    def fully_fused_projection(means, covars, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, opacities):
+
+    def fully_fused_projection(
+        means, covars, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, opacities
+    ):
         covars, _ = reference._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-        return reference._fully_fused_projection(means, covars, viewmats, Ks, width, height, eps2d, near_plane)
+        return reference._fully_fused_projection(
+            means, covars, viewmats, Ks, width, height, eps2d, near_plane
+        )
 
-    def rasterize_to_pixels(means2d, conics, colors, opacities, width, height, tile_size, offsets, ids, absgrad):
-        start, splats = means2d.new_ones(1, height, width), (tensor.detach() for tensor in (means2d, conics, opacities))
-        chosen, pixels, views = list_fragments(0, 1 << 30, start, *splats, width, height, tile_size, offsets, ids)
-        splats = [tensor[:, chosen] for tensor in (means2d, conics, opacities, colors)]  # one row per fragment, for the absolute gradients
+    def rasterize_to_pixels(
+        means2d, conics, colors, opacities, width, height, tile_size, offsets, ids, absgrad
+    ):
+        start, splats = (
+            means2d.new_ones(1, height, width),
+            (tensor.detach() for tensor in (means2d, conics, opacities)),
+        )
+        chosen, pixels, views = list_fragments(
+            0, 1 << 30, start, *splats, width, height, tile_size, offsets, ids
+        )
+        # one row per fragment, for the absolute gradients
+        splats = [tensor[:, chosen] for tensor in (means2d, conics, opacities, colors)]
         if absgrad:
-            splats[0].register_hook(lambda slopes: setattr(means2d, "absgrad", torch.zeros_like(means2d).index_add(1, chosen, slopes.abs())))
-        return reference.accumulate(*splats, torch.arange(len(chosen), device=chosen.device), pixels, views, width, height)
+            splats[0].register_hook(
+                lambda slopes: setattr(
+                    means2d, "absgrad", torch.zeros_like(means2d).index_add(1, chosen, slopes.abs())
+                )
+            )
+        return reference.accumulate(
+            *splats, torch.arange(len(chosen), device=chosen.device), pixels, views, width, height
+        )
 
-    return Functions(fully_fused_projection, reference._spherical_harmonics, reference._isect_tiles, reference._isect_offset_encode,
-                     rasterize_to_pixels, list_fragments)
+    return Functions(
+        fully_fused_projection,
+        reference._spherical_harmonics,
+        reference._isect_tiles,
+        reference._isect_offset_encode,
+        rasterize_to_pixels,
+        list_fragments,
+    )
 
 
 @pytest.mark.parametrize(("count", "size", "sh_degree"), [(300, -1.9, 3), (2000, -3.0, 1)])
@@ -161,12 +226,14 @@ def test_backend_composes_the_same_rendering(functions, monkeypatch, geometry):
     cpu, gpu = with_gradients(gaussians), with_gradients(gaussians)
     expected = render(cpu, view, 2, BACKGROUND, geometry)
     found = render_gsplat(gpu, view, 2, BACKGROUND, geometry, functions)
-    assert torch.equal(found.statistics.gradient, torch.zeros(400)) and torch.equal(found.statistics.absolute_gradient, torch.zeros(400))
+    assert torch.equal(found.statistics.gradient, torch.zeros(400)) and torch.equal(
+        found.statistics.absolute_gradient, torch.zeros(400)
+    )
     for image, truth in zip(images(found), images(expected), strict=True):
         assert image.shape == truth.shape
         assert (image - truth).abs().mean() < 1e-5
-    weighted_sum(images(found)[:None if geometry else 2]).backward()
-    weighted_sum(images(expected)[:None if geometry else 2]).backward()
+    weighted_sum(images(found)[: None if geometry else 2]).backward()
+    weighted_sum(images(expected)[: None if geometry else 2]).backward()
     for name in NAMES:
         gradient, truth = getattr(gpu, name).grad, getattr(cpu, name).grad
         assert (gradient - truth).norm() < 1e-4 * truth.norm(), name
@@ -185,14 +252,23 @@ def test_backend_without_gradients_and_without_gaussians_in_view(functions):
     gaussians.means[:, 2] = -20.0  # behind the camera
     rendering = render_gsplat(with_gradients(gaussians), view, 0, BACKGROUND, True, empty_safe(functions))
     assert torch.allclose(rendering.color, BACKGROUND.expand(64, 96, 3))
-    assert not rendering.radii.any() and not rendering.statistics.weight.any() and not rendering.statistics.max_transmittance.any()
+    assert (
+        not rendering.radii.any()
+        and not rendering.statistics.weight.any()
+        and not rendering.statistics.max_transmittance.any()
+    )
 
 
 def empty_safe(functions):
     """The stand-in for nerfacc cannot take zero fragments; gsplat's kernels can."""
-    def rasterize_to_pixels(means2d, conics, colors, opacities, width, height, tile_size, offsets, ids, absgrad):
+
+    def rasterize_to_pixels(
+        means2d, conics, colors, opacities, width, height, tile_size, offsets, ids, absgrad
+    ):
         assert not len(ids)
-        return means2d.sum() * 0 + torch.zeros(1, height, width, colors.shape[2]), torch.zeros(1, height, width, 1)
+        return means2d.sum() * 0 + torch.zeros(1, height, width, colors.shape[2]), torch.zeros(
+            1, height, width, 1
+        )
 
     return Functions(**{**vars(functions), "rasterize_to_pixels": rasterize_to_pixels})
 
@@ -245,7 +321,13 @@ def test_adam_in_torch_equals_the_kernel(monkeypatch):
     generator = torch.Generator().manual_seed(0)
     start, rates = torch.randn(20, 2, 3, generator=generator), {"values": np.linspace(0.01, 0.06, 6)}
     gradients = torch.randn(5, 20, 2, 3, generator=generator)
-    rows = [None, torch.rand(20, generator=generator) > 0.5, None, torch.rand(20, generator=generator) > 0.2, None]
+    rows = [
+        None,
+        torch.rand(20, generator=generator) > 0.5,
+        None,
+        torch.rand(20, generator=generator) > 0.2,
+        None,
+    ]
     results = []
     for kernels in (True, False):
         monkeypatch.setattr(device, "has_kernels", lambda tensor, answer=kernels: answer)
@@ -253,7 +335,9 @@ def test_adam_in_torch_equals_the_kernel(monkeypatch):
         for gradient, chosen in zip(gradients, rows, strict=True):
             optimiser.parameters["values"].grad = gradient.clone()
             optimiser.step(chosen)
-        results.append((optimiser.parameters["values"].detach(), optimiser.means["values"], optimiser.squares["values"]))
+        results.append(
+            (optimiser.parameters["values"].detach(), optimiser.means["values"], optimiser.squares["values"])
+        )
     for one, other in zip(*results, strict=True):
         assert torch.allclose(one, other, rtol=1e-5, atol=1e-7)
 
@@ -262,11 +346,22 @@ def test_adam_in_torch_equals_the_kernel(monkeypatch):
 def test_training_without_kernels_is_the_same(functions, monkeypatch, iterations, weight):
     """What a GPU computes, on the CPU: gsplat's twins render, every loss and Adam are torch operations.
 
-    One step with the multi-view terms, more without: they draw from the pixels with alpha > 0.5, and a last digit there changes the whole draw.
+    One step with the multi-view terms, more without: they draw from the pixels with alpha > 0.5, and a last
+    digit there changes the whole draw.
     """
     data, *_ = photographed([view.resized(48, 32) for view in ring()], valley(), 3.0, 0.05, 300)
-    settings = TrainSettings(iterations, 300, sh_degree=1, num_patches=64, surface_from=0.0, coarse_until=0.0, densify_until=0.0,
-                             flatten_weight=0.0, geometric_weight=weight, photometric_weight=weight)
+    settings = TrainSettings(
+        iterations,
+        300,
+        sh_degree=1,
+        num_patches=64,
+        surface_from=0.0,
+        coarse_until=0.0,
+        densify_until=0.0,
+        flatten_weight=0.0,
+        geometric_weight=weight,
+        photometric_weight=weight,
+    )
     states = []
     for kernels in (True, False):
         monkeypatch.setattr(device, "has_kernels", lambda tensor, answer=kernels: answer)
@@ -276,6 +371,8 @@ def test_training_without_kernels_is_the_same(functions, monkeypatch, iterations
             trainer.step()
         states.append((trainer.log[-1], trainer.gaussians.detached().parameters()))
     (log, parameters), (other_log, other_parameters) = states
-    assert log["loss"] == pytest.approx(other_log["loss"], rel=2e-3) and log["psnr"] == pytest.approx(other_log["psnr"], rel=2e-3)
+    assert log["loss"] == pytest.approx(other_log["loss"], rel=2e-3) and log["psnr"] == pytest.approx(
+        other_log["psnr"], rel=2e-3
+    )
     for name in ("means", "opacity_logits"):
         assert (parameters[name] - other_parameters[name]).abs().median() < 1e-4, name

@@ -15,7 +15,9 @@ PLANE = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
 
 
 def camera(x: float, y: float, z: float = 10.0, size=SIZE, calibration=CALIBRATION):
-    return pinhole_view(f"{x},{y}", size, calibration, look_at(np.array([x, y, z]), np.array([0.1 * x, 0.2 * y, 0.0])))
+    return pinhole_view(
+        f"{x},{y}", size, calibration, look_at(np.array([x, y, z]), np.array([0.1 * x, 0.2 * y, 0.0]))
+    )
 
 
 def plane_depth(view) -> torch.Tensor:
@@ -27,13 +29,17 @@ def plane_depth(view) -> torch.Tensor:
 
 def texture(points: np.ndarray) -> np.ndarray:
     x, y = points[..., 0], points[..., 1]
-    return 0.5 + 0.2 * np.sin(3.1 * x + 0.5 * y) + 0.2 * np.cos(2.3 * y - x) + 0.1 * np.sin(5 * x * 0.7 + 4 * y)
+    return (
+        0.5 + 0.2 * np.sin(3.1 * x + 0.5 * y) + 0.2 * np.cos(2.3 * y - x) + 0.1 * np.sin(5 * x * 0.7 + 4 * y)
+    )
 
 
 def plane_photo(view) -> torch.Tensor:
     directions, _ = rays(view)
     distance = -(view.centre @ PLANE) / (directions @ PLANE)
-    return torch.from_numpy(texture(view.centre + distance[:, None] * directions).reshape(view.height, view.width)).float()
+    return torch.from_numpy(
+        texture(view.centre + distance[:, None] * directions).reshape(view.height, view.width)
+    ).float()
 
 
 def plane_maps(view) -> tuple[torch.Tensor, torch.Tensor]:
@@ -63,7 +69,9 @@ def test_plane_has_no_geometric_error():
 def test_wrong_depth_has_the_epipolar_error_and_useful_gradients():
     view, other = camera(2, 1), camera(-1, 2)
     depth = (plane_depth(view) * 1.01).requires_grad_()
-    error, valid = reprojection_error((pixel_rays(view) * depth[..., None]).reshape(-1, 3), view, plane_depth(other), other)
+    error, valid = reprojection_error(
+        (pixel_rays(view) * depth[..., None]).reshape(-1, 3), view, plane_depth(other), other
+    )
     assert 0.05 < error[valid].median() < 1
     losses.geometric_loss(error, valid).backward()
     assert torch.isfinite(depth.grad).all()
@@ -122,12 +130,18 @@ def test_normal_kernel_equals_its_reference():
     start = plane_depth(view) * (1 + 0.02 * torch.rand(view.height, view.width, generator=generator))
     start[10:14, 20:25] = 0
     normal, _ = plane_maps(view)
-    alpha, edges = torch.rand(view.height, view.width, generator=generator), torch.rand(view.height, view.width, generator=generator)
+    alpha, edges = (
+        torch.rand(view.height, view.width, generator=generator),
+        torch.rand(view.height, view.width, generator=generator),
+    )
     results = []
     for fused in (True, False):
         depth, normals = start.clone().requires_grad_(), normal.clone().requires_grad_()
-        loss = depth_normal_loss(normals, depth, alpha, edges, pinhole(view)) if fused else losses.normal_loss(
-            normals, losses.normals_from_depth(depth, view), alpha, edges)
+        loss = (
+            depth_normal_loss(normals, depth, alpha, edges, pinhole(view))
+            if fused
+            else losses.normal_loss(normals, losses.normals_from_depth(depth, view), alpha, edges)
+        )
         (3 * loss).backward()
         results.append((loss.detach(), depth.grad, normals.grad))
     for one, other in zip(*results, strict=True):
@@ -139,11 +153,18 @@ def test_warped_plane_correlates():
     normal, distance = plane_maps(view)
     pixels = torch.from_numpy(pixel_centres(*SIZE).astype(np.int64))
     planes = normal.reshape(-1, 3).requires_grad_(), distance.reshape(-1).requires_grad_()
-    dissimilarity, inside = losses.patch_dissimilarity(planes, pixels, (plane_photo(view), view), (plane_photo(other), other))
+    dissimilarity, inside = losses.patch_dissimilarity(
+        planes, pixels, (plane_photo(view), view), (plane_photo(other), other)
+    )
     assert inside.float().mean() > 0.4
     assert dissimilarity[inside].median() < 0.005 and dissimilarity[inside].quantile(0.9) < 0.01  # NCC > 0.99
     wrong = planes[0], planes[1] * 1.1
-    assert losses.patch_dissimilarity(wrong, pixels, (plane_photo(view), view), (plane_photo(other), other))[0][inside].median() > 0.05
+    assert (
+        losses.patch_dissimilarity(wrong, pixels, (plane_photo(view), view), (plane_photo(other), other))[0][
+            inside
+        ].median()
+        > 0.05
+    )
 
 
 def test_patch_kernel_equals_its_reference():
@@ -153,7 +174,10 @@ def test_patch_kernel_equals_its_reference():
     greys = (plane_photo(view), view), (plane_photo(other), other)
     results = []
     for function in (losses.patch_dissimilarity, losses.patch_dissimilarity_reference):
-        planes = (normal * torch.tensor([1.0, 1.1, 0.98])).reshape(-1, 3).requires_grad_(), (distance * 1.02).reshape(-1).requires_grad_()
+        planes = (
+            (normal * torch.tensor([1.0, 1.1, 0.98])).reshape(-1, 3).requires_grad_(),
+            (distance * 1.02).reshape(-1).requires_grad_(),
+        )
         values, inside = function(planes, pixels, *greys)
         (values * inside * torch.linspace(0, 1, len(values))).sum().backward()
         results.append((values.detach() * inside, inside, planes[0].grad, planes[1].grad))
@@ -170,7 +194,9 @@ def test_photometric_gradient_leads_to_the_plane():
     pixels = torch.from_numpy(pixel_centres(*SIZE).astype(np.int64))
     for factor, sign in ((1.01, 1), (0.99, -1)):
         planes = normal.reshape(-1, 3), (distance.reshape(-1) * factor).requires_grad_()
-        loss = losses.photometric_loss(planes, pixels, torch.ones(len(pixels)), (plane_photo(view), view), (plane_photo(other), other))
+        loss = losses.photometric_loss(
+            planes, pixels, torch.ones(len(pixels)), (plane_photo(view), view), (plane_photo(other), other)
+        )
         loss.backward()
         gradient = planes[1].grad
         assert torch.isfinite(gradient).all() and loss > 0

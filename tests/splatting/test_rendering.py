@@ -21,13 +21,18 @@ def make_gaussians(count=150, coefficients=16, seed=0, size=-1.8):
     generator = torch.Generator().manual_seed(seed)
     spread = torch.tensor([2.0, 1.5, 1.0])
     return Gaussians(
-        torch.randn(count, 3, generator=generator) * spread, torch.randn(count, 3, generator=generator) * 0.6 + size,
-        torch.randn(count, 4, generator=generator), torch.randn(count, generator=generator) * 2,
-        torch.randn(count, coefficients, 3, generator=generator) * 0.3)
+        torch.randn(count, 3, generator=generator) * spread,
+        torch.randn(count, 3, generator=generator) * 0.6 + size,
+        torch.randn(count, 4, generator=generator),
+        torch.randn(count, generator=generator) * 2,
+        torch.randn(count, coefficients, 3, generator=generator) * 0.3,
+    )
 
 
 def make_view(width=45, height=37, calibration=(40.0, 42.0, 27.3, 15.1)):
-    return pinhole_view("view", (width, height), calibration, look_at(np.array([0.5, -1.0, -5.0]), np.zeros(3), up=(0, -1, 0)))
+    return pinhole_view(
+        "view", (width, height), calibration, look_at(np.array([0.5, -1.0, -5.0]), np.zeros(3), up=(0, -1, 0))
+    )
 
 
 def with_gradients(gaussians, dtype=torch.float32):
@@ -43,7 +48,9 @@ def weighted_sum(outputs, seed=5):
     return sum((output * torch.randn(output.shape, generator=generator)).sum() for output in outputs)
 
 
-def assert_equals_reference(gaussians, view, sh_degree=None, background=None, outputs=slice(None), tolerance=1e-5):
+def assert_equals_reference(
+    gaussians, view, sh_degree=None, background=None, outputs=slice(None), tolerance=1e-5
+):
     fast, slow = with_gradients(gaussians), with_gradients(gaussians, torch.float64)
     found = images(render(fast, view, sh_degree, background))[outputs]
     expected = render_reference(slow, view, sh_degree, background)[outputs]
@@ -66,28 +73,40 @@ def test_images_and_gradients_equal_the_dense_twin(sh_degree):
     assert 0.3 < expected[1].mean() < 0.9  # the scene is neither empty nor saturated
 
 
-@pytest.mark.parametrize("outputs", [slice(0, 1), slice(1, 2), slice(2, 3), slice(3, 4)], ids=["color", "alpha", "normal", "plane_distance"])
+@pytest.mark.parametrize(
+    "outputs",
+    [slice(0, 1), slice(1, 2), slice(2, 3), slice(3, 4)],
+    ids=["color", "alpha", "normal", "plane_distance"],
+)
 def test_gradients_of_each_output_alone(outputs):
     assert_equals_reference(make_gaussians(60, 4, seed=2), make_view(), outputs=outputs)
 
 
-@pytest.mark.parametrize("calibration", [(40.0, 42.0, -20.0, 60.0), (300.0, 200.0, 22.5, 18.5)], ids=["principal point outside", "telephoto"])
+@pytest.mark.parametrize(
+    "calibration",
+    [(40.0, 42.0, -20.0, 60.0), (300.0, 200.0, 22.5, 18.5)],
+    ids=["principal point outside", "telephoto"],
+)
 def test_unusual_calibrations(calibration):
-    assert_equals_reference(make_gaussians(200, 1, seed=3), make_view(calibration=calibration), background=BACKGROUND)
+    assert_equals_reference(
+        make_gaussians(200, 1, seed=3), make_view(calibration=calibration), background=BACKGROUND
+    )
 
 
 def test_camera_inside_the_scene_clamps_the_jacobian():
     view = pinhole_view("inside", (40, 40), (30.0, 30.0, 12.0, 25.0), np.eye(4))
     gaussians = make_gaussians(300, 4, seed=4, size=-2.5)
     slopes = gaussians.means[:, :2] / gaussians.means[:, 2:]
-    assert ((gaussians.means[:, 2] > 0.01) & (slopes.abs() > 2.5).any(1)).sum() > 20  # beyond the limits of the Jacobian
+    # beyond the limits of the Jacobian
+    assert ((gaussians.means[:, 2] > 0.01) & (slopes.abs() > 2.5).any(1)).sum() > 20
     assert_equals_reference(gaussians, view)
 
 
 def test_opaque_layers_stop_and_clamp_like_the_twin():
     gaussians = make_gaussians(120, 1, seed=6, size=-0.5)
     gaussians.opacity_logits += 6.0  # most of them above the limit of 0.99
-    expected = assert_equals_reference(gaussians, make_view(), tolerance=1e-4)  # float32 opacities near 1 are that coarse
+    # float32 opacities near 1 are that coarse
+    expected = assert_equals_reference(gaussians, make_view(), tolerance=1e-4)
     assert (expected[1] > 1 - 1e-4).double().mean() > 0.2
 
 
@@ -107,17 +126,27 @@ def test_tilted_wall_has_exact_depth():
     angle = np.radians(50.0)
     normal_cam = np.array([np.sin(angle), 0.2, -np.cos(angle)])
     normal_cam /= np.linalg.norm(normal_cam)
-    view = pinhole_view("wall", (60, 44), (55.0, 57.0, 21.0, 30.0), look_at(np.array([3.0, 1.0, 2.0]), np.array([0.0, 4.0, 1.0])))
+    view = pinhole_view(
+        "wall",
+        (60, 44),
+        (55.0, 57.0, 21.0, 30.0),
+        look_at(np.array([3.0, 1.0, 2.0]), np.array([0.0, 4.0, 1.0])),
+    )
     rotation, translation = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
-    tangent = np.linalg.svd(normal_cam[None])[2][1:]  # the wall lies 6 units in front of the camera and is made of many Gaussians
+    # the wall lies 6 units in front of the camera and is made of many Gaussians
+    tangent = np.linalg.svd(normal_cam[None])[2][1:]
     generator = np.random.default_rng(9)
     points_cam = np.array([0.0, 0.0, 6.0]) + generator.uniform(-9, 9, (400, 2)) @ tangent
     points_cam = points_cam[points_cam[:, 2] > 1.0]
     axes = np.stack([tangent[0], tangent[1], np.cross(tangent[0], tangent[1])], axis=1)
     count = len(points_cam)
     gaussians = Gaussians(
-        torch.tensor((points_cam - translation) @ rotation, dtype=torch.float32), torch.log(torch.tensor([[0.8, 0.8, 1e-4]])).repeat(count, 1),
-        quat_of(rotation.T @ axes).repeat(count, 1), torch.full((count,), 2.0), torch.zeros(count, 1, 3))
+        torch.tensor((points_cam - translation) @ rotation, dtype=torch.float32),
+        torch.log(torch.tensor([[0.8, 0.8, 1e-4]])).repeat(count, 1),
+        quat_of(rotation.T @ axes).repeat(count, 1),
+        torch.full((count,), 2.0),
+        torch.zeros(count, 1, 3),
+    )
     rendering = render(gaussians, view)
     u, v = np.meshgrid(np.arange(60) + 0.5, np.arange(44) + 0.5)
     rays = np.stack([(u - 21.0) / 55.0, (v - 30.0) / 57.0, np.ones_like(u)], axis=-1)
@@ -131,11 +160,14 @@ def test_tilted_wall_has_exact_depth():
 def quat_of(rotation):
     """(1, 4) wxyz quaternion of a rotation matrix, by the eigenvector of its symmetric form."""
     r = rotation if np.linalg.det(rotation) > 0 else rotation * [1, 1, -1]
-    matrix = np.array([
-        [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-        [0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
-        [0, 0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
-        [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]]])
+    matrix = np.array(
+        [
+            [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+            [0, 0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
+            [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]],
+        ]
+    )
     quat = torch.tensor(np.linalg.eigh(matrix, UPLO="U")[1][:, -1], dtype=torch.float32)[None]
     assert torch.allclose(rotation_matrices(quat)[0], torch.tensor(r, dtype=torch.float32), atol=1e-5)
     return quat
@@ -150,7 +182,10 @@ def test_depth_is_differentiable_and_safe_where_nothing_is():
     assert (depth[empty] == 0).all()
     depth.sum().backward()
     assert gaussians.means.grad.norm() > 0
-    assert all(torch.isfinite(getattr(gaussians, name).grad).all() for name in ("means", "log_scales", "quats", "opacity_logits"))
+    assert all(
+        torch.isfinite(getattr(gaussians, name).grad).all()
+        for name in ("means", "log_scales", "quats", "opacity_logits")
+    )
 
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one processor")
@@ -162,8 +197,17 @@ def test_threads_do_not_change_a_bit():
         rendering = render(gaussians, make_view(150, 110, (120.0, 120.0, 70.0, 50.0)))
         weighted_sum(images(rendering)).backward()
         statistics = rendering.statistics
-        results.append([*images(rendering), *(getattr(gaussians, name).grad for name in NAMES), statistics.gradient,
-                        statistics.absolute_gradient, statistics.weight, statistics.max_transmittance, rendering.radii])
+        results.append(
+            [
+                *images(rendering),
+                *(getattr(gaussians, name).grad for name in NAMES),
+                statistics.gradient,
+                statistics.absolute_gradient,
+                statistics.weight,
+                statistics.max_transmittance,
+                rendering.radii,
+            ]
+        )
     numba.set_num_threads(before)
     assert all(torch.equal(first, second) for first, second in zip(*results, strict=True))
 
@@ -200,7 +244,9 @@ def test_statistics():
     assert float(statistics.weight.sum()) == pytest.approx(float(rendering.alpha.detach().sum()), rel=1e-5)
     assert ((statistics.max_transmittance > 0) == (statistics.weight > 0)).all()
     assert ((statistics.weight == 0) | (rendering.radii > 0)).all()
-    nearest = (gaussians.means.detach().double() @ torch.tensor(view.cam_from_world[2, :3]))[statistics.weight > 0].argmin()
+    nearest = (gaussians.means.detach().double() @ torch.tensor(view.cam_from_world[2, :3]))[
+        statistics.weight > 0
+    ].argmin()
     assert statistics.max_transmittance[statistics.weight > 0][nearest] == 1.0
     assert statistics.max_transmittance.max() == 1.0
     weighted_sum(images(rendering)).backward()
@@ -209,7 +255,9 @@ def test_statistics():
 
 
 def test_gradient_statistic_is_the_derivative_by_the_2d_mean():
-    """A principal point that moves by one pixel moves every 2D mean by one pixel (the Jacobian moves with it, far from its clamp)."""
+    """A principal point that moves by one pixel moves every 2D mean by one pixel (the Jacobian moves with it,
+    far from its clamp).
+    """
     gaussians = make_gaussians(1, 1, seed=15)
     gaussians.means[:], gaussians.opacity_logits[:] = torch.tensor([[0.2, 0.1, 0.0]]), 1.0
     fast = with_gradients(gaussians)

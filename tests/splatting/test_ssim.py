@@ -17,7 +17,11 @@ def reference_ssim(x, y):
         return torch.nn.functional.conv2d(image.permute(2, 0, 1)[None], window, padding=5, groups=3)
 
     mean_x, mean_y = blur(x), blur(y)
-    variance_x, variance_y, covariance = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2, blur(x * y) - mean_x * mean_y
+    variance_x, variance_y, covariance = (
+        blur(x * x) - mean_x**2,
+        blur(y * y) - mean_y**2,
+        blur(x * y) - mean_x * mean_y,
+    )
     top = (2 * mean_x * mean_y + 0.01**2) * (2 * covariance + 0.03**2)
     return (top / ((mean_x**2 + mean_y**2 + 0.01**2) * (variance_x + variance_y + 0.03**2))).mean()
 
@@ -35,12 +39,16 @@ def test_value_and_gradient_equal_the_convolution(size):
     for weight in (0.0, 0.2, 1.0):
         fast.grad = slow.grad = None
         loss = image_loss(fast, target, weight)
-        expected = (1 - weight) * (slow - target.double()).abs().mean() + weight * (1 - reference_ssim(slow, target.double()))
+        expected = (1 - weight) * (slow - target.double()).abs().mean() + weight * (
+            1 - reference_ssim(slow, target.double())
+        )
         assert loss.item() == pytest.approx(expected.item(), abs=1e-6)
         (3 * loss).backward()
         (3 * expected).backward()
         assert (fast.grad - slow.grad).norm() < 1e-5 * slow.grad.norm()
-    assert ssim_loss(image, target).item() == pytest.approx(1 - reference_ssim(image.double(), target.double()).item(), abs=1e-6)
+    assert ssim_loss(image, target).item() == pytest.approx(
+        1 - reference_ssim(image.double(), target.double()).item(), abs=1e-6
+    )
 
 
 def test_flat_and_equal_images():

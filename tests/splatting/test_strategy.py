@@ -17,7 +17,10 @@ def tagged(count: int) -> tuple[RowAdam, Statistics]:
     """Row i of every tensor, moment and statistic holds the value i."""
     gaussians = random_gaussians(count, 1)
     tags = torch.arange(count, dtype=torch.float32)
-    parameters = {name: torch.zeros_like(tensor) + tags.reshape(-1, *[1] * (tensor.dim() - 1)) for name, tensor in gaussians.parameters().items()}
+    parameters = {
+        name: torch.zeros_like(tensor) + tags.reshape(-1, *[1] * (tensor.dim() - 1))
+        for name, tensor in gaussians.parameters().items()
+    }
     optimiser = RowAdam({name: tensor.requires_grad_() for name, tensor in parameters.items()}, RATES)
     for moments in (optimiser.means, optimiser.squares):
         for name in moments:
@@ -63,7 +66,9 @@ def test_adam_leaves_other_rows_alone():
     optimiser = RowAdam({"values": values}, {"values": [0.1, 0.1, 0.0]})
     values.grad = torch.ones(4, 3)
     optimiser.step(torch.tensor([True, False, True, False]))
-    assert torch.allclose(values.detach(), torch.tensor([[0.9, 0.9, 1.0], [1, 1, 1], [0.9, 0.9, 1.0], [1, 1, 1]]))
+    assert torch.allclose(
+        values.detach(), torch.tensor([[0.9, 0.9, 1.0], [1, 1, 1], [0.9, 0.9, 1.0], [1, 1, 1]])
+    )
     assert values.grad is None and not optimiser.means["values"][1].any()
 
 
@@ -71,7 +76,9 @@ def small_scene(count: int) -> tuple[RowAdam, Statistics]:
     gaussians = random_gaussians(count, 0)
     gaussians.log_scales.fill_(math.log(1e-4))
     gaussians.opacity_logits.zero_()
-    optimiser = RowAdam({name: tensor.requires_grad_() for name, tensor in gaussians.parameters().items()}, RATES)
+    optimiser = RowAdam(
+        {name: tensor.requires_grad_() for name, tensor in gaussians.parameters().items()}, RATES
+    )
     statistics = Statistics.zeros(count)
     statistics.count += 2
     return optimiser, statistics
@@ -83,7 +90,9 @@ def test_small_ones_are_cloned_and_large_ones_split():
     with torch.no_grad():
         optimiser.parameters["log_scales"][2:] = math.log(0.01)
     before = densify.current(optimiser).detached()
-    densify.densify(optimiser, statistics, DensifyLimits(extent=1.0, max_gaussians=100), torch.Generator().manual_seed(0))
+    densify.densify(
+        optimiser, statistics, DensifyLimits(extent=1.0, max_gaussians=100), torch.Generator().manual_seed(0)
+    )
     after = densify.current(optimiser).detached()
     assert len(after) == 6 + 2 + 2  # 2 clones, and 2 Gaussians replaced by 4
     assert torch.equal(after.means[4:6], before.means[:2])
@@ -98,7 +107,10 @@ def test_split_samples_have_the_covariance():
         optimiser.parameters["log_scales"][:] = torch.tensor([[0.0, -1.0, -3.0]])
     optimiser.take(torch.zeros(20000, dtype=torch.int64), torch.zeros(20000, dtype=torch.bool))
     statistics.take(torch.zeros(20000, dtype=torch.int64))
-    covariance, mean = densify.current(optimiser).covariances[0].detach(), optimiser.parameters["means"][0].detach().clone()
+    covariance, mean = (
+        densify.current(optimiser).covariances[0].detach(),
+        optimiser.parameters["means"][0].detach().clone(),
+    )
     nothing = torch.zeros(20000, dtype=torch.bool)
     densify.clone_and_split(optimiser, statistics, nothing, ~nothing, torch.Generator().manual_seed(0))
     assert torch.allclose(torch.cov((optimiser.parameters["means"].detach() - mean).T), covariance, atol=0.02)
@@ -129,7 +141,11 @@ def test_useless_ones_are_pruned():
 def test_trim_drops_what_is_hidden_or_floats():
     optimiser, statistics = small_scene(5)
     # seen by two of three; by one of three; by none; by the only one; by one of two
-    for radius, transmittance in (([3, 3, 3, 3, 3], [0.9, 0.9, 0.3, 0.9, 0.8]), ([3, 3, 3, 0, 3], [0.9, 0.2, 0.3, 0, 0.4]), ([3, 3, 3, 0, 0], [0] * 5)):
+    for radius, transmittance in (
+        ([3, 3, 3, 3, 3], [0.9, 0.9, 0.3, 0.9, 0.8]),
+        ([3, 3, 3, 0, 3], [0.9, 0.2, 0.3, 0, 0.4]),
+        ([3, 3, 3, 0, 0], [0] * 5),
+    ):
         statistics.add(torch.zeros(5), torch.zeros(5), torch.tensor(radius), torch.tensor(transmittance))
     kept = optimiser.parameters["means"][[0, 3, 4]].detach().clone()
     densify.trim(optimiser, statistics)
@@ -143,4 +159,6 @@ def test_opacity_reset():
     optimiser.means["opacity_logits"] += 1
     densify.reset_opacity(optimiser)
     assert torch.allclose(densify.current(optimiser).opacities, torch.full((3,), 0.01))
-    assert not optimiser.means["opacity_logits"].any() and optimiser.parameters["opacity_logits"].requires_grad
+    assert (
+        not optimiser.means["opacity_logits"].any() and optimiser.parameters["opacity_logits"].requires_grad
+    )

@@ -39,26 +39,43 @@ def trace(view) -> tuple[np.ndarray, np.ndarray]:
         hits.append(np.where(distance > 0, distance, np.inf))
     distance = np.minimum(*hits)  # the space above both planes is convex
     colour = surface_colour(view.centre + distance[:, None] * directions)
-    return (colour * 255 + 0.5).astype(np.uint8).reshape(HEIGHT, WIDTH, 3), (distance * along).reshape(HEIGHT, WIDTH)
+    return (colour * 255 + 0.5).astype(np.uint8).reshape(HEIGHT, WIDTH, 3), (distance * along).reshape(
+        HEIGHT, WIDTH
+    )
 
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[TrainingData, list[np.ndarray]]:
     centres = [(4 * np.cos(a), 3 * np.sin(a), 9 + np.cos(3 * a)) for a in np.arange(8) * np.pi / 4]
-    views = [pinhole_view(f"{i}.png", (WIDTH, HEIGHT), (90, 90, WIDTH / 2 + 2, HEIGHT / 2 - 1), look_at(np.array(c), np.array([0.2 * c[0], 0, 0])))
-             for i, c in enumerate(centres)]
+    views = [
+        pinhole_view(
+            f"{i}.png",
+            (WIDTH, HEIGHT),
+            (90, 90, WIDTH / 2 + 2, HEIGHT / 2 - 1),
+            look_at(np.array(c), np.array([0.2 * c[0], 0, 0])),
+        )
+        for i, c in enumerate(centres)
+    ]
     photos, depths = zip(*map(trace, views), strict=True)
     random = np.random.default_rng(0)
     points = np.concatenate([random.uniform(-8, 8, (1500, 2)), np.zeros((1500, 1))], 1)
     points[:, 2] = 0.3 * np.abs(points[:, 0])
     colors = (surface_colour(points) * 255).astype(np.uint8)
-    return TrainingData(views, list(photos), points + random.normal(0, 0.05, points.shape), colors), list(depths)
+    return TrainingData(views, list(photos), points + random.normal(0, 0.05, points.shape), colors), list(
+        depths
+    )
 
 
 @pytest.mark.parametrize(("plain", "tolerance"), [(True, 0.015), (False, 0.008)])
 def test_training_recovers_colour_and_depth(scene, plain, tolerance):
     data, depths = scene
-    result = train(data, TrainSettings(iterations=350, sh_degree=0, max_gaussians=6000, plain=plain, test_every=8, num_patches=1024), progress=False)
+    result = train(
+        data,
+        TrainSettings(
+            iterations=350, sh_degree=0, max_gaussians=6000, plain=plain, test_every=8, num_patches=1024
+        ),
+        progress=False,
+    )
     assert result.metrics["psnr"] > 22 and result.log[-1]["psnr"] > 22
     errors = []
     for view, truth in zip(data.views, depths, strict=True):
@@ -90,14 +107,20 @@ def test_empty_parts_are_filled_at_the_right_depth(scene):
 def test_same_seed_same_result_and_resume_is_exact(scene, tmp_path):
     data, _ = scene
     settings = replace(SHORT, checkpoint_every=35, surface_from=0.3, num_patches=256)
-    whole = train(data, settings, tmp_path / "checkpoint.pt", progress=False)  # leaves the checkpoint of iteration 35
+    # leaves the checkpoint of iteration 35
+    whole = train(data, settings, tmp_path / "checkpoint.pt", progress=False)
     resumed = train(data, settings, tmp_path / "checkpoint.pt", progress=False)
     fresh = train(data, settings, progress=False)
     for other in (resumed, fresh):
-        assert [(row["iteration"], row["loss"], row["psnr"]) for row in other.log] == [(row["iteration"], row["loss"], row["psnr"]) for row in whole.log]
+        assert [(row["iteration"], row["loss"], row["psnr"]) for row in other.log] == [
+            (row["iteration"], row["loss"], row["psnr"]) for row in whole.log
+        ]
         for name, tensor in whole.gaussians.parameters().items():
             assert torch.equal(tensor, other.gaussians.parameters()[name]), name
-    assert not torch.equal(train(data, replace(settings, seed=1), progress=False).gaussians.means[:100], whole.gaussians.means[:100])
+    assert not torch.equal(
+        train(data, replace(settings, seed=1), progress=False).gaussians.means[:100],
+        whole.gaussians.means[:100],
+    )
 
 
 def test_checkpoint_of_other_settings_is_not_used(scene, tmp_path, caplog):
@@ -112,7 +135,9 @@ def test_checkpoint_of_other_settings_is_not_used(scene, tmp_path, caplog):
 
 def test_cap_holds(scene):
     data, _ = scene
-    result = train(data, replace(SHORT, max_gaussians=1600, gradient_threshold=1e-9, densify_from=0.0), progress=False)
+    result = train(
+        data, replace(SHORT, max_gaussians=1600, gradient_threshold=1e-9, densify_from=0.0), progress=False
+    )
     assert 1000 < len(result.gaussians) <= 1600
     few = train(data, replace(SHORT, max_gaussians=700), progress=False)
     assert len(few.gaussians) <= 700
@@ -139,13 +164,19 @@ def test_two_views_are_enough_and_one_is_not(scene):
     with pytest.raises(InputError, match="at least 2"):
         train(replace(data, views=data.views[:1]), SHORT, progress=False)
     with pytest.raises(InputError, match="image of .* is 48x32, its view 96x64"):
-        train(replace(data, images=[photo[::2, ::2] for photo in data.images]), replace(SHORT, test_every=0), progress=False)
+        train(
+            replace(data, images=[photo[::2, ::2] for photo in data.images]),
+            replace(SHORT, test_every=0),
+            progress=False,
+        )
 
 
 def test_exposure_of_photos_is_found(scene):
     data, _ = scene
     gains = np.where(np.arange(8) % 2, 1.2, 0.85)
-    photos = [np.clip(photo * gain, 0, 255).astype(np.uint8) for photo, gain in zip(data.images, gains, strict=True)]
+    photos = [
+        np.clip(photo * gain, 0, 255).astype(np.uint8) for photo, gain in zip(data.images, gains, strict=True)
+    ]
     result = train(replace(data, images=photos), replace(SHORT, iterations=300), progress=False)
     brightness = np.exp(result.exposures[:, 0]) + 2 * result.exposures[:, 1]
     assert brightness[gains > 1].min() > brightness[gains < 1].max()
@@ -159,7 +190,10 @@ def test_schedules_scale_with_the_run(iterations):
     assert settings.densify_interval(40) >= min(40, iterations // 60)
     assert [settings.active_sh_degree(iterations * k // 30) for k in (0, 30)] == [0, 3]
     assert settings.position_rate(iterations, 10.0) == pytest.approx(0.01 * settings.position_rate(0, 10.0))
-    assert settings.allowed_gaussians(0, 1000) <= 1000 and settings.allowed_gaussians(iterations, 1000) == settings.max_gaussians
+    assert (
+        settings.allowed_gaussians(0, 1000) <= 1000
+        and settings.allowed_gaussians(iterations, 1000) == settings.max_gaussians
+    )
     assert any(settings.resets_opacity(step) for step in range(iterations)) == (iterations >= 7000)
     assert settings.shapes_surface(iterations // 2) and not settings.shapes_surface(iterations // 10)
     assert not TrainSettings(iterations=iterations, plain=True).shapes_surface(iterations - 1)

@@ -1,4 +1,6 @@
-"""The synthetic city: sites that meet, one at a time in memory, files that Open3D reads, masks that say what the cloud says."""
+"""The synthetic city: sites that meet, one at a time in memory, files that Open3D reads, masks that say what
+the cloud says.
+"""
 
 from __future__ import annotations
 
@@ -66,13 +68,29 @@ def truth_of(scene: Scene, view: View) -> np.ndarray:
 
 def test_cloud_and_mesh(made):
     scene, _ = made
-    cloud, mesh, record = read_cloud(scene.cloud), read_mesh(scene.mesh), json.loads((scene.path / "city.json").read_text())
+    cloud, mesh, record = (
+        read_cloud(scene.cloud),
+        read_mesh(scene.mesh),
+        json.loads((scene.path / "city.json").read_text()),
+    )
     points, middle = cloud.point.positions.numpy(), city.OFFSET
-    assert len(points) == SITES[0] * SITES[1] * POINTS == record["points"] and len(mesh.triangle.indices) == record["triangles"] > 20_000
-    assert {name: str(cloud.point[name].dtype) for name in cloud.point} == {"positions": "Float64", "normals": "Float32", "colors": "UInt8", "label": "UInt8"}
-    assert mesh.vertex.positions.dtype == o3d.core.float64 and np.array_equal(mesh.triangle.indices.numpy().ravel(), np.arange(3 * record["triangles"]))
+    assert (
+        len(points) == SITES[0] * SITES[1] * POINTS == record["points"]
+        and len(mesh.triangle.indices) == record["triangles"] > 20_000
+    )
+    assert {name: str(cloud.point[name].dtype) for name in cloud.point} == {
+        "positions": "Float64",
+        "normals": "Float32",
+        "colors": "UInt8",
+        "label": "UInt8",
+    }
+    assert mesh.vertex.positions.dtype == o3d.core.float64 and np.array_equal(
+        mesh.triangle.indices.numpy().ravel(), np.arange(3 * record["triangles"])
+    )
     assert (np.abs(points[:, :2] - middle[:2]) <= [60, 30]).all()
-    assert (np.ptp(points[:, :2], axis=0) > [119, 59]).all() and np.allclose(np.linalg.norm(cloud.point.normals.numpy(), axis=1), 1, atol=1e-5)
+    assert (np.ptp(points[:, :2], axis=0) > [119, 59]).all() and np.allclose(
+        np.linalg.norm(cloud.point.normals.numpy(), axis=1), 1, atol=1e-5
+    )
     left = points[:, 0] < middle[0]
     assert left.sum() == POINTS and set(np.unique(cloud.point.label.numpy())) == {0, 1, 2, 3, 4}
     assert not np.allclose(points[left][:100, 2], points[~left][:100, 2])  # each site has a seed of its own
@@ -82,7 +100,10 @@ def test_header_is_that_of_open3d(made, tmp_path):
     scene, _ = made
     o3d.t.io.write_point_cloud(str(tmp_path / "again.ply"), read_cloud(scene.cloud))
     again, own = (tmp_path / "again.ply").read_bytes(), scene.cloud.read_bytes()
-    parts = [[line for line in file.partition(b"end_header\n")[0].splitlines() if not line.startswith(b"comment")] for file in (again, own)]
+    parts = [
+        [line for line in file.partition(b"end_header\n")[0].splitlines() if not line.startswith(b"comment")]
+        for file in (again, own)
+    ]
     assert parts[0] == parts[1] and again.partition(b"end_header\n")[2] == own.partition(b"end_header\n")[2]
 
 
@@ -109,10 +130,15 @@ def test_every_truth_mask_agrees_with_the_cloud(made, surface):
         inside = np.flatnonzero(in_image(view, pixels))
         cell = pixels[inside].astype(int)
         central = np.abs(pixels[inside] - cell - 0.5).max(1) < 0.1
-        seen = np.abs(np.linalg.norm(points[inside] - view.centre, axis=1) - first.range[cell[:, 1], cell[:, 0]]) < 0.3
+        seen = (
+            np.abs(np.linalg.norm(points[inside] - view.centre, axis=1) - first.range[cell[:, 1], cell[:, 0]])
+            < 0.3
+        )
         rows = inside[central & seen]
         checked.append(len(rows))
-        assert (label[rows] == truth[cell[central & seen, 1], cell[central & seen, 0]]).mean() > 0.97, view.name
+        assert (label[rows] == truth[cell[central & seen, 1], cell[central & seen, 0]]).mean() > 0.97, (
+            view.name
+        )
     assert min(checked) > 100
 
 
@@ -145,19 +171,29 @@ def test_sites_are_built_when_asked_for(monkeypatch):
     sites = city.make_sites(SynthesizeCity(Path("x"), sites=(3, 2), seed=4))
     first = next(sites)
     assert built == [4000] and np.allclose(first.middle, [-120, -60, 0])
-    assert [site.number for site in sites] == [1, 2, 3, 4, 5] and built == [4000 + number for number in range(6)]
+    assert [site.number for site in sites] == [1, 2, 3, 4, 5] and built == [
+        4000 + number for number in range(6)
+    ]
 
 
 def test_masks_err_and_flight_covers_the_city(made):
     scene, _ = made
     views = scene.model.views
-    assert [view.name for view in views] == [f"view_{i:03d}.jpg" for i in range(4)] and {(view.width, view.height) for view in views} == {(160, 107)}
+    assert [view.name for view in views] == [f"view_{i:03d}.jpg" for i in range(4)] and {
+        (view.width, view.height) for view in views
+    } == {(160, 107)}
     assert 0.6 < json.loads((scene.path / "city.json").read_text())["mask_accuracy"] < 0.9
-    assert len(scene.mask_files(scene.masks, scene.class_table())) == len(scene.mask_files(scene.confidence)) == 4
+    assert (
+        len(scene.mask_files(scene.masks, scene.class_table()))
+        == len(scene.mask_files(scene.confidence))
+        == 4
+    )
     assert np.abs(local_origin(views)[:2] - city.OFFSET[:2]).max() < 150
     flown = fly_over((720.0, 600.0), SynthesizeCity(Path("x")))
     ground = pixel_centres(72, 60) * 10 - [360, 300]
-    seen = sum(in_image(view, project(view, np.c_[ground, np.zeros(len(ground))])[0]).astype(int) for view in flown)
+    seen = sum(
+        in_image(view, project(view, np.c_[ground, np.zeros(len(ground))])[0]).astype(int) for view in flown
+    )
     assert len(flown) == 200 and seen.min() >= 3 and 7 < np.median(seen) < 25
 
 

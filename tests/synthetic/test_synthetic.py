@@ -123,7 +123,9 @@ def test_truth_ends_at_the_border_of_the_site(views, photos):
 
 def test_crowns_let_the_ground_shine_through(photos):
     label = photos[2].label
-    tree_share = np.stack([np.roll(label == TREE, (dy, dx), (0, 1)) for dy in (-2, 0, 2) for dx in (-2, 0, 2)]).mean(0)
+    tree_share = np.stack(
+        [np.roll(label == TREE, (dy, dx), (0, 1)) for dy in (-2, 0, 2) for dx in (-2, 0, 2)]
+    ).mean(0)
     assert ((tree_share > 0.7) & (label != TREE)).sum() > 20
 
 
@@ -134,8 +136,15 @@ def test_photos_are_the_same_every_time(world, views, photos):
 
 
 def test_mask_noise_is_tuned_and_grows_with_strength(photos):
-    accuracy = [[(noisy_mask(photo.label, strength, np.random.default_rng([1, i]))[0] == photo.label)[photo.label != OTHER].mean()
-                 for i, photo in enumerate(photos)] for strength in (0.0, 0.25, 0.5, 1.0, 2.0)]
+    accuracy = [
+        [
+            (noisy_mask(photo.label, strength, np.random.default_rng([1, i]))[0] == photo.label)[
+                photo.label != OTHER
+            ].mean()
+            for i, photo in enumerate(photos)
+        ]
+        for strength in (0.0, 0.25, 0.5, 1.0, 2.0)
+    ]
     mean = np.mean(accuracy, axis=1)
     assert mean[0] == 1.0 and 0.70 < mean[3] < 0.84
     assert (np.diff(mean) < -0.02).all()
@@ -149,8 +158,18 @@ def test_perfect_masks_are_sure(photos):
 def test_mask_errors_of_two_views_are_unrelated(photos):
     wrong = []
     for seed in (0, 1):
-        masks = [noisy_mask(photo.label, 1.0, np.random.default_rng([seed, i]))[0] for i, photo in enumerate(photos)]
-        wrong.append(np.concatenate([(mask != photo.label)[plain(photo.label) & (photo.label > 0)] for mask, photo in zip(masks, photos)]))
+        masks = [
+            noisy_mask(photo.label, 1.0, np.random.default_rng([seed, i]))[0]
+            for i, photo in enumerate(photos)
+        ]
+        wrong.append(
+            np.concatenate(
+                [
+                    (mask != photo.label)[plain(photo.label) & (photo.label > 0)]
+                    for mask, photo in zip(masks, photos)
+                ]
+            )
+        )
     assert np.corrcoef(wrong[0], wrong[1])[0, 1] < 0.3
 
 
@@ -176,7 +195,9 @@ def test_truth_cloud_agrees_with_truth_masks(world, views, photos):
         pixels, depth = project(view, points)
         inside = np.flatnonzero(in_image(view, pixels))
         columns, rows = np.floor(pixels[inside]).astype(int).T
-        visible = (np.abs(photo.depth[rows, columns] - depth[inside]) < 0.05) & plain(photo.label)[rows, columns]
+        visible = (np.abs(photo.depth[rows, columns] - depth[inside]) < 0.05) & plain(photo.label)[
+            rows, columns
+        ]
         right += (photo.label[rows, columns] == label[inside])[visible].sum()
         total += visible.sum()
     assert total > 20_000 and right / total > 0.99
@@ -186,7 +207,13 @@ def test_truth_cloud_has_only_outer_surfaces(world):
     cloud = truth_cloud(world, 20_000, np.random.default_rng(1))
     points = cloud.point.positions.numpy()
     for building in world.buildings:
-        rect = (*building.centre, np.cos(building.yaw), np.sin(building.yaw), building.half[0] - 0.05, building.half[1] - 0.05)
+        rect = (
+            *building.centre,
+            np.cos(building.yaw),
+            np.sin(building.yaw),
+            building.half[0] - 0.05,
+            building.half[1] - 0.05,
+        )
         inside = rect_distance(points[:, :2], rect) < 0
         assert (points[inside, 2] > building.base + building.wall - 0.7).all()
 
@@ -208,7 +235,9 @@ def test_sparse_model_holds_the_true_cameras_and_exact_tracks(scene):
     model = read_sparse_model(path / "sparse" / "0")
     assert len(model.points) == summary["num_sparse_points"] > 300
     for view, true_view in zip(model.views, fly(settings)):
-        assert view.name == true_view.name and np.allclose(view.cam_from_world, true_view.cam_from_world, atol=1e-9)
+        assert view.name == true_view.name and np.allclose(
+            view.cam_from_world, true_view.cam_from_world, atol=1e-9
+        )
     reconstruction = pycolmap.Reconstruction(str(path / "sparse" / "0"))
     assert min(point.track.length() for point in reconstruction.points3D.values()) >= 3
     reconstruction.update_point_3d_errors()
@@ -220,9 +249,11 @@ def test_exif_gives_focal_length_and_position(scene):
     views = fly(settings)
     for view in views[:2]:
         file = path / "images" / view.name
-        assert pycolmap.infer_camera_from_image(file).mean_focal_length() == pytest.approx(view.focal, rel=1e-6)
+        assert pycolmap.infer_camera_from_image(file).mean_focal_length() == pytest.approx(
+            view.focal, rel=1e-6
+        )
         gps = Image.open(file).getexif().get_ifd(ExifTags.IFD.GPSInfo)
-        latitude, longitude = (sum(float(part) / 60 ** i for i, part in enumerate(gps[tag])) for tag in (2, 4))
+        latitude, longitude = (sum(float(part) / 60**i for i, part in enumerate(gps[tag])) for tag in (2, 4))
         assert gps[1] == "S" and gps[3] == "E"
         position = [-latitude, longitude, float(gps[ExifTags.GPS.GPSAltitude])]
         centre = pycolmap.GPSTransform().ellipsoid_to_enu(np.array([position]), *REFERENCE)[0]
@@ -250,4 +281,8 @@ def test_impossible_settings_are_refused(wrong):
 
 
 def _digests(path: Path) -> dict[str, str]:
-    return {str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(path.rglob("*")) if file.is_file()}
+    return {
+        str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in sorted(path.rglob("*"))
+        if file.is_file()
+    }

@@ -1,4 +1,6 @@
-"""Tile by tile equals in one piece: labels, votes, propagated labels and judged pixels, here and on Dask workers, whole and after a kill."""
+"""Tile by tile equals in one piece: labels, votes, propagated labels and judged pixels, here and on Dask
+workers, whole and after a kill.
+"""
 
 import json
 import os
@@ -48,6 +50,7 @@ def site(tmp_path_factory) -> Path:
 @pytest.fixture
 def small_tiles(monkeypatch):
     """Room for TILES points only, whatever a point needs."""
+
     def room(resources, _):
         return TILES if resources.max_memory == "2G" else 10**9
 
@@ -66,7 +69,9 @@ def run_label(site: Path, name: str, **options) -> dict[str, np.ndarray]:
     return columns(site / f"{name}.ply")
 
 
-def assert_same(first: dict[str, np.ndarray], second: dict[str, np.ndarray], but: tuple[str, ...] = ()) -> None:
+def assert_same(
+    first: dict[str, np.ndarray], second: dict[str, np.ndarray], but: tuple[str, ...] = ()
+) -> None:
     assert first.keys() == second.keys()
     for name in first:
         if name not in but:
@@ -82,7 +87,15 @@ def blocks(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return keys[order], votes[order]
 
 
-@pytest.mark.parametrize("options", [{}, {"reproject": True, "incidence": True, "density": True}, {"method": "direct"}, {"depth_filter": False}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"reproject": True, "incidence": True, "density": True},
+        {"method": "direct"},
+        {"depth_filter": False},
+    ],
+)
 def test_labels_and_votes_by_tile_are_those_of_the_whole_to_the_bit(site, small_tiles, options):
     whole, tiled = run_label(site, "whole", **options), run_label(site, "tiled", max_memory="2G", **options)
     assert_same(whole, tiled)
@@ -115,10 +128,14 @@ def test_map_by_tile_is_that_of_the_whole(site, small_tiles, options):
     label.run(Scene(site), Label(output=seeds))
     results = []
     for name, memory in (("whole", ""), ("tiled", "2G")):
-        propagate.run(Scene(site), Propagate(seeds=seeds, output=site / f"{name}_map.ply", max_memory=memory, **options))
+        propagate.run(
+            Scene(site), Propagate(seeds=seeds, output=site / f"{name}_map.ply", max_memory=memory, **options)
+        )
         results.append(columns(site / f"{name}_map.ply"))
     whole, tiled = results
-    assert (whole["label"] != tiled["label"]).mean() <= 1e-4 and (whole["state"] != tiled["state"]).mean() <= 1e-4
+    assert (whole["label"] != tiled["label"]).mean() <= 1e-4 and (
+        whole["state"] != tiled["state"]
+    ).mean() <= 1e-4
     assert (np.abs(whole["confidence"] - tiled["confidence"]) > 1e-3).mean() <= 1e-3
     assert (whole["label"] > 0).mean() > 0.95
     assert_same(whole, tiled, but=("label", "state", "confidence"))
@@ -130,7 +147,10 @@ def test_other_methods_by_tile_differ_in_few_points(site, small_tiles, method):
     label.run(Scene(site), Label(output=seeds))
     results = []
     for name, memory in (("whole", ""), ("tiled", "2G")):
-        propagate.run(Scene(site), Propagate(method=method, seeds=seeds, output=site / f"{name}_{method}.ply", max_memory=memory))
+        propagate.run(
+            Scene(site),
+            Propagate(method=method, seeds=seeds, output=site / f"{name}_{method}.ply", max_memory=memory),
+        )
         results.append(columns(site / f"{name}_{method}.ply")["label"])
     assert (results[0] != results[1]).mean() < 0.002
 
@@ -147,14 +167,21 @@ def test_points_that_hang_on_a_seed_only_through_other_tiles_are_reached(site, s
     votes[seeded, 0], votes[seeded, 1] = 2, 2
     cloud = o3d.t.geometry.PointCloud(points)
     cloud.point.normals = np.tile(np.float32([0, 0, 1]), (len(points), 1))
-    attributes = {"label": seeded.astype(np.uint8), "confidence": seeded.astype(np.float32), "state": seeded.astype(np.uint8), "num_views": (2 * seeded).astype(np.int32)}
+    attributes = {
+        "label": seeded.astype(np.uint8),
+        "confidence": seeded.astype(np.float32),
+        "state": seeded.astype(np.uint8),
+        "num_views": (2 * seeded).astype(np.int32),
+    }
     attributes |= {f"votes_{number}": votes[:, number] for number in range(3)}
     for name, values in attributes.items():
         cloud.point[name] = o3d.core.Tensor(values[:, None].copy())
     write_geometry(tmp_path / "seeds.ply", cloud)
     found = []
     for name, memory in (("whole", ""), ("tiled", "2G")):
-        propagate.run(Scene(tmp_path), Propagate(appearance=False, output=tmp_path / f"{name}.ply", max_memory=memory))
+        propagate.run(
+            Scene(tmp_path), Propagate(appearance=False, output=tmp_path / f"{name}.ply", max_memory=memory)
+        )
         found.append(columns(tmp_path / f"{name}.ply")["label"].ravel() > 0)
     for labelled in found:
         assert labelled[: -len(island)].all() and not labelled[-len(island) :].any()
@@ -164,7 +191,9 @@ def test_evaluation_by_tile_judges_the_same_pixels(site, small_tiles):
     label.run(Scene(site), Label(output=site / "judged.ply"))
     figures = []
     for memory in ("", "2G"):
-        settings = Evaluate(labelled=site / "judged.ply", output=site / f"metrics{memory}.json", max_memory=memory)
+        settings = Evaluate(
+            labelled=site / "judged.ply", output=site / f"metrics{memory}.json", max_memory=memory
+        )
         evaluate.run(Scene(site), settings)
         figures.append(json.loads(settings.output.read_text()))
     for part in ("labels", "masks", "labels_near_edges"):
@@ -191,14 +220,26 @@ def test_ranges_over_parts_of_a_mesh_are_those_of_the_whole(site, tmp_path):
 @pytest.fixture
 def command(site):
     """Runs `label` in a process of its own with room for few points, on `workers` Dask workers."""
-    program = "import sys\nfrom sc3d.tiling import label\nlabel.max_points = lambda *_: %d\nfrom sc3d.cli import main\nif __name__ == '__main__':\n    main()\n" % TILES
+    program = (
+        "import sys\nfrom sc3d.tiling import label\nlabel.max_points = lambda *_: %d\nfrom sc3d.cli import main\nif __name__ == '__main__':\n    main()\n"
+        % TILES
+    )
     script = site.parent / "few_points.py"
     script.write_text(program)
 
     def start(workers: int, output: Path) -> subprocess.Popen:
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+        environment = os.environ | {
+            "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+            "OMP_NUM_THREADS": "1",
+            "NUMBA_NUM_THREADS": "1",
+        }
         options = ["--workers", str(workers), "--max-memory", "12G", "--output", str(output)]
-        return subprocess.Popen([sys.executable, str(script), "label", str(site), *options], env=environment, stderr=subprocess.PIPE, text=True)
+        return subprocess.Popen(
+            [sys.executable, str(script), "label", str(site), *options],
+            env=environment,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
 
     return start
 
@@ -223,7 +264,11 @@ def kill_a_worker(parent: int, site: Path, seconds: float = 120) -> bool:
     while time.monotonic() < until:
         if any(folder.glob("results/label.*.npy") for folder in site.glob(".workers2.ply.*.parts")):
             for folder in Path("/proc").iterdir():
-                if folder.name.isdigit() and "spawn_main" in _said_by(folder, "cmdline") and f"PPid:\t{parent}\n" in _said_by(folder, "status"):
+                if (
+                    folder.name.isdigit()
+                    and "spawn_main" in _said_by(folder, "cmdline")
+                    and f"PPid:\t{parent}\n" in _said_by(folder, "status")
+                ):
                     os.kill(int(folder.name), signal.SIGKILL)
                     return True
         time.sleep(0.02)
@@ -253,7 +298,9 @@ def test_a_killed_run_keeps_its_finished_tiles(site, small_tiles, monkeypatch):
     assert not (site / "resumed.ply").exists()
     fused = []
     monkeypatch.setattr(tiled_label, "label_tile", original)
-    monkeypatch.setattr(tiled_label, "fuse", lambda *given, fuse=tiled_label.fuse: (fused.append(1), fuse(*given))[1])
+    monkeypatch.setattr(
+        tiled_label, "fuse", lambda *given, fuse=tiled_label.fuse: (fused.append(1), fuse(*given))[1]
+    )
     assert_same(expected, run_label(site, "resumed", max_memory="2G"))
     number = len(CloudFileTiles.of(site))
     assert len(fused) == number - 3
@@ -275,7 +322,10 @@ def test_parts_of_other_inputs_are_not_taken(tmp_path):
     source.write_text("one")
     first = Parts(tmp_path / "out.ply", "label", [source], Label())
     first.subfolder("tiles")
-    assert Parts(tmp_path / "out.ply", "label", [source], replace(Label(), workers=3, max_memory="9G")).folder == first.folder
+    assert (
+        Parts(tmp_path / "out.ply", "label", [source], replace(Label(), workers=3, max_memory="9G")).folder
+        == first.folder
+    )
     assert Parts(tmp_path / "out.ply", "label", [source], Label(consensus=0.9)).folder != first.folder
     assert not first.folder.exists()  # of no use any more
     source.write_text("other")
@@ -304,11 +354,15 @@ def test_a_store_gives_back_every_point_once_and_the_margin(site, tmp_path):
     cloud = CloudFile.open(site / "cloud.ply")
     points = read_cloud(site / "cloud.ply").point.positions.numpy()
     store = TileStore.build(cloud, Survey.of(cloud).grid(TILES, 18.0), tmp_path)
-    np.testing.assert_array_equal(np.sort(np.concatenate([store.rows(tile) for tile in store.tiles])), np.arange(POINTS))
+    np.testing.assert_array_equal(
+        np.sort(np.concatenate([store.rows(tile) for tile in store.tiles])), np.arange(POINTS)
+    )
     for tile in store.tiles:
         window = store.window(tile, 2.0)
         np.testing.assert_array_equal(window.rows, np.flatnonzero(store.grid.within(points, tile, 2.0)))
-        np.testing.assert_array_equal(window.rows[window.core], np.flatnonzero(store.grid.tile_of(points) == tile))
+        np.testing.assert_array_equal(
+            window.rows[window.core], np.flatnonzero(store.grid.tile_of(points) == tile)
+        )
         np.testing.assert_array_equal(window.gather(store.records)["x"], points[window.rows, 0])
 
 
@@ -324,7 +378,9 @@ def test_ply_in_chunks_is_what_open3d_reads(tmp_path):
         write_ply(tmp_path / "made.ply", dtype, 11, [records])
 
 
-@pytest.mark.parametrize(("text", "amount"), [("6G", 6 << 30), ("1500M", 1500 << 20), ("2.5 GiB", 5 << 29), ("", None)])
+@pytest.mark.parametrize(
+    ("text", "amount"), [("6G", 6 << 30), ("1500M", 1500 << 20), ("2.5 GiB", 5 << 29), ("", None)]
+)
 def test_amounts_of_memory(text, amount):
     assert memory_of(Label(max_memory=text)) == (amount or memory_of(Label()))
 
@@ -337,7 +393,9 @@ def test_memory_that_is_none_or_too_little_is_refused(text):
 
 
 def test_a_cloud_that_cannot_be_read_in_parts_is_refused(tmp_path):
-    (tmp_path / "text.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n")
+    (tmp_path / "text.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n"
+    )
     with pytest.raises(InputError, match="binary PLY"):
         CloudFile.open(tmp_path / "text.ply")
     with pytest.raises(InputError, match="PLY, LAS or LAZ"):

@@ -1,4 +1,6 @@
-"""The speed benchmark on tiny scenes: complete figures, honest counts, a rival that is there, broken or missing."""
+"""The speed benchmark on tiny scenes: complete figures, honest counts, a rival that is there, broken or
+missing.
+"""
 
 import json
 import subprocess
@@ -57,14 +59,22 @@ def brute_force_fragments(gaussians: Gaussians, view) -> float:
     means_cam = gaussians.means @ rotation.T + torch.tensor(view.cam_from_world[:3, 3]).float()
     order = means_cam[:, 2].argsort()
     order = order[means_cam[order, 2] > 0.01]
-    alphas = _alphas(means_cam[order].double(), (rotation @ rotation_matrices(gaussians.quats[order])).double(),
-                     gaussians.log_scales[order].double().exp(), gaussians.opacity_logits[order].double().sigmoid(), view)
+    alphas = _alphas(
+        means_cam[order].double(),
+        (rotation @ rotation_matrices(gaussians.quats[order])).double(),
+        gaussians.log_scales[order].double().exp(),
+        gaussians.opacity_logits[order].double().sigmoid(),
+        view,
+    )
     reached = torch.cumprod(torch.cat([torch.ones_like(alphas[:, :1]), 1 - alphas], 1), 1)[:, :-1]
     return float(((alphas > 0) & (reached >= 1e-4)).sum(1).double().mean())
 
 
 def test_fragments_equal_a_brute_force_count(workload):
-    opaque = Gaussians(**workload.gaussians.parameters() | {"opacity_logits": workload.gaussians.opacity_logits + 3})  # pixels that are finished early
+    # pixels that are finished early
+    opaque = Gaussians(
+        **workload.gaussians.parameters() | {"opacity_logits": workload.gaussians.opacity_logits + 3}
+    )
     for gaussians in (workload.gaussians, opaque):
         for view in workload.views:
             fragments, slots, _ = count_fragments(gaussians, view)
@@ -75,7 +85,13 @@ def test_fragments_equal_a_brute_force_count(workload):
 def test_known_count():
     """One large Gaussian covers every pixel of a view, once."""
     view = pinhole_view("a", (40, 24), (40, 40, 20, 12), look_at(np.array([0, 0, 5.0]), np.zeros(3)))
-    parameters = [torch.zeros(1, 3), torch.full((1, 3), 3.0), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1), torch.zeros(1, 1, 3)]
+    parameters = [
+        torch.zeros(1, 3),
+        torch.full((1, 3), 3.0),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.ones(1),
+        torch.zeros(1, 1, 3),
+    ]
     assert count_fragments(Gaussians(*parameters), view) == pytest.approx((1, 1, 1))
 
 
@@ -84,7 +100,12 @@ def test_workload_is_calibrated(workload):
     fragments, _, share = count_fragments(larger.gaussians, larger.views[0])
     assert abs(fragments / FRAGMENTS - 1) < 0.05 and abs(share / VISIBLE_SHARE - 1) < 0.5
     again = build_workload(synthetic_ground(2000), 600, 64)
-    assert all(torch.equal(a, b) for a, b in zip(workload.gaussians.parameters().values(), again.gaussians.parameters().values(), strict=True))
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(
+            workload.gaussians.parameters().values(), again.gaussians.parameters().values(), strict=True
+        )
+    )
 
 
 def test_command_writes_all_figures(tmp_path, capsys):
@@ -98,9 +119,17 @@ def test_command_writes_all_figures(tmp_path, capsys):
         assert all(seconds > 0 for seconds in stages.values())
         if clock == "cpu_seconds":  # the others wait for whoever else is busy
             assert sum(stages.values()) - stages["total"] == pytest.approx(stages["total"], rel=0.2)
-    assert 0 < column["arithmetic_fraction"] < 1 and column["peak_memory_mb"] > 100 and 0 < column["idle_speed_up"] <= 1.2 * column["threads"]
-    assert column["surface_step_ratio"] == pytest.approx(column["surface_step_cpu_seconds"] / column["plain_step_cpu_seconds"])
-    assert (column["gaussians"], column["width"]) == (600, 64) and column["fragments_per_pixel"] == pytest.approx(FRAGMENTS, rel=0.05)
+    assert (
+        0 < column["arithmetic_fraction"] < 1
+        and column["peak_memory_mb"] > 100
+        and 0 < column["idle_speed_up"] <= 1.2 * column["threads"]
+    )
+    assert column["surface_step_ratio"] == pytest.approx(
+        column["surface_step_cpu_seconds"] / column["plain_step_cpu_seconds"]
+    )
+    assert (column["gaussians"], column["width"]) == (600, 64) and column[
+        "fragments_per_pixel"
+    ] == pytest.approx(FRAGMENTS, rel=0.05)
     page = output.with_suffix(".md").read_text()
     assert page == markdown(record) and "| total, CPU ms |" in page and "reference machine" in page
 
@@ -110,10 +139,25 @@ def test_command_takes_a_scene_and_a_rival(tmp_path):
     scene = write_points_scene(tmp_path / "scene", ground)
     binary = program(tmp_path / "opensplat", RIVAL)
     output = tmp_path / "speed.json"
-    main([*TINY, "--repeats", "1", "--no-surface", "--scene", str(scene), "--opensplat", str(binary), "--output", str(output)])
+    main(
+        [
+            *TINY,
+            "--repeats",
+            "1",
+            "--no-surface",
+            "--scene",
+            str(scene),
+            "--opensplat",
+            str(binary),
+            "--output",
+            str(output),
+        ]
+    )
     (column,) = json.loads(output.read_text())["configurations"]
     assert column["opensplat_cpu_seconds"] == pytest.approx(0.03, rel=0.5)
-    assert column["opensplat_ratio"] == pytest.approx(column["opensplat_cpu_seconds"] / column["cpu_seconds"]["total"])
+    assert column["opensplat_ratio"] == pytest.approx(
+        column["opensplat_cpu_seconds"] / column["cpu_seconds"]["total"]
+    )
     assert "surface_step_ratio" not in column
     page = output.with_suffix(".md").read_text()
     assert "OpenSplat / sc3d" in page and "reference machine" not in page and str(tmp_path) not in page
@@ -123,17 +167,33 @@ def test_rival_project_holds_the_same_scene(workload, tmp_path):
     opensplat.write_project(workload, tmp_path)
     model = read_sparse_model(tmp_path / "sparse" / "0")
     for view, photo, written in zip(workload.views, workload.photos, model.views, strict=True):
-        assert np.allclose(written.cam_from_world, view.cam_from_world) and written.camera.model.name == "PINHOLE"
+        assert (
+            np.allclose(written.cam_from_world, view.cam_from_world)
+            and written.camera.model.name == "PINHOLE"
+        )
         assert np.array_equal(read_image(tmp_path / "images" / written.name), photo)
     gaussians = Gaussians.load(tmp_path / "gaussians.ply")[0]
-    assert torch.equal(gaussians.means, workload.gaussians.means) and torch.equal(gaussians.sh[:, :1], workload.gaussians.sh)
+    assert torch.equal(gaussians.means, workload.gaussians.means) and torch.equal(
+        gaussians.sh[:, :1], workload.gaussians.sh
+    )
     assert gaussians.sh_degree == 1
 
 
 def test_missing_and_broken_rival(tmp_path, capsys, caplog):
     assert "no OpenSplat at" in fails(capsys, *TINY, "--opensplat", tmp_path / "nowhere")
     broken = program(tmp_path / "broken", "#!/bin/sh\necho 'cannot read it' >&2\nexit 3\n")
-    main([*TINY, "--repeats", "2", "--no-surface", "--opensplat", str(broken), "--output", str(tmp_path / "speed.json")])
+    main(
+        [
+            *TINY,
+            "--repeats",
+            "2",
+            "--no-surface",
+            "--opensplat",
+            str(broken),
+            "--output",
+            str(tmp_path / "speed.json"),
+        ]
+    )
     assert caplog.text.count("OpenSplat ended with status 3: cannot read it") == 1
     assert "opensplat_ratio" not in json.loads((tmp_path / "speed.json").read_text())["configurations"][0]
 
@@ -160,14 +220,24 @@ def test_stopwatch_times_and_restores():
 
 
 def test_reference_ratio_needs_a_measured_configuration():
-    column = {"gaussians": 50_000, "width": 496, "height": 279, "cpu_seconds": {"total": 0.0885}, "ceiling_gflops": 80.0}
-    assert reference_ratio(column, scaled=False) == pytest.approx(10) and reference_ratio(column, scaled=True) == pytest.approx(5)
+    column = {
+        "gaussians": 50_000,
+        "width": 496,
+        "height": 279,
+        "cpu_seconds": {"total": 0.0885},
+        "ceiling_gflops": 80.0,
+    }
+    assert reference_ratio(column, scaled=False) == pytest.approx(10) and reference_ratio(
+        column, scaled=True
+    ) == pytest.approx(5)
     assert reference_ratio(column | {"gaussians": 7}, scaled=False) is None
 
 
 def test_help_imports_nothing_heavy():
-    code = ("import sys\nfrom tools.benchmark.__main__ import main\ntry:\n    main(['speed', '--help'])\nexcept SystemExit: pass\n"
-            "assert not {'torch', 'numba', 'open3d', 'numpy'} & set(sys.modules)")
+    code = (
+        "import sys\nfrom tools.benchmark.__main__ import main\ntry:\n    main(['speed', '--help'])\nexcept SystemExit: pass\n"
+        "assert not {'torch', 'numba', 'open3d', 'numpy'} & set(sys.modules)"
+    )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 0 and "--opensplat" in result.stdout, result.stderr
 

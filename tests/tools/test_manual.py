@@ -29,7 +29,9 @@ def test_there_is_a_page_for_every_command(pages):
 
 def test_the_committed_pages_are_those_that_the_code_writes(pages):
     for file in pages.glob("*.md"):
-        assert (MANUAL / "commands" / file.name).read_text() == file.read_text(), f"run: python tools/make_manual.py"
+        assert (MANUAL / "commands" / file.name).read_text() == file.read_text(), (
+            f"run: python tools/make_manual.py"
+        )
 
 
 @pytest.mark.parametrize("command", ["label", "segment", "export", "reconstruct", "import", "view"])
@@ -45,12 +47,19 @@ def test_options_tell_defaults_choices_and_positionals():
     found = {option.flag: option for option in options(Label)}
     assert found["--edge-width"].default == "3.0" and found["--edge-width"].values == "number"
     assert found["--method"].values == "direct, majority, conflict-lock, paper"
-    assert "--depth-filter, --no-depth-filter" in found and "labels penetrate" in found["--depth-filter, --no-depth-filter"].help
+    assert (
+        "--depth-filter, --no-depth-filter" in found
+        and "labels penetrate" in found["--depth-filter, --no-depth-filter"].help
+    )
     assert {option.flag: option.values for option in options(Segment)}["--prompts"] == "text ..."
     flags = [option.flag for option in options(ReconstructCommand)]
     assert flags[:2] == ["PHOTOS", "SCENE"] and "--matching" in flags
 
 
 def test_the_examples_of_the_geometry_utilities_run():
-    failed, tried = doctest.testfile(str(MANUAL / "geometry.md"), module_relative=False, optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+    failed, tried = doctest.testfile(
+        str(MANUAL / "geometry.md"),
+        module_relative=False,
+        optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE,
+    )
     assert tried > 10 and not failed

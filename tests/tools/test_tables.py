@@ -1,4 +1,6 @@
-"""`sc3d benchmark tables`, `fusion-speed` and `surface` on tiny scenes: the same figures as the stages, rows kept, rows for every switch."""
+"""`sc3d benchmark tables`, `fusion-speed` and `surface` on tiny scenes: the same figures as the stages, rows
+kept, rows for every switch.
+"""
 
 import json
 from dataclasses import fields, replace
@@ -48,7 +50,24 @@ def command(path: Path) -> list:
     scene = path / "given"
     if not scene.exists():
         write_bare_scene(scene)
-    return ["tables", path, "--scenes", scene, "--seeds", "0", "--noises", "1", "--views", "6", "--width", "160", "--points", "20000", "--every", "1"]
+    return [
+        "tables",
+        path,
+        "--scenes",
+        scene,
+        "--seeds",
+        "0",
+        "--noises",
+        "1",
+        "--views",
+        "6",
+        "--width",
+        "160",
+        "--points",
+        "20000",
+        "--every",
+        "1",
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -61,28 +80,50 @@ def figures(record: dict, name: str, scene: int = 0) -> dict:
     return record["results"][scene]["rows"][key]
 
 
-@pytest.mark.parametrize(("name", "method", "how"), [(DEFAULT, "conflict-lock", "map"), (OURS, "conflict-lock", "geometry")])
+@pytest.mark.parametrize(
+    ("name", "method", "how"), [(DEFAULT, "conflict-lock", "map"), (OURS, "conflict-lock", "geometry")]
+)
 def test_rows_equal_the_stages(folder, record, tmp_path, name, method, how):
     scene = folder / "seed0_noise1"
     run("label", scene, "--method", method, "--output", tmp_path / "seeds.ply")
-    run("propagate", scene, "--method", how, "--seeds", tmp_path / "seeds.ply", "--output", tmp_path / "full.ply")
+    run(
+        "propagate",
+        scene,
+        "--method",
+        how,
+        "--seeds",
+        tmp_path / "seeds.ply",
+        "--output",
+        tmp_path / "full.ply",
+    )
     run("evaluate", scene, "--labelled", tmp_path / "full.ply", "--output", tmp_path / "metrics.json")
     metrics, found = json.loads((tmp_path / "metrics.json").read_text()), figures(record, name)
-    for area, key in (("all", "labels"), ("near_edges", "labels_near_edges"), ("elsewhere", "labels_elsewhere")):
+    for area, key in (
+        ("all", "labels"),
+        ("near_edges", "labels_near_edges"),
+        ("elsewhere", "labels_elsewhere"),
+    ):
         assert found[area] == metrics[key]
     masks = record["results"][0]["rows"]["masks"]
     assert masks["all"] == metrics["masks"] and masks["bound"]["all"]["oa"] > max(0.9, found["all"]["oa"])
-    truth, label = (read_cloud(path).point["label"].numpy().ravel() for path in (folder / "seed0" / "truth.ply", tmp_path / "full.ply"))
+    truth, label = (
+        read_cloud(path).point["label"].numpy().ravel()
+        for path in (folder / "seed0" / "truth.ply", tmp_path / "full.ply")
+    )
     assert found["points"]["oa"] == pytest.approx((truth == label)[truth > 0].mean())
     believed = metrics["reliability"]
     assert found["reliability"] == believed
-    assert 0 < believed["ece"] < 0.5 and sum(count for _, _, count in filter(None, believed["bins"])) == round(metrics["labels"]["coverage"] * metrics["labels"]["pixels"])
+    assert 0 < believed["ece"] < 0.5 and sum(
+        count for _, _, count in filter(None, believed["bins"])
+    ) == round(metrics["labels"]["coverage"] * metrics["labels"]["pixels"])
 
 
 def test_scene_by_path_and_costs(record):
     assert [result["group"] for result in record["results"]] == ["synthetic, mask noise 1", "given"]
     given = figures(record, DEFAULT, 1)
-    assert given["all"]["oa"] > 0.98 and "points" not in given and set(given["all"]["iou"]) == {"road", "grass"}
+    assert (
+        given["all"]["oa"] > 0.98 and "points" not in given and set(given["all"]["iou"]) == {"road", "grass"}
+    )
     for result in record["results"]:
         for key, row in result["rows"].items():
             if key != "masks":
@@ -96,7 +137,11 @@ def test_rows_are_kept_and_only_missing_ones_computed(folder, record, monkeypatc
     monkeypatch.undo()
     assert (folder / "tables.md").read_text() == page_before
     files = {file: file.stat().st_mtime_ns for file in (folder / "rows").rglob("*.json")}
-    lost = next(file for file in files if json.loads(file.read_text())["name"] == "conflict-lock + KNN" and "seed0" in file.parent.name)
+    lost = next(
+        file
+        for file in files
+        if json.loads(file.read_text())["name"] == "conflict-lock + KNN" and "seed0" in file.parent.name
+    )
     lost.unlink()
     calls, fuse = [], tables.fuse
     monkeypatch.setattr(tables, "fuse", lambda *arguments: calls.append(arguments[-1]) or fuse(*arguments))
@@ -110,20 +155,35 @@ def test_rows_are_kept_and_only_missing_ones_computed(folder, record, monkeypatc
 def test_masks_of_strength_one_are_those_of_synthesize(folder):
     for name in ("masks", "confidence", "truth"):
         for file in (folder / "seed0" / name).iterdir():
-            assert np.array_equal(read_index_image(file), read_index_image(folder / "seed0_noise1" / name / file.name))
+            assert np.array_equal(
+                read_index_image(file), read_index_image(folder / "seed0_noise1" / name / file.name)
+            )
 
 
 def test_every_switch_has_a_row_that_turns_it_alone():
     rows = ablation()
     for default in (Label(), Propagate()):
-        stage, records = type(default).__name__.lower(), [getattr(row, type(default).__name__.lower()) for row in rows]
-        changed = [[field.name for field in fields(default) if getattr(record, field.name) != getattr(default, field.name)] for record in records]
+        stage, records = (
+            type(default).__name__.lower(),
+            [getattr(row, type(default).__name__.lower()) for row in rows],
+        )
+        changed = [
+            [
+                field.name
+                for field in fields(default)
+                if getattr(record, field.name) != getattr(default, field.name)
+            ]
+            for record in records
+        ]
         assert all(len(set(names) - {"method"} or names) <= 1 for names in changed)
         flags = {name for name, hint in get_type_hints(type(default)).items() if hint is bool}
         zeros = {name for name, text in helps(type(default)).items() if "0 = off" in text}
         assert flags | zeros | {"method"} <= {name for names in changed for name in names}, stage
     assert len({row.key for row in rows}) == len(rows) and all(row.key != row.base.key for row in rows)
-    assert {getattr(record, "edge_width") for _, record in turned(replace(Label(), edge_width=0.0))} == {0.0, 1.0}
+    assert {getattr(record, "edge_width") for _, record in turned(replace(Label(), edge_width=0.0))} == {
+        0.0,
+        1.0,
+    }
 
 
 def test_changed_inputs_are_other_rows(folder, tmp_path):
@@ -138,14 +198,36 @@ def test_page_shows_means_spread_and_differences():
     def result(seed: int, ours: float, other: float) -> dict:
         def row(value: float) -> dict:
             area = {"oa": value + 0.1, "miou": value, "iou": {"road": value}, "coverage": 1.0}
-            return {"all": area, "near_edges": area, "elsewhere": area, "cpu_seconds": 100 * value, "peak_memory_mb": 500}
+            return {
+                "all": area,
+                "near_edges": area,
+                "elsewhere": area,
+                "cpu_seconds": 100 * value,
+                "peak_memory_mb": 500,
+            }
+
         keys = {row["key"] for rows in layout.values() for row in rows}
-        found = {key: row(ours if key == "0" else other) for key in keys} | {"masks": {area: row(other)[area] for area in ("all", "near_edges", "elsewhere")}}
-        return {"scene": f"seed{seed}", "group": "synthetic", "seed": seed, "classes": ["road"], "rows": found}
+        found = {key: row(ours if key == "0" else other) for key in keys} | {
+            "masks": {area: row(other)[area] for area in ("all", "near_edges", "elsewhere")}
+        }
+        return {
+            "scene": f"seed{seed}",
+            "group": "synthetic",
+            "seed": seed,
+            "classes": ["road"],
+            "rows": found,
+        }
 
     names = dict.fromkeys(name for _, _, *pair in DIFFERENCES for name in pair)
-    layout = {"Table 1": [{"name": name, "key": "0" if name == OURS else str(row + 1)} for row, name in enumerate(names)]}
-    layout["Ablation"] = [layout["Table 1"][list(names).index(DEFAULT)], {"name": "label: --no-thing", "key": "0", "base": str(list(names).index(DEFAULT) + 1)}]
+    layout = {
+        "Table 1": [
+            {"name": name, "key": "0" if name == OURS else str(row + 1)} for row, name in enumerate(names)
+        ]
+    }
+    layout["Ablation"] = [
+        layout["Table 1"][list(names).index(DEFAULT)],
+        {"name": "label: --no-thing", "key": "0", "base": str(list(names).index(DEFAULT) + 1)},
+    ]
     results = [result(0, 0.9, 0.7), result(1, 0.8, 0.5)]
     text = markdown({"settings": {"every": 4}, "code": "abc", "layout": layout, "results": results})
     assert "| ours - majority voting | +12.39 / +17.03 | +25.00 ± 7.07 / +25.00 ± 7.07 |" in text
@@ -165,22 +247,45 @@ def test_bad_input(folder, tmp_path, capsys):
 def test_z_buffer_voter_and_scikit_learn_find_the_classes():
     cloud = Cloud(ground(), None)
     label = fusion_rivals.vote_with_z_buffer(cloud, views(), lambda view: (truth_mask(view), None), 4)
-    expected = np.where(cloud.points[:, 0] < 512345.0 - 0.1, 1, np.where(cloud.points[:, 0] > 512345.0 + 0.2, 3, 0))
-    inner = (expected > 0) & (np.abs(cloud.points[:, 1] - 5187654.0) < 3.5) & (np.abs(cloud.points[:, 0] - 512345.0) < 3.5)
+    expected = np.where(
+        cloud.points[:, 0] < 512345.0 - 0.1, 1, np.where(cloud.points[:, 0] > 512345.0 + 0.2, 3, 0)
+    )
+    inner = (
+        (expected > 0)
+        & (np.abs(cloud.points[:, 1] - 5187654.0) < 3.5)
+        & (np.abs(cloud.points[:, 0] - 512345.0) < 3.5)
+    )
     assert (label == expected)[inner].mean() > 0.99
-    filled = fusion_rivals.classify_neighbors(cloud.points - cloud.points[0], np.where(np.arange(len(label)) % 3, label, 0).astype(np.uint8))
+    filled = fusion_rivals.classify_neighbors(
+        cloud.points - cloud.points[0], np.where(np.arange(len(label)) % 3, label, 0).astype(np.uint8)
+    )
     assert (filled == expected)[inner].mean() > 0.98
 
 
 def test_fusion_speed(folder, tmp_path):
     output = tmp_path / "speed.json"
-    run("fusion-speed", folder / "seed0_noise1", "--points", "3000", "6000", "--views", "4", "12", "--repeats", "1", "--output", output)
+    run(
+        "fusion-speed",
+        folder / "seed0_noise1",
+        "--points",
+        "3000",
+        "6000",
+        "--views",
+        "4",
+        "12",
+        "--repeats",
+        "1",
+        "--output",
+        output,
+    )
     record = json.loads(output.read_text())
     assert record["rays"] == 6 * 160 * 107 and [row["views"] for row in record["growth_views"]] == [4, 12]
     assert [row["points"] for row in record["growth_points"]] == [3000, 6000]
     assert all(seconds > 0 for clocks in record["contenders"].values() for seconds in clocks.values())
     ratio = record["contenders"]["label"]["cpu_seconds"] / record["contenders"]["rays only"]["cpu_seconds"]
-    assert output.with_suffix(".md").read_text() == fusion_markdown(record) and f"| {ratio:.2f} |" in fusion_markdown(record)
+    assert output.with_suffix(".md").read_text() == fusion_markdown(
+        record
+    ) and f"| {ratio:.2f} |" in fusion_markdown(record)
 
 
 def test_surface_of_the_truth_itself_is_perfect(folder, tmp_path, monkeypatch, capsys):
@@ -190,13 +295,26 @@ def test_surface_of_the_truth_itself_is_perfect(folder, tmp_path, monkeypatch, c
     scene.mkdir()
     for name, target in {"mesh.ply": "truth_mesh.ply", "sparse": "sparse"}.items():
         (scene / name).symlink_to(truth.path / target)
-    points = torch.tensor(read_cloud(truth.path / "truth.ply").point.positions.numpy() - local_origin(truth.model.views)).float()
+    points = torch.tensor(
+        read_cloud(truth.path / "truth.ply").point.positions.numpy() - local_origin(truth.model.views)
+    ).float()
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(points), 1)
-    Gaussians(points, torch.full_like(points, np.log(0.4)), quats, torch.full((len(points),), 4.0), torch.zeros(len(points), 1, 3)).save(scene / "gaussians.ply")
+    Gaussians(
+        points,
+        torch.full_like(points, np.log(0.4)),
+        quats,
+        torch.full((len(points),), 4.0),
+        torch.zeros(len(points), 1, 3),
+    ).save(scene / "gaussians.ply")
     assert "--voxel-size" in fails(capsys, "surface", scene, truth.path)
     (scene / "mesh.ply.json").write_text(json.dumps({"summary": {"voxel_size": 0.25}}))
     assert voxel_size_of(Scene(scene)) == 0.25
     run("surface", scene, truth.path, "--output", tmp_path / "surface.json")
     found = json.loads((tmp_path / "surface.json").read_text())["figures"]
-    assert found["accuracy"] == 1 and set(found["completeness"].values()) == {1.0} and found["voxel_size"] == 0.25 and found["hit"] > 0.95
+    assert (
+        found["accuracy"] == 1
+        and set(found["completeness"].values()) == {1.0}
+        and found["voxel_size"] == 0.25
+        and found["hit"] > 0.95
+    )
     assert (tmp_path / "surface.md").read_text() == page("scene", surface.SurfaceFigures(**found))

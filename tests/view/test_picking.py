@@ -16,7 +16,13 @@ from sc3d.view.picking import Inspector, photos_that_see, point_on_ray, position
 from sc3d.view.progressive_order import even_order
 
 UTM = np.array([512_345.0, 5_187_654.0, 210.0])
-CLASSES = parse_classes([{"id": 1, "name": "road", "color": [150, 150, 160]}, {"id": 3, "name": "a / b", "color": [170, 220, 110]}], "test")
+CLASSES = parse_classes(
+    [
+        {"id": 1, "name": "road", "color": [150, 150, 160]},
+        {"id": 3, "name": "a / b", "color": [170, 220, 110]},
+    ],
+    "test",
+)
 
 
 def make_cloud(points: np.ndarray, **attributes: np.ndarray) -> o3d.t.geometry.PointCloud:
@@ -38,17 +44,24 @@ def box_on_ground() -> tuple[np.ndarray, np.ndarray]:
 def views_around() -> list[View]:
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=240, height=180, params=[210.0, 124.0, 87.0, -0.08])
     centres = [[0, 0, 30], [18, 2, 14], [-16, 9, 12], [3, -19, 9], [0, 15, 20]]
-    return [View(f"photo_{row}.jpg", camera, look_at(UTM + centre, UTM)) for row, centre in enumerate(centres)]
+    return [
+        View(f"photo_{row}.jpg", camera, look_at(UTM + centre, UTM)) for row, centre in enumerate(centres)
+    ]
 
 
 def points_on_faces(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) points in UTM and their outward normals, on the ground and on all faces of the box but its floor."""
+    """(N, 3) points in UTM and their outward normals, on the ground and on all faces of the box but its
+    floor.
+    """
     rng = np.random.default_rng(1)
     u, v = rng.uniform(0, 1, (2, count))
     faces = [
-        (np.c_[20 * u - 10, 20 * v - 10, 0 * u], [0, 0, 1]), (np.c_[4 * u - 2, 3 * v - 1, 0 * u + 5], [0, 0, 1]),
-        (np.c_[0 * u - 2, 3 * v - 1, 5 * u], [-1, 0, 0]), (np.c_[0 * u + 2, 3 * v - 1, 5 * u], [1, 0, 0]),
-        (np.c_[4 * u - 2, 0 * v - 1, 5 * u], [0, -1, 0]), (np.c_[4 * u - 2, 0 * v + 2, 5 * u], [0, 1, 0]),
+        (np.c_[20 * u - 10, 20 * v - 10, 0 * u], [0, 0, 1]),
+        (np.c_[4 * u - 2, 3 * v - 1, 0 * u + 5], [0, 0, 1]),
+        (np.c_[0 * u - 2, 3 * v - 1, 5 * u], [-1, 0, 0]),
+        (np.c_[0 * u + 2, 3 * v - 1, 5 * u], [1, 0, 0]),
+        (np.c_[4 * u - 2, 0 * v - 1, 5 * u], [0, -1, 0]),
+        (np.c_[4 * u - 2, 0 * v + 2, 5 * u], [0, 1, 0]),
     ]
     points = np.concatenate([face for face, _ in faces]) + UTM
     return points, np.repeat(np.float32([normal for _, normal in faces]), count, axis=0)
@@ -57,8 +70,15 @@ def points_on_faces(count: int) -> tuple[np.ndarray, np.ndarray]:
 def test_photos_that_see_are_those_that_fusion_counts():
     views, (points, normals) = views_around(), points_on_faces(60)
     surface = Surface.from_mesh(*box_on_ground(), local_origin(views))
-    seen = {view.name: set(see_points(view, points, normals, first_surface(surface, view), 0.1).points.tolist()) for view in views}  # the slow twin
-    found = [photos_that_see(point, normal, views, surface, 0.1) for point, normal in zip(points, normals, strict=True)]
+    # the slow twin
+    seen = {
+        view.name: set(see_points(view, points, normals, first_surface(surface, view), 0.1).points.tolist())
+        for view in views
+    }
+    found = [
+        photos_that_see(point, normal, views, surface, 0.1)
+        for point, normal in zip(points, normals, strict=True)
+    ]
     assert found == [[name for name, rows in seen.items() if row in rows] for row in range(len(points))]
     counts = np.array([len(names) for names in found])
     assert counts.min() == 0 and counts.max() >= 4  # points that nobody sees and points that nearly all see
@@ -67,28 +87,44 @@ def test_photos_that_see_are_those_that_fusion_counts():
 def inspector(tmp_path, **attributes: np.ndarray) -> Inspector:
     points, normals = points_on_faces(300)
     labels = np.resize(np.uint8([1, 3, 0]), len(points))[:, None]
-    mesh = o3d.t.geometry.TriangleMesh(*(o3d.core.Tensor(values) for values in (box_on_ground()[0], box_on_ground()[1].astype(np.int32))))
+    mesh = o3d.t.geometry.TriangleMesh(
+        *(o3d.core.Tensor(values) for values in (box_on_ground()[0], box_on_ground()[1].astype(np.int32)))
+    )
     o3d.t.io.write_triangle_mesh(str(tmp_path / "mesh.ply"), mesh)
-    return Inspector(make_cloud(points, label=labels, **attributes), views_around(), CLASSES, tmp_path / "mesh.ply", 0.1)
+    return Inspector(
+        make_cloud(points, label=labels, **attributes), views_around(), CLASSES, tmp_path / "mesh.ply", 0.1
+    )
 
 
 def test_everything_known_of_a_point_is_told(tmp_path):
     points, normals = points_on_faces(300)
-    votes = {f"votes_{label}": np.full((len(points), 1), count, np.float32) for label, count in enumerate((5, 1.25, 0, 3.5))}
-    state, confidence = np.full((len(points), 1), 2, np.uint8), np.linspace(0, 1, len(points), dtype=np.float32)[:, None]
+    votes = {
+        f"votes_{label}": np.full((len(points), 1), count, np.float32)
+        for label, count in enumerate((5, 1.25, 0, 3.5))
+    }
+    state, confidence = (
+        np.full((len(points), 1), 2, np.uint8),
+        np.linspace(0, 1, len(points), dtype=np.float32)[:, None],
+    )
     looked_up = inspector(tmp_path, normals=normals, state=state, confidence=confidence, **votes).look_up(301)
     surface = Surface.from_mesh(*box_on_ground(), UTM)
-    assert (looked_up.label, looked_up.state) == ("a / b", "locked") and np.isclose(looked_up.confidence, confidence[301, 0])
+    assert (looked_up.label, looked_up.state) == ("a / b", "locked") and np.isclose(
+        looked_up.confidence, confidence[301, 0]
+    )
     assert list(looked_up.votes.items()) == [("a / b", 3.5), ("road", 1.25)]
     assert np.array_equal(looked_up.position, points[301])
     assert looked_up.photos == tuple(photos_that_see(points[301], normals[301], views_around(), surface, 0.1))
-    assert all(word in str(looked_up) for word in ("point 301", "a / b 3.5, road 1.2", "locked", "photo_0.jpg"))
+    assert all(
+        word in str(looked_up) for word in ("point 301", "a / b 3.5, road 1.2", "locked", "photo_0.jpg")
+    )
 
 
 def test_nearest_is_the_nearest_at_utm_size(tmp_path):
     found, (points, _) = inspector(tmp_path), points_on_faces(300)
     queries = UTM + np.random.default_rng(3).uniform(-11, 11, (100, 3))
-    assert [found.nearest(query) for query in queries] == [int(np.argmin(((points - query) ** 2).sum(axis=1))) for query in queries]
+    assert [found.nearest(query) for query in queries] == [
+        int(np.argmin(((points - query) ** 2).sum(axis=1))) for query in queries
+    ]
 
 
 def test_missing_attributes_views_and_mesh_do_no_harm(tmp_path):
@@ -96,18 +132,29 @@ def test_missing_attributes_views_and_mesh_do_no_harm(tmp_path):
     bare = Inspector(make_cloud(points), [], None, tmp_path / "no_mesh.ply").look_up(7)
     assert (bare.label, bare.confidence, bare.state, bare.votes, bare.photos) == (None, None, None, {}, ())
     ground = points[:300]  # no normals, no mesh: both are made from the points
-    seen = Inspector(make_cloud(ground), views_around(), None, tmp_path / "no_mesh.ply").look_up(int(np.argmin(((ground - UTM - [5, 0, 0]) ** 2).sum(axis=1))))
+    seen = Inspector(make_cloud(ground), views_around(), None, tmp_path / "no_mesh.ply").look_up(
+        int(np.argmin(((ground - UTM - [5, 0, 0]) ** 2).sum(axis=1)))
+    )
     assert set(seen.photos) == {view.name for view in views_around()}
     from_below = View("below.jpg", views_around()[0].camera, look_at(UTM + [1, 1, -20], UTM))
-    assert Inspector(make_cloud(ground), [*views_around(), from_below], None, tmp_path / "no_mesh.ply").look_up(0).photos.count("below.jpg") == 0
+    assert (
+        Inspector(make_cloud(ground), [*views_around(), from_below], None, tmp_path / "no_mesh.ply")
+        .look_up(0)
+        .photos.count("below.jpg")
+        == 0
+    )
 
 
 def test_ray_takes_the_first_surface_and_there_the_nearest_point():
-    grid = np.stack(np.meshgrid(np.arange(-5, 5.0, 0.5), np.arange(-5, 5.0, 0.5), indexing="ij"), axis=-1).reshape(-1, 2)
+    grid = np.stack(
+        np.meshgrid(np.arange(-5, 5.0, 0.5), np.arange(-5, 5.0, 0.5), indexing="ij"), axis=-1
+    ).reshape(-1, 2)
     points = np.concatenate([np.c_[grid, np.zeros(len(grid))], np.c_[grid, np.full(len(grid), 4.0)]])
     row = point_on_ray(points, np.array([0.0, 0, 10]), np.array([0.09, 0.0, -1.0]) * 7, 0.5)
     assert np.array_equal(points[row], [0.5, 0, 4])
-    assert np.array_equal(points[point_on_ray(points, np.array([0.0, 0, 2]), np.array([0.0, 0, -1]), 0.5)], [0, 0, 0])
+    assert np.array_equal(
+        points[point_on_ray(points, np.array([0.0, 0, 2]), np.array([0.0, 0, -1]), 0.5)], [0, 0, 0]
+    )
     assert point_on_ray(points, np.array([20.0, 0, 10]), np.array([0, 0, -1.0]), 0.5) is None
     assert point_on_ray(points[:0], np.zeros(3), np.array([0, 0, 1.0]), 0.5) is None
 
@@ -123,7 +170,9 @@ def test_pixel_of_a_picture_goes_back_to_its_point(buffer):
         pixel, z = project(view, point[None])
         column, row = np.floor(pixel[0]).astype(int)
         depth = np.full(size[::-1], 1.0 if buffer else np.inf)
-        depth[row, column] = (projection[2, 2] * -z[0] + projection[2, 3]) / z[0] / 2 + 0.5 if buffer else z[0]
+        depth[row, column] = (
+            (projection[2, 2] * -z[0] + projection[2, 3]) / z[0] / 2 + 0.5 if buffer else z[0]
+        )
         found = position_at(depth, (column, row), flip @ view.cam_from_world, projection)
         assert np.linalg.norm(found - point) < 0.75 * z[0] / 260  # half a pixel
         assert position_at(depth, (column - 1, row), flip @ view.cam_from_world, projection) is None
@@ -146,17 +195,27 @@ def test_every_beginning_of_the_order_is_spread_evenly():
 def test_shown_cloud_keeps_millimetres_and_rows():
     points = UTM + np.random.default_rng(6).uniform(-60, 60, (5000, 3))
     label = np.random.default_rng(7).choice(np.uint8([0, 1, 3]), (5000, 1))
-    shown = ShownCloud.of(make_cloud(points, label=label, confidence=np.ones((5000, 1), np.float32)), np.round(UTM), CLASSES)
-    assert shown.points.dtype == np.float32 and np.abs(shown.points + shown.origin - points[shown.rows]).max() < 1e-3
+    shown = ShownCloud.of(
+        make_cloud(points, label=label, confidence=np.ones((5000, 1), np.float32)), np.round(UTM), CLASSES
+    )
+    assert (
+        shown.points.dtype == np.float32
+        and np.abs(shown.points + shown.origin - points[shown.rows]).max() < 1e-3
+    )
     assert np.array_equal(shown.colors("label"), CLASSES.palette[label.ravel()[shown.rows]])
     assert shown.class_counts == {value: int((label == value).sum()) for value in (0, 1, 3)}
-    assert shown.colourings == ("label", "confidence") and np.isclose(shown.spacing_at(1250), 2 * shown.spacing_at(5000))
+    assert shown.colourings == ("label", "confidence") and np.isclose(
+        shown.spacing_at(1250), 2 * shown.spacing_at(5000)
+    )
 
 
 def test_classes_are_chosen_by_name():
     cloud = make_cloud(np.zeros((4, 3)), label=np.uint8([[0], [1], [3], [1]]))
     assert class_ids(CLASSES, ()) is None and class_ids(CLASSES, ("road", "unlabelled")) == {0, 1}
-    assert only_classes(cloud, {1}).point["label"].numpy().ravel().tolist() == [1, 1] and only_classes(cloud, None) is cloud
+    assert (
+        only_classes(cloud, {1}).point["label"].numpy().ravel().tolist() == [1, 1]
+        and only_classes(cloud, None) is cloud
+    )
     with pytest.raises(InputError, match="no class 'house': choose from road, a / b, unlabelled"):
         class_ids(CLASSES, ("house",))
     with pytest.raises(InputError, match="nothing to show"):

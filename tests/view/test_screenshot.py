@@ -1,4 +1,6 @@
-"""Pictures must be exact: a point lies where `project` says, in the colour it was given, with either renderer."""
+"""Pictures must be exact: a point lies where `project` says, in the colour it was given, with either
+renderer.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,13 @@ from sc3d.view.viewpoints import aerial_view, frusta
 from sc3d.view.window import show
 
 UTM = np.array([500_000.0, 4_500_000.0, 100.0])
-CLASSES = parse_classes([{"id": 1, "name": "grass", "color": [124, 179, 66]}, {"id": 4, "name": "building", "color": [214, 60, 60]}], "test")
+CLASSES = parse_classes(
+    [
+        {"id": 1, "name": "grass", "color": [124, 179, 66]},
+        {"id": 4, "name": "building", "color": [214, 60, 60]},
+    ],
+    "test",
+)
 # The two renderers cannot share a process, so the one that is not the default here runs in another one.
 EXACTNESS = """
 import sys; sys.path.insert(0, {folder!r})
@@ -70,7 +78,10 @@ def odd_view() -> View:
 
 
 def check_exactness(renderer: str) -> None:
-    grid = np.stack(np.meshgrid(np.arange(-9, 10, 3.0), np.arange(-9, 10, 3.0), [0.0]), axis=-1).reshape(-1, 3)  # apart, so that none hides another
+    # apart, so that none hides another
+    grid = np.stack(np.meshgrid(np.arange(-9, 10, 3.0), np.arange(-9, 10, 3.0), [0.0]), axis=-1).reshape(
+        -1, 3
+    )
     points = UTM + grid + np.random.default_rng(1).uniform(-0.4, 0.4, grid.shape)
     order = np.arange(len(points))
     colors = np.stack([order * 4 + 10, 250 - order * 5, order % 7 * 30 + 20], axis=1).astype(np.uint8)
@@ -94,7 +105,9 @@ def test_points_appear_where_project_says(renderer):
     if renderer == "vulkan" and not vulkan_works():
         pytest.skip("no Vulkan here")
     script = EXACTNESS.format(folder=str(Path(__file__).parents[2]), renderer=renderer)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False
+    )
     if "cannot render pictures here" in done.stderr:
         pytest.skip(f"no {renderer} here")
     assert done.returncode == 0, done.stderr[-2000:]
@@ -161,7 +174,9 @@ def test_large_clouds_are_thinned_the_same_way_each_time():
 
 
 def test_mesh_is_drawn_in_its_colours():
-    mesh = o3d.t.geometry.TriangleMesh(np.float64([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]]) + UTM, np.int32([[0, 1, 2], [0, 2, 3]]))
+    mesh = o3d.t.geometry.TriangleMesh(
+        np.float64([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]]) + UTM, np.int32([[0, 1, 2], [0, 2, 3]])
+    )
     mesh.vertex.colors = o3d.core.Tensor(np.tile(np.uint8([30, 160, 220]), (4, 1)))
     image = screenshot(mesh, None, (200, 200), Style(from_above=True))
     assert (image[60:140, 60:140] == [30, 160, 220]).all()
@@ -202,7 +217,8 @@ def test_colours():
 
 
 def test_disagreement_is_what_the_winner_did_not_get():
-    votes = np.float32([[3, 2, 0, 1, 0, 1], [1, 0, 0, 5, 0, 0], [0, 0, 0, 0, 0, 0], [9, 0, 0, 0, 0, 0]])  # column 0 counts views and has no vote
+    # column 0 counts views and has no vote
+    votes = np.float32([[3, 2, 0, 1, 0, 1], [1, 0, 0, 5, 0, 0], [0, 0, 0, 0, 0, 0], [9, 0, 0, 0, 0, 0]])
     assert np.allclose(disagreement(votes), [0.5, 0, np.nan, np.nan], equal_nan=True)
     assert np.isnan(disagreement(np.zeros((3, 1), np.float32))).all()
     rng = np.random.default_rng(5)
@@ -243,15 +259,25 @@ def test_missing_attribute_names_the_stage(by):
 
 
 def test_unknown_ids_and_broken_confidences_do_not_fail():
-    odd = {"state": np.uint8([[9], [255], [1]]), "confidence": np.float32([[np.nan], [2], [-1]]), "label": np.uint8([[7], [0], [1]])}
+    odd = {
+        "state": np.uint8([[9], [255], [1]]),
+        "confidence": np.float32([[np.nan], [2], [-1]]),
+        "label": np.uint8([[7], [0], [1]]),
+    }
     cloud = make_cloud(np.zeros((3, 3)), **odd)
-    assert color_points(cloud, "state").shape == color_points(cloud, "confidence").shape == color_points(cloud, "label", CLASSES).shape
+    assert (
+        color_points(cloud, "state").shape
+        == color_points(cloud, "confidence").shape
+        == color_points(cloud, "label", CLASSES).shape
+    )
     assert np.array_equal(color_points(cloud, "confidence")[0], color_points(cloud, "confidence")[2])
 
 
 def test_empty_geometry_is_an_input_error():
     with pytest.raises(InputError, match="no points"):
-        screenshot(make_cloud(np.full((2, 3), np.nan), colors=np.zeros((2, 3), np.uint8)), style=Style("photo"))
+        screenshot(
+            make_cloud(np.full((2, 3), np.nan), colors=np.zeros((2, 3), np.uint8)), style=Style("photo")
+        )
 
 
 def test_without_display_the_window_names_the_screenshot(monkeypatch, tmp_path):
@@ -265,23 +291,52 @@ def test_without_display_the_window_names_the_screenshot(monkeypatch, tmp_path):
 
 
 def test_where_nothing_can_render_the_error_names_the_two_packages():
-    script = (f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from tests.view import test_screenshot as test_view; from sc3d.errors import Sc3dError; from sc3d.view import screenshot\n"
-              "try: screenshot(test_view.full_cloud(), None, (64, 64), class_table=test_view.CLASSES)\n"
-              "except Sc3dError as error: sys.exit(str(error))")
-    hidden = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent.json"}
+    script = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from tests.view import test_screenshot as test_view; from sc3d.errors import Sc3dError; from sc3d.view import screenshot\n"
+        "try: screenshot(test_view.full_cloud(), None, (64, 64), class_table=test_view.CLASSES)\n"
+        "except Sc3dError as error: sys.exit(str(error))"
+    )
+    hidden = {
+        "VK_ICD_FILENAMES": "/nonexistent.json",
+        "VK_DRIVER_FILES": "/nonexistent.json",
+        "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent.json",
+    }
     environment = {name: value for name, value in os.environ.items() if name != "DISPLAY"} | hidden
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
     if done.returncode == 0:
         pytest.skip("another OpenGL driver than that of libglvnd renders here")
-    assert done.returncode == 1 and "apt install libvulkan1 mesa-vulkan-drivers" in done.stderr and "Traceback" not in done.stderr, done.stderr[-2000:]
+    assert (
+        done.returncode == 1
+        and "apt install libvulkan1 mesa-vulkan-drivers" in done.stderr
+        and "Traceback" not in done.stderr
+    ), done.stderr[-2000:]
 
 
 def test_without_any_vulkan_driver_the_other_renderer_is_used():
     """The missing driver aborts Open3D, which must not reach this process."""
-    script = (f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from tests.view import test_screenshot as test_view; from sc3d.view.renderers import vulkan_works\n"
-              "assert not vulkan_works(); test_view.check_exactness('auto')")
-    environment = os.environ | {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=300, check=False)
+    script = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from tests.view import test_screenshot as test_view; from sc3d.view.renderers import vulkan_works\n"
+        "assert not vulkan_works(); test_view.check_exactness('auto')"
+    )
+    environment = os.environ | {
+        "VK_ICD_FILENAMES": "/nonexistent.json",
+        "VK_DRIVER_FILES": "/nonexistent.json",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
     if "cannot render pictures here" in done.stderr:
         pytest.skip("no EGL here")
     assert done.returncode == 0, done.stderr[-2000:]
@@ -293,7 +348,7 @@ def test_labels_in_a_photo_match_what_the_camera_sees(tmp_path):
     cloud = make_cloud(np.c_[grid, np.zeros(len(grid))] + UTM, label=label[:, None])
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=[600, 320, 240, -0.05])
     view = View("a.jpg", camera, look_at(UTM + [0, 0, 12.0], UTM))
-    image = LabelledSurface.build(cloud, [view], tmp_path / 'no_mesh.ply').see(view, (320, 240))[0]
+    image = LabelledSurface.build(cloud, [view], tmp_path / "no_mesh.ply").see(view, (320, 240))[0]
     assert image.shape == (240, 320) and image.dtype == np.uint8
     border = project(view, UTM + [[2.0, 0, 0]])[0][0, 0] / 2
     row = image[120]

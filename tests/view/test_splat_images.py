@@ -53,7 +53,12 @@ def make_gaussians(half: float = 4.0) -> Gaussians:
 def view_of(centre: tuple[float, float, float], size: tuple[int, int] = (120, 90)):
     """A view whose principal point is not the middle, image top towards the north-east."""
     calibration = (110, 114, size[0] / 2 + 5, size[1] / 2 - 3)
-    return pinhole_view("some photo.jpg", size, calibration, look_at(np.array(centre, float), np.array([0.3, 0.2, 0]), (0.4, 1, 0.3)))
+    return pinhole_view(
+        "some photo.jpg",
+        size,
+        calibration,
+        look_at(np.array(centre, float), np.array([0.3, 0.2, 0]), (0.4, 1, 0.3)),
+    )
 
 
 def centre_of_red(image: np.ndarray) -> np.ndarray:
@@ -79,7 +84,9 @@ def trained(tmp_path_factory) -> Path:
     for view in views():  # drawn by projection alone, not by the renderer under test
         photo = np.tile(np.uint8(GREEN), (view.height, view.width, 1))
         pixel = project(view, (ORIGIN + RED_POINT)[None])[0][0]
-        photo = cv2.circle(photo, tuple(np.round(16 * (pixel - 0.5)).astype(int).tolist()), 3 * 16, RED, -1, cv2.LINE_AA, 4)
+        photo = cv2.circle(
+            photo, tuple(np.round(16 * (pixel - 0.5)).astype(int).tolist()), 3 * 16, RED, -1, cv2.LINE_AA, 4
+        )
         write_image(scene / "images" / view.name, photo)
     return scene
 
@@ -92,16 +99,29 @@ def test_panels_are_what_the_camera_sees(gaussians):
     assert np.array_equal(found.rendered, expected) and np.array_equal(found.photo, photo) and found.psnr > 50
     assert np.abs(centre_of_red(found.rendered) - project(view, RED_POINT[None])[0][0]).max() < 0.1
     row, column = view.height // 2, view.width // 2
-    ray = np.array([(column + 0.5 - view.matrix[0, 2]) / view.matrix[0, 0], (row + 0.5 - view.matrix[1, 2]) / view.matrix[1, 1], 1])
+    ray = np.array(
+        [
+            (column + 0.5 - view.matrix[0, 2]) / view.matrix[0, 0],
+            (row + 0.5 - view.matrix[1, 2]) / view.matrix[1, 1],
+            1,
+        ]
+    )
     height_per_depth = ray @ view.cam_from_world[:3, :3][:, 2]
-    assert np.isclose(found.depth[row, column], -view.centre[2] / height_per_depth, rtol=1e-3)  # where the ray meets z = 0
-    assert np.abs(found.normals[found.depth > 0] - [0, 0, 1]).max() < 0.02  # world frame, towards the camera, although it is tilted
+    # where the ray meets z = 0
+    assert np.isclose(found.depth[row, column], -view.centre[2] / height_per_depth, rtol=1e-3)
+    # world frame, towards the camera, although it is tilted
+    assert np.abs(found.normals[found.depth > 0] - [0, 0, 1]).max() < 0.02
 
 
 def test_exposure_of_the_photo_is_fitted_or_applied(gaussians):
     view = view_of((1, -2, 9))
     photo = np.round(0.8 * rendered(gaussians, view) + 10).astype(np.uint8)
-    assert compare(gaussians, view, photo).psnr > 45 > 30 > compare(gaussians, view, photo, exposure=(0.0, 0.0)).psnr
+    assert (
+        compare(gaussians, view, photo).psnr
+        > 45
+        > 30
+        > compare(gaussians, view, photo, exposure=(0.0, 0.0)).psnr
+    )
     assert compare(gaussians, view, photo, exposure=(np.log(0.8), 10 / 255)).psnr > 45
 
 
@@ -109,9 +129,15 @@ def test_near_is_bright_up_is_blue_and_nothing_is_grey(gaussians):
     near_far = depth_range([np.float32([[5, 10, 20, 0]])])
     colors = depth_colors(np.float32([[5, 10, 20, 0]]), (5.0, 20.0)).astype(int)
     brightness = colors.sum(axis=2)[0]
-    assert brightness[0] > brightness[1] > brightness[2] and np.ptp(colors[0, 3]) < 10 and near_far[0] >= 5 and near_far[1] <= 20
+    assert (
+        brightness[0] > brightness[1] > brightness[2]
+        and np.ptp(colors[0, 3]) < 10
+        and near_far[0] >= 5
+        and near_far[1] <= 20
+    )
     assert depth_range([np.zeros((2, 2), np.float32)]) == (1.0, 1.0)
-    found = compare(gaussians, view_of((0, -6, 5)), np.zeros((90, 120, 3), np.uint8))  # towards the north: its top is farther away
+    # towards the north: its top is farther away
+    found = compare(gaussians, view_of((0, -6, 5)), np.zeros((90, 120, 3), np.uint8))
     normals = normal_colors(found.normals)
     present = found.depth > 0
     assert 0.2 < present.mean() < 1
@@ -130,7 +156,12 @@ def test_sheet_holds_the_four_panels(gaussians):
     cell = (560 - 2 * 16 - 3 * 8) // 4
     near_far = depth_range([row.depth for row in rows])
     top, height = sheet.shape[0] - 16 - 8 - round(cell * 90 / 120), round(cell * 90 / 120)
-    expected = [rows[1].photo, rows[1].rendered, depth_colors(rows[1].depth, near_far), normal_colors(rows[1].normals)]
+    expected = [
+        rows[1].photo,
+        rows[1].rendered,
+        depth_colors(rows[1].depth, near_far),
+        normal_colors(rows[1].normals),
+    ]
     for column, panel in enumerate(expected):
         left = 16 + column * (cell + 8)
         shown = sheet[top : top + height, left : left + cell].astype(float)
@@ -143,9 +174,14 @@ def test_chosen_photos_are_spread_and_held_out_ones_come_first():
     assert chosen_views(18, TrainSettings()) == [(index, False) for index in (0, 3, 7, 10, 14, 17)]
     assert chosen_views(3, TrainSettings()) == [(0, False), (1, False), (2, False)]
     with_test = chosen_views(40, TrainSettings(test_every=8))
-    assert [index for index, held_out in with_test if held_out] == [7, 15, 31, 39] and [held_out for _, held_out in with_test] == [True] * 4 + [False] * 2
+    assert [index for index, held_out in with_test if held_out] == [7, 15, 31, 39] and [
+        held_out for _, held_out in with_test
+    ] == [True] * 4 + [False] * 2
     assert not {index for index, held_out in with_test if not held_out} & set(range(7, 40, 8))
-    assert chosen_views(8, TrainSettings(test_every=8))[0] == (7, True) and len(chosen_views(8, TrainSettings(test_every=8))) == 6
+    assert (
+        chosen_views(8, TrainSettings(test_every=8))[0] == (7, True)
+        and len(chosen_views(8, TrainSettings(test_every=8))) == 6
+    )
 
 
 def test_training_sheet_uses_the_exposures_found(gaussians, tmp_path):
@@ -160,13 +196,27 @@ def test_training_sheet_uses_the_exposures_found(gaussians, tmp_path):
     log = [{"iteration": 30, "loss": 0.1, "psnr": 31.0, "num_gaussians": 5, "seconds": 1.0}]
     result = TrainResult(gaussians, exposures, log, {"psnr": 25.0, "ssim": 0.8})
     write_training_sheet(tmp_path / "train.jpg", result, data, settings)
-    assert read_image(tmp_path / "train.jpg").shape[1] == 1600 and [path.name for path in tmp_path.iterdir()] == ["train.jpg"]
+    assert read_image(tmp_path / "train.jpg").shape[1] == 1600 and [
+        path.name for path in tmp_path.iterdir()
+    ] == ["train.jpg"]
 
 
 @pytest.mark.parametrize("size", [(500, 300), (300, 500)])
 def test_splats_lie_where_the_photo_has_them(trained, tmp_path, size):
     target = tmp_path / "pair.png"
-    main(["view", str(trained), "--screenshot", str(target), "--photo", "photo_1.jpg", "--splats", "--size", *map(str, size)])
+    main(
+        [
+            "view",
+            str(trained),
+            "--screenshot",
+            str(target),
+            "--photo",
+            "photo_1.jpg",
+            "--splats",
+            "--size",
+            *map(str, size),
+        ]
+    )
     picture = read_image(target)
     pinhole = undistorted(views()[1])
     scale = min(1.0, half_of(size)[0] / pinhole.width)
@@ -187,13 +237,21 @@ def test_splats_from_the_air_have_north_up(trained, tmp_path):
         assert picture.shape == (240, 320, 3) and (picture[0, 0] == 255).all()  # white where nothing is
         ground = np.argwhere((np.abs(picture.astype(int) - GREEN) < 40).all(axis=2))
         assert len(ground) > 5000
-        offset = centre_of_red(np.where((picture == 255).all(axis=2, keepdims=True), 0, picture)) - ground.mean(axis=0)[::-1]
+        offset = (
+            centre_of_red(np.where((picture == 255).all(axis=2, keepdims=True), 0, picture))
+            - ground.mean(axis=0)[::-1]
+        )
         assert offset[0] > 5 and offset[1] < -5  # in the north-east
 
 
 def test_flight_passes_through_the_cameras(trained, tmp_path):
     path = flight_path(views(), (100, 100))
-    assert 20 < len(path) <= 600 and path[0].width % 2 == 0 and path[0].height % 2 == 0 and max(path[0].width, path[0].height) <= 100
+    assert (
+        20 < len(path) <= 600
+        and path[0].width % 2 == 0
+        and path[0].height % 2 == 0
+        and max(path[0].width, path[0].height) <= 100
+    )
     centres = np.array([view.centre for view in path])
     for view in views():
         assert np.linalg.norm(centres - view.centre, axis=1).min() < 0.15
@@ -206,13 +264,19 @@ def test_flight_passes_through_the_cameras(trained, tmp_path):
     read, frame = video.read()
     assert read and frame.shape[1] == 160 and int(video.get(cv2.CAP_PROP_FRAME_COUNT)) > 20
     first = flight_path(views(), (160, 160))[0]
-    assert np.abs(centre_of_red(frame[..., ::-1]) - project(first, (ORIGIN + RED_POINT)[None])[0][0]).max() < 1.5
+    assert (
+        np.abs(centre_of_red(frame[..., ::-1]) - project(first, (ORIGIN + RED_POINT)[None])[0][0]).max() < 1.5
+    )
 
 
 def test_side_by_side_keeps_the_pictures():
     left, right = (np.full((30, 200, 3), value, np.uint8) for value in (10, 200))
     picture = side_by_side((left, right), ("a" * 200, "b"))
-    assert np.array_equal(picture[:30, :200], left) and np.array_equal(picture[:30, -200:], right) and picture.shape[0] > 40
+    assert (
+        np.array_equal(picture[:30, :200], left)
+        and np.array_equal(picture[:30, -200:], right)
+        and picture.shape[0] > 40
+    )
 
 
 class TestBadInput:
@@ -230,13 +294,28 @@ class TestBadInput:
     def test_trained_with_other_cameras(self, capsys, tmp_path, trained):
         write_model(tmp_path / "sparse" / "0", [view.shifted(np.array([500.0, 0, 0])) for view in views()])
         (tmp_path / "gaussians.ply").write_bytes((trained / "gaussians.ply").read_bytes())
-        self.check(capsys, ["other cameras", "--overwrite"], tmp_path, "--splats", "--screenshot", tmp_path / "a.png")
+        self.check(
+            capsys, ["other cameras", "--overwrite"], tmp_path, "--splats", "--screenshot", tmp_path / "a.png"
+        )
 
     def test_options_that_do_not_fit(self, capsys, trained, tmp_path):
         self.check(capsys, ["--screenshot FILE"], trained, "--splats")
         self.check(capsys, [".mp4"], trained, "--flight", tmp_path / "a.avi")
         self.check(capsys, [".png"], trained, "--splats", "--screenshot", tmp_path / "a.gif")
-        self.check(capsys, ["no photo 'other.jpg'", "photo_0.jpg"], trained, "--splats", "--photo", "other.jpg", "--screenshot", tmp_path / "a.png")
-        self.check(capsys, ["too small"], trained, "--splats", "--size", "0", "9", "--screenshot", tmp_path / "a.png")
-        self.check(capsys, ["--file"], trained, "--splats", "--file", "x.ply", "--screenshot", tmp_path / "a.png")
+        self.check(
+            capsys,
+            ["no photo 'other.jpg'", "photo_0.jpg"],
+            trained,
+            "--splats",
+            "--photo",
+            "other.jpg",
+            "--screenshot",
+            tmp_path / "a.png",
+        )
+        self.check(
+            capsys, ["too small"], trained, "--splats", "--size", "0", "9", "--screenshot", tmp_path / "a.png"
+        )
+        self.check(
+            capsys, ["--file"], trained, "--splats", "--file", "x.ply", "--screenshot", tmp_path / "a.png"
+        )
         assert not list(tmp_path.iterdir())

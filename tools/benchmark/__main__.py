@@ -22,7 +22,9 @@ RUNS: dict[type, tuple[str, str]] = {
 def main(arguments: list[str] | None = None) -> None:
     """Run the benchmark whose record the arguments make; only its own imports count in its memory."""
     description = "Measure sc3d on this machine."
-    command = tyro.cli(settings.Benchmark, args=arguments, prog="python -m tools.benchmark", description=description)
+    command = tyro.cli(
+        settings.Benchmark, args=arguments, prog="python -m tools.benchmark", description=description
+    )
     module, function = RUNS[type(command)]
     with reporting_errors():
         getattr(importlib.import_module(f"tools.benchmark.{module}"), function)(command)

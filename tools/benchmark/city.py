@@ -25,9 +25,23 @@ def run_city(command: SynthesizeCity) -> None:
     require_writable(command.scene)
     cpu, wall = time.process_time(), time.perf_counter()
     made = synthesize_city(command)
-    took = {"cpu_seconds": round(time.process_time() - cpu, 1), "wall_seconds": round(time.perf_counter() - wall, 1), "peak_memory_mb": peak_memory_mb()}
+    took = {
+        "cpu_seconds": round(time.process_time() - cpu, 1),
+        "wall_seconds": round(time.perf_counter() - wall, 1),
+        "peak_memory_mb": peak_memory_mb(),
+    }
     files = [file for file in command.scene.rglob("*") if file.is_file() and not file.is_symlink()]
-    record = {"benchmark": "city", "sites": command.sites, "width": command.width, "seed": command.seed, "versions": versions()} | made | took
+    record = (
+        {
+            "benchmark": "city",
+            "sites": command.sites,
+            "width": command.width,
+            "seed": command.seed,
+            "versions": versions(),
+        }
+        | made
+        | took
+    )
     record["bytes"] = sum(file.stat().st_size for file in files)
     write_json(command.scene / "city.json", record)
     logger.info("%s: %s", command.scene, record)

@@ -41,7 +41,8 @@ from tools.benchmark.machine import replaced
 def count_fragments(gaussians: Gaussians, view: View) -> tuple[float, float, float]:
     """What the rasteriser has to do for a view.
 
-    returns: fragments per pixel that contribute (alpha >= 1/255, transmittance in front >= 1e-4); slots per pixel that are evaluated,
+    returns: fragments per pixel that contribute (alpha >= 1/255, transmittance in front >= 1e-4); slots per
+        pixel that are evaluated,
         which are whole runs of 8 pixels; share of the Gaussians that can touch the image
     """
     caught = []
@@ -69,19 +70,29 @@ def _count(records, ranks, starts, width, height, counts):
         rows, columns = min(TILE, height - top), min(TILE, width - left)
         pixels = np.empty(PLANE, np.float32)
         open_tile(pixels, rows, columns)
-        counts[tile, 0], counts[tile, 1] = _count_tile(records, ranks[starts[tile]:starts[tile + 1]], (left, top), (rows, columns), pixels)
+        counts[tile, 0], counts[tile, 1] = _count_tile(
+            records, ranks[starts[tile] : starts[tile + 1]], (left, top), (rows, columns), pixels
+        )
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _count_tile(records, ranks, origin, size, pixels):
-    lane, low, high, limit, one = ramp(), splat(LOG2_MIN_ALPHA), splat(MAX_ALPHA), splat(MIN_TRANSMITTANCE), splat(1.0)
+    lane, low, high, limit, one = (
+        ramp(),
+        splat(LOG2_MIN_ALPHA),
+        splat(MAX_ALPHA),
+        splat(MIN_TRANSMITTANCE),
+        splat(1.0),
+    )
     lines, ends = np.empty(3 * TILE, np.float32), np.empty(2 * TILE, np.int32)
     fragments, slots = 0, 0
     for entry in range(ranks.shape[0]):
         if entry % CHECK == CHECK - 1 and finished(pixels):
             break
         base = np.int64(ranks[entry]) * RECORD
-        first_row, last_row = measure_rows(records, base, np.float32(origin[0]), np.float32(origin[1]), size[0], size[1], lines, ends)
+        first_row, last_row = measure_rows(
+            records, base, np.float32(origin[0]), np.float32(origin[1]), size[0], size[1], lines, ends
+        )
         minus_decay = splat(-records[base + 3])
         for row in range(first_row, last_row + 1):
             centre, peak = lines[TILE + row], splat(lines[2 * TILE + row])
@@ -92,7 +103,9 @@ def _count_tile(records, ranks, origin, size, pixels):
                     u = lane + splat(np.float32(column) - centre)
                     exponent = fma(minus_decay * u, u, peak)
                     counted = where_at_least(exponent, low, where_at_least(transmittance, limit, one))
-                    store(pixels, place, transmittance - counted * minimum(exp2(exponent), high) * transmittance)
+                    store(
+                        pixels, place, transmittance - counted * minimum(exp2(exponent), high) * transmittance
+                    )
                     fragments += np.int64(total(counted))
                     slots += LANES
     return fragments, slots

@@ -1,4 +1,6 @@
-"""What label and propagate are timed against: bare ray casting, a plain numpy z-buffer voter, one neighbour pass, scikit-learn."""
+"""What label and propagate are timed against: bare ray casting, a plain numpy z-buffer voter, one neighbour
+pass, scikit-learn.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ DEPTH_TOLERANCE = 0.01  # of the depth
 
 
 def ray_bundles(surface: Surface, views: list[View]) -> list[o3d.core.Tensor]:
-    """The rays of all pixels of each view as `first_surface` casts them: (P, 6) float32 each, made beforehand so that only the cast is timed."""
+    """The rays of all pixels of each view as `first_surface` casts them: (P, 6) float32 each, made beforehand
+    so that only the cast is timed.
+    """
     bundles = []
     for view in views:
         directions, _ = rays(view)
@@ -33,8 +37,12 @@ def cast_only(surface: Surface, bundles: list[o3d.core.Tensor]) -> None:
         surface.scene.cast_rays(bundle)
 
 
-def vote_with_z_buffer(cloud: Cloud, views: list[View], read_mask: Callable[[View], Mask], num_ids: int) -> np.ndarray:
-    """(b) Majority voting as one writes it first: project all points, keep those near the front of their pixel, count. Returns (N,) uint8."""
+def vote_with_z_buffer(
+    cloud: Cloud, views: list[View], read_mask: Callable[[View], Mask], num_ids: int
+) -> np.ndarray:
+    """(b) Majority voting as one writes it first: project all points, keep those near the front of their
+    pixel, count. Returns (N,) uint8.
+    """
     votes = np.zeros((len(cloud.points), num_ids), np.int32)
     for view in views:
         mask, _ = read_mask(view)
@@ -56,12 +64,18 @@ def find_neighbors(points: np.ndarray) -> None:
 
 
 def classify_neighbors(points: np.ndarray, label: np.ndarray) -> np.ndarray | None:
-    """(d) scikit-learn's KNeighborsClassifier, fitted on the labelled points, asked for those without label; None if it is not installed."""
+    """(d) scikit-learn's KNeighborsClassifier, fitted on the labelled points, asked for those without label;
+    None if it is not installed.
+    """
     try:
         from sklearn.neighbors import KNeighborsClassifier
     except ImportError:
         return None
     known, result = label > 0, label.copy()
     if known.any() and not known.all():
-        result[~known] = KNeighborsClassifier(min(NUM_NEIGHBORS, int(known.sum()))).fit(points[known], label[known]).predict(points[~known])
+        result[~known] = (
+            KNeighborsClassifier(min(NUM_NEIGHBORS, int(known.sum())))
+            .fit(points[known], label[known])
+            .predict(points[~known])
+        )
     return result

@@ -1,4 +1,6 @@
-"""`sc3d benchmark fusion-speed`: label and propagate against their rivals, growth over points and views, memory."""
+"""`sc3d benchmark fusion-speed`: label and propagate against their rivals, growth over points and views,
+memory.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +34,21 @@ from tools.benchmark.settings import BenchmarkFusionSpeed
 
 logger = logging.getLogger(__name__)
 
-FUSE, MAP, RAYS, Z_BUFFER, NEIGHBORS, SKLEARN = "label", "propagate map", "rays only", "numpy z-buffer voter", "16 nearest neighbours", "scikit-learn KNN"
+FUSE, MAP, RAYS, Z_BUFFER, NEIGHBORS, SKLEARN = (
+    "label",
+    "propagate map",
+    "rays only",
+    "numpy z-buffer voter",
+    "16 nearest neighbours",
+    "scikit-learn KNN",
+)
 
 
 @dataclass(frozen=True)
 class Workload:
-    """A cloud and the views that label it; masks are those of the scene. read: mask by view, kept in memory so that no file is timed."""
+    """A cloud and the views that label it; masks are those of the scene. read: mask by view, kept in memory
+    so that no file is timed.
+    """
 
     cloud: Cloud
     colors: np.ndarray
@@ -68,9 +79,15 @@ def run_fusion_speed(command: BenchmarkFusionSpeed) -> None:
     _label_and_propagate(_cut(workload, 2000, 2))  # compiles
     compared = min(40, len(masks.views))
     record = {
-        "benchmark": "fusion speed", "scene": scene.path.resolve().name, "versions": versions(), "load": load,
-        "points": len(workload.cloud.points), "views": compared, "rays": sum(workload.masks[view.name][0].size for view in masks.views[:compared]),
-        "triangles": len(read_mesh(scene.mesh).triangle.indices), "contenders": _compare(_cut(workload, None, compared), command.repeats),
+        "benchmark": "fusion speed",
+        "scene": scene.path.resolve().name,
+        "versions": versions(),
+        "load": load,
+        "points": len(workload.cloud.points),
+        "views": compared,
+        "rays": sum(workload.masks[view.name][0].size for view in masks.views[:compared]),
+        "triangles": len(read_mesh(scene.mesh).triangle.indices),
+        "contenders": _compare(_cut(workload, None, compared), command.repeats),
         "growth_points": [_grown(_workload(scene, masks, count), compared) for count in command.points],
         "growth_views": [_grown(workload, count) for count in command.views],
     }
@@ -78,23 +95,45 @@ def run_fusion_speed(command: BenchmarkFusionSpeed) -> None:
 
 
 def _workload(scene: Scene, masks: Masks, num_points: int) -> Workload:
-    """Random points of the cloud (seed 0), all views with a mask. More points than the cloud has: copies, moved at random along the surface."""
+    """Random points of the cloud (seed 0), all views with a mask. More points than the cloud has: copies,
+    moved at random along the surface.
+    """
     read, origin = read_cloud(scene.cloud), local_origin(masks.views)
     points, normals = point_arrays(read, np.array([view.centre for view in masks.views]))
     surface, rng = read_surface(scene.mesh, points, normals, origin), np.random.default_rng(0)
     colors = read.point.colors.numpy() if "colors" in read.point else np.full(points.shape, 127, np.uint8)
-    spacing, rows = spacing_of(points), np.concatenate([rng.permutation(len(points)) for _ in range(-(-num_points // len(points)))])[:num_points]
+    spacing, rows = (
+        spacing_of(points),
+        np.concatenate([rng.permutation(len(points)) for _ in range(-(-num_points // len(points)))])[
+            :num_points
+        ],
+    )
     moves = rng.normal(0, spacing, (num_points, 3)) * (np.arange(num_points) >= len(points))[:, None]
     moves -= np.einsum("ni,ni->n", moves, normals[rows])[:, None] * normals[rows]
     pictures = {view.name: masks.read(view) for view in masks.views}
-    return Workload(Cloud(points[rows] + moves, normals[rows]), colors[rows], masks.views, pictures, surface, scene.class_table().num_ids)
+    return Workload(
+        Cloud(points[rows] + moves, normals[rows]),
+        colors[rows],
+        masks.views,
+        pictures,
+        surface,
+        scene.class_table().num_ids,
+    )
 
 
 def _cut(workload: Workload, num_points: int | None, num_views: int) -> Workload:
     """The first points and views; with more views than there are, they are repeated under other names."""
-    views = [replace(view, name=f"{view.name}#{row // len(workload.views)}") if row >= len(workload.views) else view
-             for row, view in ((row, workload.views[row % len(workload.views)]) for row in range(num_views))]
-    cloud = workload.cloud if num_points is None else Cloud(workload.cloud.points[:num_points], workload.cloud.normals[:num_points])
+    views = [
+        replace(view, name=f"{view.name}#{row // len(workload.views)}")
+        if row >= len(workload.views)
+        else view
+        for row, view in ((row, workload.views[row % len(workload.views)]) for row in range(num_views))
+    ]
+    cloud = (
+        workload.cloud
+        if num_points is None
+        else Cloud(workload.cloud.points[:num_points], workload.cloud.normals[:num_points])
+    )
     return replace(workload, cloud=cloud, colors=workload.colors[:num_points], views=views)
 
 
@@ -119,7 +158,9 @@ def _compare(workload: Workload, repeats: int) -> dict[str, dict[str, float]]:
     contenders: dict[str, Callable[[], object]] = {
         FUSE: lambda: _label(workload),
         RAYS: lambda: rivals.cast_only(workload.surface, bundles),
-        Z_BUFFER: lambda: rivals.vote_with_z_buffer(workload.cloud, workload.views, workload.read, workload.num_ids),
+        Z_BUFFER: lambda: rivals.vote_with_z_buffer(
+            workload.cloud, workload.views, workload.read, workload.num_ids
+        ),
         MAP: lambda: _propagate(workload, fusion),
         NEIGHBORS: lambda: rivals.find_neighbors(workload.cloud.points),
         SKLEARN: lambda: rivals.classify_neighbors(workload.cloud.points, fusion.labels.label),
@@ -131,20 +172,40 @@ def _compare(workload: Workload, repeats: int) -> dict[str, dict[str, float]]:
         for name, run in contenders.items():
             seconds[name].append(_timed(run)[:2])
             logger.info("%s: %.1f CPU s", name, seconds[name][-1][0])
-    return {name: dict(zip(("cpu_seconds", "wall_seconds"), np.median(runs, axis=0).tolist(), strict=True)) for name, runs in seconds.items()}
+    return {
+        name: dict(zip(("cpu_seconds", "wall_seconds"), np.median(runs, axis=0).tolist(), strict=True))
+        for name, runs in seconds.items()
+    }
 
 
 def _grown(workload: Workload, num_views: int) -> dict[str, float]:
     """Seconds and peak memory of label and of propagate at one size."""
     workload = _cut(workload, None, num_views)
-    rivals.cast_only(workload.surface, rivals.ray_bundles(workload.surface, workload.views[:1]))  # the first cast builds the tree
+    # the first cast builds the tree
+    rivals.cast_only(workload.surface, rivals.ray_bundles(workload.surface, workload.views[:1]))
     workload.voxel_size
     cpu, wall, peak, fusion = _timed(lambda: _label(workload))
-    record = {"points": len(workload.cloud.points), "views": num_views, "voxels": len(np.unique(fusion.cells // 2)),
-              "label_cpu_seconds": cpu, "label_wall_seconds": wall, "label_peak_memory_mb": peak}
+    record = {
+        "points": len(workload.cloud.points),
+        "views": num_views,
+        "voxels": len(np.unique(fusion.cells // 2)),
+        "label_cpu_seconds": cpu,
+        "label_wall_seconds": wall,
+        "label_peak_memory_mb": peak,
+    }
     cpu, wall, peak, _ = _timed(lambda: _propagate(workload, fusion))
-    logger.info("%d points, %d views: label %.1f s, propagate %.1f CPU s", record["points"], num_views, record["label_cpu_seconds"], cpu)
-    return record | {"propagate_cpu_seconds": cpu, "propagate_wall_seconds": wall, "propagate_peak_memory_mb": peak}
+    logger.info(
+        "%d points, %d views: label %.1f s, propagate %.1f CPU s",
+        record["points"],
+        num_views,
+        record["label_cpu_seconds"],
+        cpu,
+    )
+    return record | {
+        "propagate_cpu_seconds": cpu,
+        "propagate_wall_seconds": wall,
+        "propagate_peak_memory_mb": peak,
+    }
 
 
 def _timed(run: Callable[[], object]) -> tuple[float, float, int, object]:

@@ -1,4 +1,6 @@
-"""Clocks for a busy machine: CPU seconds per stage, thread counts, and the arithmetic ceiling to compare with."""
+"""Clocks for a busy machine: CPU seconds per stage, thread counts, and the arithmetic ceiling to compare
+with.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ _ROUNDS = 4_000_000
 class Stopwatch:
     """Adds up seconds by stage.
 
-    seconds: per stage a (3,) float64 array: CPU of the whole process, wall, CPU of the calling thread. At one thread the last one is what
+    seconds: per stage a (3,) float64 array: CPU of the whole process, wall, CPU of the calling thread. At one
+        thread the last one is what
         the work costs: the first also counts idle threads of OpenMP that still spin.
     """
 
@@ -37,7 +40,9 @@ class Stopwatch:
 
     @contextmanager
     def watching(self, functions: dict[str, list[tuple[ModuleType, str]]]) -> Iterator[None]:
-        """Time every call of module-level functions while the body runs. functions: per stage (module, name of the function) pairs."""
+        """Time every call of module-level functions while the body runs. functions: per stage (module, name
+        of the function) pairs.
+        """
         with ExitStack() as stack:
             for stage, places in functions.items():
                 for module, name in places:
@@ -48,6 +53,7 @@ class Stopwatch:
         def timed(*arguments):
             with self.stage(stage):
                 return function(*arguments)
+
         return timed
 
 
@@ -81,7 +87,9 @@ def num_threads() -> int:
 
 
 def fma_gflops(threads: int = 1) -> float:
-    """Float32 multiply-adds in registers, billion operations (2 per multiply-add) a second: per CPU second at one thread, else per wall second."""
+    """Float32 multiply-adds in registers, billion operations (2 per multiply-add) a second: per CPU second at
+    one thread, else per wall second.
+    """
     sums = np.zeros(threads, np.float32)
     watch = Stopwatch()
     with use_threads(threads):
@@ -102,7 +110,22 @@ def _multiply_add(rounds, sums):
         a, b, c, d, e, f = splat(0.1), splat(0.2), splat(0.3), splat(0.4), splat(0.5), splat(0.6)
         g, h, i, j, k, m = splat(0.7), splat(0.8), splat(0.9), splat(1.1), splat(1.2), splat(1.3)
         for _ in range(rounds):
-            a, b, c, d = fma(a, factor, step), fma(b, factor, step), fma(c, factor, step), fma(d, factor, step)
-            e, f, g, h = fma(e, factor, step), fma(f, factor, step), fma(g, factor, step), fma(h, factor, step)
-            i, j, k, m = fma(i, factor, step), fma(j, factor, step), fma(k, factor, step), fma(m, factor, step)
+            a, b, c, d = (
+                fma(a, factor, step),
+                fma(b, factor, step),
+                fma(c, factor, step),
+                fma(d, factor, step),
+            )
+            e, f, g, h = (
+                fma(e, factor, step),
+                fma(f, factor, step),
+                fma(g, factor, step),
+                fma(h, factor, step),
+            )
+            i, j, k, m = (
+                fma(i, factor, step),
+                fma(j, factor, step),
+                fma(k, factor, step),
+                fma(m, factor, step),
+            )
         sums[thread] = total(a + b + c + d + e + f + g + h + i + j + k + m)

@@ -1,4 +1,6 @@
-"""OpenSplat (C++, AGPL; https://github.com/pierotofy/OpenSplat) beside sc3d: the same Gaussians and photos, run as a separate program."""
+"""OpenSplat (C++, AGPL; https://github.com/pierotofy/OpenSplat) beside sc3d: the same Gaussians and photos,
+run as a separate program.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,15 @@ from sc3d.splatting.gaussians import SH_C0
 from tools.benchmark.workload import Workload
 
 REFERENCE_GFLOPS = 40.0  # per core of the machine that the figures below are from
-REFERENCE_CPU_SECONDS = {(50_000, 496): 0.885, (200_000, 496): 1.64, (50_000, 993): 6.43, (200_000, 993): 8.55}
-"""OpenSplat's whole iteration at one thread by (Gaussians, longest side), PERFORMANCE.md; middle of the range where it gives one."""
+REFERENCE_CPU_SECONDS = {
+    (50_000, 496): 0.885,
+    (200_000, 496): 1.64,
+    (50_000, 993): 6.43,
+    (200_000, 993): 8.55,
+}
+"""OpenSplat's whole iteration at one thread by (Gaussians, longest side), PERFORMANCE.md; middle of the range
+where it gives one.
+"""
 
 _FEW, _MORE = 2, 6  # iterations of the two runs whose difference is free of loading and saving
 _TIMEOUT = 1800  # s
@@ -30,12 +39,16 @@ def find_binary(given: Path) -> Path:
     """The program as a path. Raises InputError if there is none."""
     found = shutil.which(given) or shutil.which(given.absolute())
     if found is None:
-        raise InputError(f"no OpenSplat at {given}: pass the path of the program that its build makes, --opensplat DIR/opensplat")
+        raise InputError(
+            f"no OpenSplat at {given}: pass the path of the program that its build makes, --opensplat DIR/opensplat"
+        )
     return Path(found)
 
 
 def write_project(workload: Workload, folder: Path) -> None:
-    """A COLMAP project of the two views, and gaussians.ply as OpenSplat writes it after 0 iterations (degree 1: it takes no less)."""
+    """A COLMAP project of the two views, and gaussians.ply as OpenSplat writes it after 0 iterations (degree
+    1: it takes no less).
+    """
     reconstruction = pycolmap.Reconstruction()
     for row, (view, photo) in enumerate(zip(workload.views, workload.photos, strict=True)):
         camera = view.camera.todict() | {"camera_id": row + 1}
@@ -46,7 +59,9 @@ def write_project(workload: Workload, folder: Path) -> None:
     gaussians = workload.gaussians
     colors = (255 * (0.5 + SH_C0 * gaussians.sh[:, 0].numpy())).clip(0, 255).astype(np.uint8)
     for row in np.linspace(0, len(gaussians) - 1, min(_SPARSE, len(gaussians))).astype(int):
-        reconstruction.add_point3D(gaussians.means[row].numpy().astype(np.float64), pycolmap.Track(), colors[row])
+        reconstruction.add_point3D(
+            gaussians.means[row].numpy().astype(np.float64), pycolmap.Track(), colors[row]
+        )
     (folder / "sparse" / "0").mkdir(parents=True, exist_ok=True)
     reconstruction.write_binary(str(folder / "sparse" / "0"))
     sh = gaussians.sh.new_zeros(len(gaussians), 4, 3)
@@ -55,17 +70,42 @@ def write_project(workload: Workload, folder: Path) -> None:
 
 
 def cpu_seconds_per_iteration(binary: Path, folder: Path) -> float:
-    """CPU seconds of one iteration at one thread on a project of `write_project`. Raises Sc3dError if the program fails."""
+    """CPU seconds of one iteration at one thread on a project of `write_project`. Raises Sc3dError if the
+    program fails.
+    """
     return (_cpu_seconds(binary, folder, _MORE) - _cpu_seconds(binary, folder, _FEW)) / (_MORE - _FEW)
 
 
 def _cpu_seconds(binary: Path, folder: Path, iterations: int) -> float:
-    command = [binary, folder, "--cpu", "-n", iterations, "--num-downscales", 0, "--sh-degree", 1, "--sh-degree-interval", 10**6,
-               "--resume", folder / "gaussians.ply", "--keep-crs", "-o", folder / "splat.ply"]
+    command = [
+        binary,
+        folder,
+        "--cpu",
+        "-n",
+        iterations,
+        "--num-downscales",
+        0,
+        "--sh-degree",
+        1,
+        "--sh-degree-interval",
+        10**6,
+        "--resume",
+        folder / "gaussians.ply",
+        "--keep-crs",
+        "-o",
+        folder / "splat.ply",
+    ]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     try:
-        result = subprocess.run([str(part) for part in command], capture_output=True, text=True, errors="replace", timeout=_TIMEOUT, env=environment)
+        result = subprocess.run(
+            [str(part) for part in command],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_TIMEOUT,
+            env=environment,
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise Sc3dError(f"OpenSplat does not run: {error}") from None
     if result.returncode:
@@ -73,4 +113,3 @@ def _cpu_seconds(binary: Path, folder: Path, iterations: int) -> float:
         raise Sc3dError(f"OpenSplat ended with status {result.returncode}: {lines[0][:200]}")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-

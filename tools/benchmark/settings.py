@@ -13,7 +13,9 @@ from sc3d.settings.synthesize import SynthesizeCity as SynthesizeCity
 
 @dataclass(frozen=True)
 class BenchmarkSpeed:
-    """Time training stage by stage: CPU and wall time, fragments per pixel, fraction of the arithmetic limit, memory; OpenSplat beside it."""
+    """Time training stage by stage: CPU and wall time, fragments per pixel, fraction of the arithmetic limit,
+    memory; OpenSplat beside it.
+    """
 
     scene: Path | None = None
     """COLMAP scene folder whose sparse points say where the ground is; a synthetic ground otherwise."""
@@ -33,9 +35,16 @@ class BenchmarkSpeed:
 
 @dataclass(frozen=True)
 class BenchmarkTables:
-    """The paper's tables and an ablation: every method and switch on synthetic scenes and on scenes with truth, judged on the same pixels."""
+    """The paper's tables and an ablation: every method and switch on synthetic scenes and on scenes with
+    truth, judged on the same pixels.
+    """
 
-    workdir: Annotated[Positional[Path], arg(help="Folder for the synthetic scenes and finished rows; the same command goes on where it stopped.")]
+    workdir: Annotated[
+        Positional[Path],
+        arg(
+            help="Folder for the synthetic scenes and finished rows; the same command goes on where it stopped."
+        ),
+    ]
     scenes: tuple[Path, ...] = ()
     """Scene folders to add; each needs cloud.ply, masks/ and truth/."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -56,11 +65,20 @@ class BenchmarkTables:
 
 @dataclass(frozen=True)
 class BenchmarkFusionSpeed:
-    """Time label and propagate against bare ray casting, a numpy z-buffer voter, one nearest-neighbour pass and scikit-learn; growth and memory."""
+    """Time label and propagate against bare ray casting, a numpy z-buffer voter, one nearest-neighbour pass
+    and scikit-learn; growth and memory.
+    """
 
-    scene: Annotated[Positional[Path], arg(help="Scene folder with cloud.ply, mesh.ply and masks/, such as one that `benchmark tables` made.")]
+    scene: Annotated[
+        Positional[Path],
+        arg(
+            help="Scene folder with cloud.ply, mesh.ply and masks/, such as one that `benchmark tables` made."
+        ),
+    ]
     points: tuple[int, ...] = (1_000_000, 3_000_000, 10_000_000)
-    """Numbers of points, drawn from cloud.ply, beyond its size copied along the surface; the rivals run at the first."""
+    """Numbers of points, drawn from cloud.ply, beyond its size copied along the surface; the rivals run at
+    the first.
+    """
     views: tuple[int, ...] = (20, 40, 80)
     """Numbers of views, at the first number of points; a scene with fewer repeats its views."""
     repeats: int = 3
@@ -71,10 +89,14 @@ class BenchmarkFusionSpeed:
 
 @dataclass(frozen=True)
 class BenchmarkSurface:
-    """Compare gaussians.ply and mesh.ply of a scene with the exact depth and surface of the synthetic scene that its photos come from."""
+    """Compare gaussians.ply and mesh.ply of a scene with the exact depth and surface of the synthetic scene
+    that its photos come from.
+    """
 
     scene: Annotated[Positional[Path], arg(help="Reconstructed scene folder, with the true cameras.")]
-    truth: Annotated[Positional[Path], arg(help="Synthetic scene folder: depth/, truth/, truth.ply, truth_mesh.ply.")]
+    truth: Annotated[
+        Positional[Path], arg(help="Synthetic scene folder: depth/, truth/, truth.ply, truth_mesh.ply.")
+    ]
     voxel_size: float = 0.0
     """Voxel of the mesh, world units; 0 = as in mesh.ply.json."""
     output: Path | None = None
@@ -82,7 +104,9 @@ class BenchmarkSurface:
 
 
 Benchmark = (
-    Annotated[BenchmarkSpeed, subcommand("speed")] | Annotated[BenchmarkTables, subcommand("tables")]
-    | Annotated[BenchmarkFusionSpeed, subcommand("fusion-speed")] | Annotated[BenchmarkSurface, subcommand("surface")]
+    Annotated[BenchmarkSpeed, subcommand("speed")]
+    | Annotated[BenchmarkTables, subcommand("tables")]
+    | Annotated[BenchmarkFusionSpeed, subcommand("fusion-speed")]
+    | Annotated[BenchmarkSurface, subcommand("surface")]
     | Annotated[SynthesizeCity, subcommand("city")]
 )

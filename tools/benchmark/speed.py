@@ -28,14 +28,28 @@ def run_speed(command: BenchmarkSpeed) -> None:
     binary = None if command.opensplat is None else find_binary(command.opensplat)
     load = os.getloadavg()[0]
     ground = synthetic_ground() if command.scene is None else ground_of(Scene(command.scene).model)
-    configurations = [_configuration(ground, (count, size), command, binary) for size in command.sizes for count in command.gaussians]
-    settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(command).items()}
-    record = {"benchmark": "speed", "scene": "synthetic ground" if command.scene is None else command.scene.absolute().name, "settings": settings,
-              "versions": versions(), "load": load, "configurations": configurations}
+    configurations = [
+        _configuration(ground, (count, size), command, binary)
+        for size in command.sizes
+        for count in command.gaussians
+    ]
+    settings = {
+        name: str(value) if isinstance(value, Path) else value for name, value in asdict(command).items()
+    }
+    record = {
+        "benchmark": "speed",
+        "scene": "synthetic ground" if command.scene is None else command.scene.absolute().name,
+        "settings": settings,
+        "versions": versions(),
+        "load": load,
+        "configurations": configurations,
+    }
     publish(record, markdown(record), command.output)
 
 
-def _configuration(ground: Ground, size: tuple[int, int], command: BenchmarkSpeed, binary: Path | None) -> dict:
+def _configuration(
+    ground: Ground, size: tuple[int, int], command: BenchmarkSpeed, binary: Path | None
+) -> dict:
     """size: number of Gaussians, longest side of the view, px"""
     workload = build_workload(ground, *size)
     logger.info("%s ...", workload.name)
@@ -61,6 +75,7 @@ def _lenient(rival: Callable[[], float]) -> Callable[[], float | None]:
             failed.append(error)
             logger.warning("%s", error)
             return None
+
     return run
 
 

@@ -22,11 +22,26 @@ def markdown(record: dict) -> str:
     columns = record["configurations"]
     rows = [("", [column["name"] for column in columns]), ("---", ["---:"] * len(columns))]
     stages = list(columns[0]["cpu_seconds"])
-    rows += [(f"{stage}, CPU ms", [f"{1e3 * column['cpu_seconds'][stage]:.1f}" for column in columns]) for stage in stages]
-    rows += [(f"{stage}, wall ms, {column_threads(columns)} threads", [f"{1e3 * column['wall_seconds'][stage]:.1f}" for column in columns]) for stage in stages]
-    rows += [(title, [_cell(value, column) for column in columns]) for title, value in _ROWS if any(_cell(value, column) for column in columns)]
+    rows += [
+        (f"{stage}, CPU ms", [f"{1e3 * column['cpu_seconds'][stage]:.1f}" for column in columns])
+        for stage in stages
+    ]
+    rows += [
+        (
+            f"{stage}, wall ms, {column_threads(columns)} threads",
+            [f"{1e3 * column['wall_seconds'][stage]:.1f}" for column in columns],
+        )
+        for stage in stages
+    ]
+    rows += [
+        (title, [_cell(value, column) for column in columns])
+        for title, value in _ROWS
+        if any(_cell(value, column) for column in columns)
+    ]
     table = "\n".join(f"| {title} | {' | '.join(cells)} |" for title, cells in rows)
-    notes = [NOTE.format(load=record["load"])] + ([] if any("opensplat_ratio" in column for column in columns) else [REFERENCE_NOTE])
+    notes = [NOTE.format(load=record["load"])] + (
+        [] if any("opensplat_ratio" in column for column in columns) else [REFERENCE_NOTE]
+    )
     return f"# Training speed: {record['scene']}\n\n{table}\n\n" + "\n\n".join(notes) + "\n"
 
 
@@ -36,11 +51,17 @@ def column_threads(columns: list[dict]) -> int:
 
 
 def reference_ratio(column: dict, scaled: bool) -> float | None:
-    """OpenSplat's CPU time on the reference machine / ours here; None for configurations that were not measured there."""
+    """OpenSplat's CPU time on the reference machine / ours here; None for configurations that were not
+    measured there.
+    """
     seconds = REFERENCE_CPU_SECONDS.get((column["gaussians"], max(column["width"], column["height"])))
     if seconds is None:
         return None
-    return seconds / column["cpu_seconds"]["total"] * (REFERENCE_GFLOPS / column["ceiling_gflops"] if scaled else 1.0)
+    return (
+        seconds
+        / column["cpu_seconds"]["total"]
+        * (REFERENCE_GFLOPS / column["ceiling_gflops"] if scaled else 1.0)
+    )
 
 
 def _cell(value: Callable[[dict], str | None], column: dict) -> str:
@@ -57,7 +78,10 @@ def _ratio(column: dict, scaled: bool) -> str | None:
 
 _ROWS: tuple[tuple[str, Callable[[dict], str | None]], ...] = (
     ("speed-up of wall time, all threads / one", lambda column: f"{column['wall_speed_up']:.2f}"),
-    ("the same if no thread waited for a core, from CPU times of threads", lambda column: f"{column['idle_speed_up']:.2f}"),
+    (
+        "the same if no thread waited for a core, from CPU times of threads",
+        lambda column: f"{column['idle_speed_up']:.2f}",
+    ),
     ("share of the Gaussians in view, %", lambda column: f"{100 * column['visible_share']:.1f}"),
     ("contributing fragments per pixel", lambda column: f"{column['fragments_per_pixel']:.1f}"),
     ("slots evaluated per pixel", lambda column: f"{column['slots_per_pixel']:.1f}"),
@@ -67,7 +91,10 @@ _ROWS: tuple[tuple[str, Callable[[dict], str | None]], ...] = (
     ("fraction of the arithmetic limit", lambda column: f"{column['arithmetic_fraction']:.3f}"),
     ("peak memory, iteration, MB", lambda column: f"{column['peak_memory_mb']}"),
     ("plain training step, CPU ms", lambda column: f"{1e3 * column['plain_step_cpu_seconds']:.1f}"),
-    ("step with surface terms (two views), CPU ms", lambda column: f"{1e3 * column['surface_step_cpu_seconds']:.1f}"),
+    (
+        "step with surface terms (two views), CPU ms",
+        lambda column: f"{1e3 * column['surface_step_cpu_seconds']:.1f}",
+    ),
     ("with surface terms / plain", lambda column: f"{column['surface_step_ratio']:.2f}"),
     ("peak memory, both kinds of step, MB", lambda column: f"{column['steps_peak_memory_mb']}"),
     ("OpenSplat, CPU ms", lambda column: f"{1e3 * column['opensplat_cpu_seconds']:.1f}"),

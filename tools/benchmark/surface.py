@@ -23,10 +23,13 @@ WITHIN = 2.0  # voxels
 
 @dataclass(frozen=True)
 class SurfaceFigures:
-    """depth: relative errors of rendered depth where alpha > 0.9, trees apart; mesh: shares of surface within 2 voxels.
+    """depth: relative errors of rendered depth where alpha > 0.9, trees apart; mesh: shares of surface within
+    2 voxels.
 
-    depth_median, depth_p90: outside trees; tree_median: of trees; shares of pixels: opaque (alpha > 0.9), hit (the ray meets the mesh), tree_hit
-    completeness: per class name, share of the true surface that two or more photos see; accuracy: share of the mesh's area near the truth
+    depth_median, depth_p90: outside trees; tree_median: of trees; shares of pixels: opaque (alpha > 0.9), hit
+        (the ray meets the mesh), tree_hit
+    completeness: per class name, share of the true surface that two or more photos see; accuracy: share of
+        the mesh's area near the truth
     voxel_size: of the mesh, world units
     """
 
@@ -42,7 +45,9 @@ class SurfaceFigures:
 
 
 def surface_figures(scene: Scene, truth: Scene, voxel_size: float) -> SurfaceFigures:
-    """Compare gaussians.ply and mesh.ply of `scene` with depth/, truth/, truth.ply and truth_mesh.ply of `truth`, whose cameras it must have."""
+    """Compare gaussians.ply and mesh.ply of `scene` with depth/, truth/, truth.ply and truth_mesh.ply of
+    `truth`, whose cameras it must have.
+    """
     origin = local_origin(scene.model.views)
     views = [view.shifted(origin) for view in scene.model.views]
     mesh, true_mesh = _surface(scene.mesh, origin), _surface(truth.path / "truth_mesh.ply", origin)
@@ -53,11 +58,16 @@ def surface_figures(scene: Scene, truth: Scene, voxel_size: float) -> SurfaceFig
     return SurfaceFigures(**depth, completeness=completeness, accuracy=accuracy, voxel_size=voxel_size)
 
 
-def _depth_errors(gaussians: Gaussians, mesh: Surface, views: list[View], truth: Scene, tree: int) -> dict[str, float]:
+def _depth_errors(
+    gaussians: Gaussians, mesh: Surface, views: list[View], truth: Scene, tree: int
+) -> dict[str, float]:
     errors, labels, shares = [], [], []
     for view in tqdm(views, desc="depth", unit="view", disable=None):
         stem = view.name.rsplit(".", 1)[0]
-        exact, label = np.load(truth.path / "depth" / f"{stem}.npy"), read_index_image(truth.truth / f"{stem}.png")
+        exact, label = (
+            np.load(truth.path / "depth" / f"{stem}.npy"),
+            read_index_image(truth.truth / f"{stem}.png"),
+        )
         small = undistorted(view, max(exact.shape))
         depth, alpha, _ = depth_map(gaussians, small)
         known = np.isfinite(exact) & (exact > 0)
@@ -65,22 +75,40 @@ def _depth_errors(gaussians: Gaussians, mesh: Surface, views: list[View], truth:
         errors.append(np.abs(depth[used] - exact[used]) / exact[used])
         labels.append(label[used])
         hit = np.isfinite(first_surface(mesh, small).range)
-        shares.append([(alpha > MIN_ALPHA)[known].mean(), hit[known].mean(), hit[label == tree].mean() if (label == tree).any() else np.nan])
+        shares.append(
+            [
+                (alpha > MIN_ALPHA)[known].mean(),
+                hit[known].mean(),
+                hit[label == tree].mean() if (label == tree).any() else np.nan,
+            ]
+        )
     errors, labels = np.concatenate(errors), np.concatenate(labels)
     opaque, hit, tree_hit = np.nanmean(shares, axis=0)
     other = errors[labels != tree]
-    return {"depth_median": float(np.median(other)), "depth_p90": float(np.quantile(other, 0.9)), "tree_median": float(np.median(errors[labels == tree])),
-            "opaque": float(opaque), "hit": float(hit), "tree_hit": float(tree_hit)}
+    return {
+        "depth_median": float(np.median(other)),
+        "depth_p90": float(np.quantile(other, 0.9)),
+        "tree_median": float(np.median(errors[labels == tree])),
+        "opaque": float(opaque),
+        "hit": float(hit),
+        "tree_hit": float(tree_hit),
+    }
 
 
-def _completeness(mesh: Surface, true_mesh: Surface, views: list[View], truth: Scene, distance: float, origin: np.ndarray) -> dict[str, float]:
+def _completeness(
+    mesh: Surface, true_mesh: Surface, views: list[View], truth: Scene, distance: float, origin: np.ndarray
+) -> dict[str, float]:
     cloud = read_cloud(truth.path / "truth.ply")
     points, normals = cloud.point.positions.numpy() - origin, cloud.point.normals.numpy()
     seen = np.zeros(len(points), np.int32)
     for view in tqdm(views, desc="visible", unit="view", disable=None):
         seen[see_points(view, points, normals, first_surface(true_mesh, view), 0.05).points] += 1
     near, label = _distances(mesh, points) <= distance, cloud.point.label.numpy().ravel()
-    return {entry.name: float(near[(label == entry.id) & (seen >= 2)].mean()) for entry in truth.class_table() if ((label == entry.id) & (seen >= 2)).any()}
+    return {
+        entry.name: float(near[(label == entry.id) & (seen >= 2)].mean())
+        for entry in truth.class_table()
+        if ((label == entry.id) & (seen >= 2)).any()
+    }
 
 
 def _samples(scene: Scene, origin: np.ndarray) -> np.ndarray:
@@ -96,7 +124,9 @@ def _samples(scene: Scene, origin: np.ndarray) -> np.ndarray:
 
 def _surface(path, origin: np.ndarray) -> Surface:
     mesh = read_mesh(path)
-    return Surface.from_mesh(mesh.vertex.positions.numpy() - origin, mesh.triangle.indices.numpy(), np.zeros(3))
+    return Surface.from_mesh(
+        mesh.vertex.positions.numpy() - origin, mesh.triangle.indices.numpy(), np.zeros(3)
+    )
 
 
 def _distances(surface: Surface, points: np.ndarray) -> np.ndarray:

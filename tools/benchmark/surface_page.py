@@ -19,10 +19,22 @@ def run_surface(command: BenchmarkSurface) -> None:
     check_output(command.output)
     scene, truth = Scene(command.scene), Scene(command.truth)
     scene.require(scene.gaussians, scene.mesh, hint="run `sc3d train` and `sc3d extract` first")
-    exact = (truth.path / "depth", truth.truth, truth.path / "truth.ply", truth.path / "truth_mesh.ply", truth.classes)
+    exact = (
+        truth.path / "depth",
+        truth.truth,
+        truth.path / "truth.ply",
+        truth.path / "truth_mesh.ply",
+        truth.classes,
+    )
     truth.require(*exact, hint="the exact surface comes from `sc3d synthesize`")
     figures = surface_figures(scene, truth, command.voxel_size or voxel_size_of(scene))
-    record = {"benchmark": "surface", "scene": scene.path.resolve().name, "truth": truth.path.resolve().name, "versions": versions(), "figures": asdict(figures)}
+    record = {
+        "benchmark": "surface",
+        "scene": scene.path.resolve().name,
+        "truth": truth.path.resolve().name,
+        "versions": versions(),
+        "figures": asdict(figures),
+    }
     publish(record, page(record["scene"], figures), command.output)
 
 
@@ -45,7 +57,20 @@ def page(name: str, figures: SurfaceFigures) -> str:
         ("pixels that see the mesh", f"{figures.hit:.1%}"),
         ("pixels of trees that see the mesh", f"{figures.tree_hit:.1%}"),
         (f"area of the mesh within {WITHIN:g} voxels of the truth", f"{figures.accuracy:.1%}"),
-        *((f"true surface within {WITHIN:g} voxels of the mesh, {label}", f"{share:.1%}") for label, share in figures.completeness.items()),
+        *(
+            (f"true surface within {WITHIN:g} voxels of the mesh, {label}", f"{share:.1%}")
+            for label, share in figures.completeness.items()
+        ),
         ("voxel", f"{figures.voxel_size:g}"),
     ]
-    return "\n".join([f"# Surface: {name}\n", "| | |", "| --- | ---: |", *(f"| {title} | {value} |" for title, value in rows)]) + "\n"
+    return (
+        "\n".join(
+            [
+                f"# Surface: {name}\n",
+                "| | |",
+                "| --- | ---: |",
+                *(f"| {title} | {value} |" for title, value in rows),
+            ]
+        )
+        + "\n"
+    )

@@ -15,7 +15,12 @@ DIFFERENCES = [
     ("ours - majority voting", (12.39, 17.03), OURS, "majority voting, no filter"),
     ("ours - majority voting with the filter", None, OURS, "majority voting"),
     ("geometry - KNN", (1.13, 1.65), OURS, "conflict-lock + KNN"),
-    ("geometry - KNN, seeds not verified", (1.13, 1.65), "conflict-lock + geometry, seeds not verified", "conflict-lock + KNN, seeds not verified"),
+    (
+        "geometry - KNN, seeds not verified",
+        (1.13, 1.65),
+        "conflict-lock + geometry, seeds not verified",
+        "conflict-lock + KNN, seeds not verified",
+    ),
     ("filter - none", (24.99, 31.50), OURS, "conflict-lock + geometry, no filter"),
     ("default - conflict-lock + geometry", None, DEFAULT, OURS),
     ("default - majority voting with the filter", None, DEFAULT, "majority voting"),
@@ -34,9 +39,19 @@ def markdown(record: dict) -> str:
     for result in record["results"]:
         groups.setdefault(result["group"], []).append(result)
     seeds = max(len(results) for results in groups.values())
-    notes = NOTE.format(every=record["settings"]["every"], seeds=f"{seeds} seeds" if seeds > 1 else "seeds (there is one)", code=record["code"])
+    notes = NOTE.format(
+        every=record["settings"]["every"],
+        seeds=f"{seeds} seeds" if seeds > 1 else "seeds (there is one)",
+        code=record["code"],
+    )
     layout = {title: rows for title, rows in record["layout"].items() if title != "Ablation"}
-    parts = ["# Tables", notes, "## Differences", _differences(record["layout"], groups), _class_differences(record["layout"], groups)]
+    parts = [
+        "# Tables",
+        notes,
+        "## Differences",
+        _differences(record["layout"], groups),
+        _class_differences(record["layout"], groups),
+    ]
     parts += ["## Ablation", _ablation(record["layout"]["Ablation"], groups)]
     for group, results in groups.items():
         parts.append(f"## {group[0].upper()}{group[1:]}: {', '.join(result['scene'] for result in results)}")
@@ -50,24 +65,65 @@ def spread(values: list[float], digits: int = 1, sign: str = "") -> str:
     values = [value for value in values if np.isfinite(value)]
     if not values:
         return "–"
-    return f"{np.mean(values):{sign}.{digits}f}" + (f" ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else "")
+    return f"{np.mean(values):{sign}.{digits}f}" + (
+        f" ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else ""
+    )
 
 
 def _table(rows: list[dict], results: list[dict]) -> str:
-    classes = [name for name in results[0]["classes"] if any(name in result["rows"]["masks"]["all"]["iou"] for result in results)]
-    heads = ["OA", "mIoU", *classes, "OA edges", "mIoU edges", "OA elsewhere", "mIoU elsewhere", "coverage", "points", "ECE", "CPU s", "MB"]
+    classes = [
+        name
+        for name in results[0]["classes"]
+        if any(name in result["rows"]["masks"]["all"]["iou"] for result in results)
+    ]
+    heads = [
+        "OA",
+        "mIoU",
+        *classes,
+        "OA edges",
+        "mIoU edges",
+        "OA elsewhere",
+        "mIoU elsewhere",
+        "coverage",
+        "points",
+        "ECE",
+        "CPU s",
+        "MB",
+    ]
     lines = []
     masks = [result["rows"]["masks"] for result in results]
-    bounds = [(BOUND, [figures["bound"] for figures in masks])] if all("bound" in figures for figures in masks) else []
-    for name, found in [(MASKS, masks), *((row["name"], [result["rows"][row["key"]] for result in results]) for row in rows), *bounds]:
-        cells = [_percent(found, lambda figures: figures["all"]["oa"]), _percent(found, lambda figures: figures["all"]["miou"])]
-        cells += [_percent(found, lambda figures, label=label: figures["all"]["iou"].get(label, np.nan)) for label in classes]
-        for area, figure in (("near_edges", "oa"), ("near_edges", "miou"), ("elsewhere", "oa"), ("elsewhere", "miou")):
+    bounds = (
+        [(BOUND, [figures["bound"] for figures in masks])]
+        if all("bound" in figures for figures in masks)
+        else []
+    )
+    for name, found in [
+        (MASKS, masks),
+        *((row["name"], [result["rows"][row["key"]] for result in results]) for row in rows),
+        *bounds,
+    ]:
+        cells = [
+            _percent(found, lambda figures: figures["all"]["oa"]),
+            _percent(found, lambda figures: figures["all"]["miou"]),
+        ]
+        cells += [
+            _percent(found, lambda figures, label=label: figures["all"]["iou"].get(label, np.nan))
+            for label in classes
+        ]
+        for area, figure in (
+            ("near_edges", "oa"),
+            ("near_edges", "miou"),
+            ("elsewhere", "oa"),
+            ("elsewhere", "miou"),
+        ):
             cells.append(_percent(found, lambda figures, area=area, figure=figure: figures[area][figure]))
         cells += [_percent(found, lambda figures: figures["all"]["coverage"])]
         cells += [_percent(found, lambda figures: figures.get("points", {}).get("miou", np.nan))]
         cells += [_percent(found, lambda figures: figures.get("reliability", {}).get("ece", np.nan))]
-        cells += [spread([figures.get(key, np.nan) for figures in found], digits) for key, digits in (("cpu_seconds", 1), ("peak_memory_mb", 0))]
+        cells += [
+            spread([figures.get(key, np.nan) for figures in found], digits)
+            for key, digits in (("cpu_seconds", 1), ("peak_memory_mb", 0))
+        ]
         lines.append([name, *cells])
     return _grid(["", *heads], lines)
 
@@ -79,8 +135,16 @@ def _differences(layout: dict[str, list[dict]], groups: dict[str, list[dict]]) -
     for name, paper, better, worse in DIFFERENCES:
         cells = [" / ".join(f"{value:+.2f}" for value in paper) if paper else "–"]
         for results in groups.values():
-            pairs = [(result["rows"][keys[better]]["all"], result["rows"][keys[worse]]["all"]) for result in results]
-            cells.append(" / ".join(spread([100 * (more[figure] - less[figure]) for more, less in pairs], 2, "+") for figure in ("oa", "miou")))
+            pairs = [
+                (result["rows"][keys[better]]["all"], result["rows"][keys[worse]]["all"])
+                for result in results
+            ]
+            cells.append(
+                " / ".join(
+                    spread([100 * (more[figure] - less[figure]) for more, less in pairs], 2, "+")
+                    for figure in ("oa", "miou")
+                )
+            )
         lines.append([name, *cells])
     return _grid(["OA / mIoU, points", "paper, BeDOI-GB", *groups], lines)
 
@@ -88,10 +152,35 @@ def _differences(layout: dict[str, list[dict]], groups: dict[str, list[dict]]) -
 def _class_differences(layout: dict[str, list[dict]], groups: dict[str, list[dict]]) -> str:
     """IoU of each class: the default against majority voting with the filter."""
     keys = {row["name"]: row["key"] for rows in layout.values() for row in rows}
-    classes, lines = list(dict.fromkeys(name for results in groups.values() for result in results for name in result["classes"])), []
+    classes, lines = (
+        list(
+            dict.fromkeys(
+                name for results in groups.values() for result in results for name in result["classes"]
+            )
+        ),
+        [],
+    )
     for group, results in groups.items():
-        pairs = [(result["rows"][keys[DEFAULT]]["all"]["iou"], result["rows"][keys["majority voting"]]["all"]["iou"]) for result in results]
-        lines.append([group, *(spread([100 * (more.get(name, np.nan) - less.get(name, np.nan)) for more, less in pairs], 2, "+") for name in classes)])
+        pairs = [
+            (
+                result["rows"][keys[DEFAULT]]["all"]["iou"],
+                result["rows"][keys["majority voting"]]["all"]["iou"],
+            )
+            for result in results
+        ]
+        lines.append(
+            [
+                group,
+                *(
+                    spread(
+                        [100 * (more.get(name, np.nan) - less.get(name, np.nan)) for more, less in pairs],
+                        2,
+                        "+",
+                    )
+                    for name in classes
+                ),
+            ]
+        )
     return _grid(["IoU, default - majority voting with the filter", *classes], lines)
 
 
@@ -99,15 +188,45 @@ def _ablation(rows: list[dict], groups: dict[str, list[dict]]) -> str:
     """Change of mIoU when one switch is turned, sorted: what helps most stands first."""
     default, lines = rows[0]["key"], []
     for row in rows[1:]:
-        changes = {group: [_change(result, row["key"], row["base"]) for result in results] for group, results in groups.items()}
+        changes = {
+            group: [_change(result, row["key"], row["base"]) for result in results]
+            for group, results in groups.items()
+        }
         everywhere = [change for values in changes.values() for change in values]
-        edges = [_change(result, row["key"], row["base"], "near_edges") for results in groups.values() for result in results]
-        seconds = [result["rows"][row["key"]]["cpu_seconds"] - result["rows"][row["base"]]["cpu_seconds"] for results in groups.values() for result in results]
+        edges = [
+            _change(result, row["key"], row["base"], "near_edges")
+            for results in groups.values()
+            for result in results
+        ]
+        seconds = [
+            result["rows"][row["key"]]["cpu_seconds"] - result["rows"][row["base"]]["cpu_seconds"]
+            for results in groups.values()
+            for result in results
+        ]
         cells = [spread(values, 2, "+") for values in changes.values()]
-        lines.append((np.mean(everywhere), [row["name"], *cells, f"{np.mean(everywhere):+.2f}", f"{np.mean(edges):+.2f}", f"{np.mean(seconds):+.0f}"]))
-    level = [spread([100 * result["rows"][default]["all"]["miou"] for result in results]) for results in groups.values()]
-    every = [100 * result["rows"][default]["all"]["miou"] for results in groups.values() for result in results]
-    lines = [["default, mIoU", *level, f"{np.mean(every):.1f}", "", ""], *(line for _, line in sorted(lines, key=lambda line: line[0]))]
+        lines.append(
+            (
+                np.mean(everywhere),
+                [
+                    row["name"],
+                    *cells,
+                    f"{np.mean(everywhere):+.2f}",
+                    f"{np.mean(edges):+.2f}",
+                    f"{np.mean(seconds):+.0f}",
+                ],
+            )
+        )
+    level = [
+        spread([100 * result["rows"][default]["all"]["miou"] for result in results])
+        for results in groups.values()
+    ]
+    every = [
+        100 * result["rows"][default]["all"]["miou"] for results in groups.values() for result in results
+    ]
+    lines = [
+        ["default, mIoU", *level, f"{np.mean(every):.1f}", "", ""],
+        *(line for _, line in sorted(lines, key=lambda line: line[0])),
+    ]
     return _grid(["change of mIoU, points", *groups, "mean of all scenes", "mean near edges", "CPU s"], lines)
 
 

@@ -1,4 +1,6 @@
-"""The rows of the tables: baselines, the paper's method and ours, and one row per switch of Label and Propagate."""
+"""The rows of the tables: baselines, the paper's method and ours, and one row per switch of Label and
+Propagate.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +19,16 @@ GEOMETRY = Propagate(method="geometry")
 BASELINES = ("direct", "majority")
 RESOURCES = {field.name for field in fields(Resources)}
 ON_VALUES: dict[tuple[str, str], float] = {}
-"""What "on" means for numeric options that are off (0) by default, by stage and option; others are tried at 1."""
+"""What "on" means for numeric options that are off (0) by default, by stage and option; others are tried at
+1.
+"""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One way to label a cloud. propagate: None = the labels of `fuse` as they are; base: the row that an ablation row turns a switch of."""
+    """One way to label a cloud. propagate: None = the labels of `fuse` as they are; base: the row that an
+    ablation row turns a switch of.
+    """
 
     name: str
     label: Label
@@ -38,45 +44,80 @@ class Row:
     def settings(self) -> dict:
         """JSON-ready; the options that name files are left out."""
         records = {"label": self.label, "propagate": self.propagate}
-        return {stage: record and {name: value for name, value in asdict(record).items() if _is_mechanism(type(record), name) or name == "voxel_size"}
-                for stage, record in records.items()}
+        return {
+            stage: record
+            and {
+                name: value
+                for name, value in asdict(record).items()
+                if _is_mechanism(type(record), name) or name == "voxel_size"
+            }
+            for stage, record in records.items()
+        }
 
 
 def tables() -> dict[str, list[Row]]:
     """The rows of each table by its title; rows of equal settings are computed once."""
-    ours, default, as_printed = Row(OURS, Label(), GEOMETRY), Row(DEFAULT, Label(), Propagate()), Propagate(method="geometry", verify_seeds=False, color=False)
+    ours, default, as_printed = (
+        Row(OURS, Label(), GEOMETRY),
+        Row(DEFAULT, Label(), Propagate()),
+        Propagate(method="geometry", verify_seeds=False, color=False),
+    )
     return {
         "Table 1: semantic accuracy": [
-            Row("direct overlay, no filter", replace(NO_FILTER, method="direct"), None), Row("direct overlay", Label(method="direct"), None),
-            Row("majority voting, no filter", replace(NO_FILTER, method="majority"), None), Row("majority voting", Label(method="majority"), None),
-            Row("majority voting + KNN", Label(method="majority"), Propagate(method="knn", verify_seeds=False)),
-            Row("paper preset (any conflict locks) + geometry", Label(method="paper"), as_printed), ours, default],
+            Row("direct overlay, no filter", replace(NO_FILTER, method="direct"), None),
+            Row("direct overlay", Label(method="direct"), None),
+            Row("majority voting, no filter", replace(NO_FILTER, method="majority"), None),
+            Row("majority voting", Label(method="majority"), None),
+            Row(
+                "majority voting + KNN", Label(method="majority"), Propagate(method="knn", verify_seeds=False)
+            ),
+            Row("paper preset (any conflict locks) + geometry", Label(method="paper"), as_printed),
+            ours,
+            default,
+        ],
         "Table 2: propagation": [
             Row("conflict-lock, seeds only", Label(), None),
-            Row("conflict-lock + KNN, seeds not verified", Label(), Propagate(method="knn", verify_seeds=False)),
-            Row("conflict-lock + geometry, seeds not verified", Label(), as_printed), Row("conflict-lock + KNN", Label(), Propagate(method="knn")), ours,
-            Row("conflict-lock + map", Label(), Propagate(method="map"))],
+            Row(
+                "conflict-lock + KNN, seeds not verified",
+                Label(),
+                Propagate(method="knn", verify_seeds=False),
+            ),
+            Row("conflict-lock + geometry, seeds not verified", Label(), as_printed),
+            Row("conflict-lock + KNN", Label(), Propagate(method="knn")),
+            ours,
+            Row("conflict-lock + map", Label(), Propagate(method="map")),
+        ],
         "Table 3: first-surface filter": [
-            Row("conflict-lock + geometry, no filter", NO_FILTER, GEOMETRY), ours, Row("default, no filter", NO_FILTER, Propagate()), default],
+            Row("conflict-lock + geometry, no filter", NO_FILTER, GEOMETRY),
+            ours,
+            Row("default, no filter", NO_FILTER, Propagate()),
+            default,
+        ],
         "Ablation": [default, *ablation()],
     }
 
 
 def ablation() -> list[Row]:
-    """The default with one switch turned, for every switch; switches of knn and geometry alone are turned in conflict-lock + geometry."""
+    """The default with one switch turned, for every switch; switches of knn and geometry alone are turned in
+    conflict-lock + geometry.
+    """
     default, geometry = Row(DEFAULT, Label(), Propagate()), Row(OURS, Label(), GEOMETRY)
     rows = [Row(f"label: {text}", record, Propagate(), default) for text, record in turned(Label())]
     for text, record in turned(Propagate()):
         option = text.removeprefix("--no-").removeprefix("--").split()[0].replace("-", "_")
         if "(knn, geometry)" in helps(Propagate)[option]:
-            rows.append(Row(f"propagate, geometry: {text}", Label(), replace(record, method="geometry"), geometry))
+            rows.append(
+                Row(f"propagate, geometry: {text}", Label(), replace(record, method="geometry"), geometry)
+            )
         else:
             rows.append(Row(f"propagate: {text}", Label(), record, default))
     return rows
 
 
 def turned(record: Label | Propagate) -> list[tuple[str, Label | Propagate]]:
-    """Description and record for every switch that can be turned: flags, choices, and numbers for which the help says that 0 is off."""
+    """Description and record for every switch that can be turned: flags, choices, and numbers for which the
+    help says that 0 is off.
+    """
     kind, stage = type(record), type(record).__name__.lower()
     hints, found = get_type_hints(kind), []
     for field in fields(kind):
@@ -86,7 +127,11 @@ def turned(record: Label | Propagate) -> list[tuple[str, Label | Propagate]]:
         if hints[field.name] is bool:
             found.append((f"--{'no-' if value else ''}{option}", replace(record, **{field.name: not value})))
         elif get_origin(hints[field.name]) is Literal:
-            others = [choice for choice in get_args(hints[field.name]) if choice != value and choice not in BASELINES]
+            others = [
+                choice
+                for choice in get_args(hints[field.name])
+                if choice != value and choice not in BASELINES
+            ]
             found += [(f"--{option} {choice}", replace(record, **{field.name: choice})) for choice in others]
         elif "0 = off" in helps(kind)[field.name]:
             other = 0.0 if value else ON_VALUES.get((stage, field.name), 1.0)

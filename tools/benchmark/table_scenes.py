@@ -1,4 +1,6 @@
-"""What the tables are computed on: synthetic scenes that are made once per seed, with masks of any strength, and scenes given by path."""
+"""What the tables are computed on: synthetic scenes that are made once per seed, with masks of any strength,
+and scenes given by path.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,15 @@ from sc3d.synthetic.masks import noisy_mask
 
 logger = logging.getLogger(__name__)
 
-LINKS = {"sparse": "sparse", "truth": "truth", "classes.json": "classes.json", "images": "images", "truth.ply": "truth.ply", "cloud.ply": "truth.ply",
-         "mesh.ply": "truth_mesh.ply"}
+LINKS = {
+    "sparse": "sparse",
+    "truth": "truth",
+    "classes.json": "classes.json",
+    "images": "images",
+    "truth.ply": "truth.ply",
+    "cloud.ply": "truth.ply",
+    "mesh.ply": "truth_mesh.ply",
+}
 BAND = 10.0  # px
 FEW = 8  # photos are judged in any case, if there are so many
 
@@ -38,7 +47,8 @@ FEW = 8  # photos are judged in any case, if there are so many
 class Place:
     """A scene without its masks: loaded once, whatever masks are tried on it.
 
-    cloud: points and normals; colors: (N, 3) uint8 or None; truth: (N,) uint8 true label per point, None = not known
+    cloud: points and normals; colors: (N, 3) uint8 or None; truth: (N,) uint8 true label per point, None =
+        not known
     judged: the evaluated pixels of `photos`, in this order
     """
 
@@ -58,19 +68,24 @@ class Place:
 def synthetic_scene(folder: Path, settings: Synthesize) -> Scene:
     """The scene of a seed in `folder`; made if it is not there yet. InputError if another scene is."""
     scene = Scene(folder)
-    if not all(path.exists() for path in (scene.classes, folder / "truth.ply", folder / "truth_mesh.ply")):  # classes.json is written last
+    # classes.json is written last
+    if not all(path.exists() for path in (scene.classes, folder / "truth.ply", folder / "truth_mesh.ply")):
         with tqdm(total=100, desc=f"synthesize {folder.name}", unit="%", disable=None) as bar:
             synthesize(folder, settings, lambda share, _: bar.update(round(100 * share) - bar.n))
     views = scene.model.views
     found = len(views), views[0].width, len(read_cloud(folder / "truth.ply").point.positions)
     wanted = settings.views, settings.width, settings.num_points
     if found != wanted:
-        raise InputError(f"{folder} has {found[0]} views of {found[1]} px and {found[2]} points, not {wanted}: choose another working folder, or its options")
+        raise InputError(
+            f"{folder} has {found[0]} views of {found[1]} px and {found[2]} points, not {wanted}: choose another working folder, or its options"
+        )
     return scene
 
 
 def with_masks(scene: Scene, folder: Path, settings: Synthesize) -> Scene:
-    """A scene folder with the same world and photos (links) and masks of strength `settings.mask_noise`, as `synthesize` makes them."""
+    """A scene folder with the same world and photos (links) and masks of strength `settings.mask_noise`, as
+    `synthesize` makes them.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for name, target in LINKS.items():
         link = folder / name
@@ -90,8 +105,15 @@ def with_masks(scene: Scene, folder: Path, settings: Synthesize) -> Scene:
 
 
 def load_place(scene: Scene, every: int) -> Place:
-    """Load cloud and surface of a scene and find the point that every judged pixel shows, in every `every`th photo that has truth (all if they are few)."""
-    scene.require(scene.truth, scene.classes, scene.cloud, hint="the tables need a scene with cloud.ply, classes.json and truth masks")
+    """Load cloud and surface of a scene and find the point that every judged pixel shows, in every `every`th
+    photo that has truth (all if they are few).
+    """
+    scene.require(
+        scene.truth,
+        scene.classes,
+        scene.cloud,
+        hint="the tables need a scene with cloud.ply, classes.json and truth masks",
+    )
     views, truth_files = scene.model.views, scene.mask_files(scene.truth, scene.class_table())
     cloud = read_cloud(scene.cloud)
     points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
@@ -104,21 +126,32 @@ def load_place(scene: Scene, every: int) -> Place:
         truth = read_index_image(truth_files[view.name])
         sized = view.resized(*truth.shape[::-1])
         first = first_surface(surface, sized)
-        parts.append(JudgedPixels.of(truth, nearest_points(first, sized, index, reach, truth > 0), depth_edge_band(first.range, BAND)))
+        parts.append(
+            JudgedPixels.of(
+                truth,
+                nearest_points(first, sized, index, reach, truth > 0),
+                depth_edge_band(first.range, BAND),
+            )
+        )
     colors = cloud.point.colors.numpy() if "colors" in cloud.point else None
-    true = scene.cloud.resolve() == (scene.path / "truth.ply").resolve()  # else a label in the cloud is somebody's result
+    # else a label in the cloud is somebody's result
+    true = scene.cloud.resolve() == (scene.path / "truth.ply").resolve()
     label = cloud.point["label"].numpy().ravel() if true and "label" in cloud.point else None
     return Place(scene, Cloud(points, normals), colors, label, surface, JudgedPixels.joined(parts), photos)
 
 
 def judge_masks(place: Place, masks: Masks) -> tuple[Confusion, Confusion]:
-    """Confusion of the masks themselves on the judged pixels, inside and outside the band; photos without a mask count as unlabelled."""
+    """Confusion of the masks themselves on the judged pixels, inside and outside the band; photos without a
+    mask count as unlabelled.
+    """
     truth_files, parts = place.scene.mask_files(place.scene.truth), []
     for view in place.photos:
         truth = read_index_image(truth_files[view.name])
         mask = np.zeros_like(truth)
         if view.name in masks.files:
-            mask = cv2.resize(read_index_image(masks.files[view.name]), truth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            mask = cv2.resize(
+                read_index_image(masks.files[view.name]), truth.shape[::-1], interpolation=cv2.INTER_NEAREST
+            )
         parts.append(mask[truth > 0])
     return place.judged.confusions(np.concatenate(parts), place.num_ids)
 

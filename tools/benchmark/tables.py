@@ -1,4 +1,6 @@
-"""The tables of the paper: every row is one way to label a cloud, judged on the same pixels. Finished rows are kept, so that a run can go on."""
+"""The tables of the paper: every row is one way to label a cloud, judged on the same pixels. Finished rows
+are kept, so that a run can go on.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,18 @@ from tools.benchmark.table_scenes import (
 
 logger = logging.getLogger(__name__)
 
-DECIDE = ("geometry", "propagation", "density.py", "fusion.py", "labelled.py", "labelling.py", "verification.py", "voting.py", "voting_kernels.py")  # the rows
+# the rows
+DECIDE = (
+    "geometry",
+    "propagation",
+    "density.py",
+    "fusion.py",
+    "labelled.py",
+    "labelling.py",
+    "verification.py",
+    "voting.py",
+    "voting_kernels.py",
+)
 
 
 @dataclass(frozen=True)
@@ -57,7 +70,16 @@ class Variant:
     def digest(self) -> str:
         """Hash of all that rows are made from: rows of other inputs are not mixed in."""
         scene = self.scene
-        inputs = (scene.sparse, scene.classes, scene.masks, scene.confidence, scene.truth, scene.cloud, scene.mesh, scene.gaussians)
+        inputs = (
+            scene.sparse,
+            scene.classes,
+            scene.masks,
+            scene.confidence,
+            scene.truth,
+            scene.cloud,
+            scene.mesh,
+            scene.gaussians,
+        )
         return hashlib.sha256(" ".join(digest(path) for path in inputs).encode()).hexdigest()[:12]
 
 
@@ -80,10 +102,30 @@ def compute_tables(command: BenchmarkTables) -> dict[str, object]:
         classes = [entry.name for entry in scene.class_table()]
         for variant in variants:
             rows = _run_variant(place, variant, command)
-            results.append({"scene": variant.scene.path.name, "group": variant.group, "seed": variant.seed, "classes": classes, "rows": rows})
-    layout = {title: [{"name": row.name, "key": row.key} | ({"base": row.base.key} if row.base else {}) for row in rows] for title, rows in tables().items()}
+            results.append(
+                {
+                    "scene": variant.scene.path.name,
+                    "group": variant.group,
+                    "seed": variant.seed,
+                    "classes": classes,
+                    "rows": rows,
+                }
+            )
+    layout = {
+        title: [
+            {"name": row.name, "key": row.key} | ({"base": row.base.key} if row.base else {}) for row in rows
+        ]
+        for title, rows in tables().items()
+    }
     settings = {name: getattr(command, name) for name in ("views", "points", "width", "every")}
-    return {"benchmark": "tables", "settings": settings, "versions": versions(), "code": code_digest(), "layout": layout, "results": results}
+    return {
+        "benchmark": "tables",
+        "settings": settings,
+        "versions": versions(),
+        "code": code_digest(),
+        "layout": layout,
+        "results": results,
+    }
 
 
 def unique_rows() -> list[Row]:
@@ -110,7 +152,13 @@ def _check(command: BenchmarkTables) -> None:
     require_writable(command.output or command.workdir)
     for path in command.scenes:
         scene = Scene(path)
-        scene.require(scene.truth, scene.cloud, scene.masks, scene.classes, hint="the tables need cloud.ply, classes.json, masks/ and truth/")
+        scene.require(
+            scene.truth,
+            scene.cloud,
+            scene.masks,
+            scene.classes,
+            hint="the tables need cloud.ply, classes.json, masks/ and truth/",
+        )
 
 
 def _scenes(command: BenchmarkTables) -> Iterator[tuple[Scene, list[Variant]]]:
@@ -119,7 +167,9 @@ def _scenes(command: BenchmarkTables) -> Iterator[tuple[Scene, list[Variant]]]:
         settings = Synthesize(seed=seed, views=command.views, width=command.width, num_points=command.points)
         base, variants = synthetic_scene(command.workdir / f"seed{seed}", settings), []
         for noise in command.noises:
-            scene = with_masks(base, command.workdir / f"seed{seed}_noise{noise:g}", replace(settings, mask_noise=noise))
+            scene = with_masks(
+                base, command.workdir / f"seed{seed}_noise{noise:g}", replace(settings, mask_noise=noise)
+            )
             variants.append(Variant(f"synthetic, mask noise {noise:g}", seed, scene))
         yield variants[0].scene, variants
     for path in command.scenes:
@@ -128,7 +178,13 @@ def _scenes(command: BenchmarkTables) -> Iterator[tuple[Scene, list[Variant]]]:
 
 def _run_variant(place: Place | None, variant: Variant, command: BenchmarkTables) -> dict[str, dict]:
     """Figures by key of the row; "masks" for the masks."""
-    figures = {key: found for key, found in ((row.key if row else "masks", _kept(command, variant, row)) for row in [None, *unique_rows()]) if found}
+    figures = {
+        key: found
+        for key, found in (
+            (row.key if row else "masks", _kept(command, variant, row)) for row in [None, *unique_rows()]
+        )
+        if found
+    }
     missing = [row for row in unique_rows() if row.key not in figures]
     if "masks" in figures and not missing:
         return figures
@@ -137,17 +193,23 @@ def _run_variant(place: Place | None, variant: Variant, command: BenchmarkTables
         table = variant.scene.class_table()
         figures["masks"] = {"name": MASKS} | _areas(judge_masks(place, masks), table)
         if place.truth is not None:
-            figures["masks"]["bound"] = _areas(place.judged.confusions(place.judged.look_up(place.truth), place.num_ids), table)
+            figures["masks"]["bound"] = _areas(
+                place.judged.confusions(place.judged.look_up(place.truth), place.num_ids), table
+            )
         write_json(_file(command, variant, None), figures["masks"])
     _warm_up(place, masks)
     voxel_size = default_voxel_size(place.cloud.points, masks)
     for label, rows in groupby(missing, key=lambda row: row.label):
-        seeds, cost = _seeds(place, masks, label if label.voxel_size else replace(label, voxel_size=voxel_size))
+        seeds, cost = _seeds(
+            place, masks, label if label.voxel_size else replace(label, voxel_size=voxel_size)
+        )
         for row in rows:
             figures[row.key] = _run_row(place, (seeds, cost), row)
             write_json(_file(command, variant, row), figures[row.key])
             score, seconds = figures[row.key]["all"]["miou"], figures[row.key]["cpu_seconds"]
-            logger.info("%s: %s: mIoU %.1f %%, %.0f CPU s", variant.scene.path.name, row.name, 100 * score, seconds)
+            logger.info(
+                "%s: %s: mIoU %.1f %%, %.0f CPU s", variant.scene.path.name, row.name, 100 * score, seconds
+            )
     return figures
 
 
@@ -158,13 +220,25 @@ def _run_row(place: Place, given: tuple[Evidence, dict[str, float]], row: Row) -
     if row.propagate is not None:
         labels, cost = _propagated(place, evidence, row.propagate)
     figures = judge(place, labels)
-    seconds = {f"{name}_{clock}": spent[clock] for name, spent in (("label", before), ("propagate", cost)) for clock in ("cpu_seconds", "wall_seconds")}
+    seconds = {
+        f"{name}_{clock}": spent[clock]
+        for name, spent in (("label", before), ("propagate", cost))
+        for clock in ("cpu_seconds", "wall_seconds")
+    }
     total = {clock: before[clock] + cost[clock] for clock in ("cpu_seconds", "wall_seconds")}
-    return {"name": row.name, "settings": row.settings} | figures | seconds | total | {"peak_memory_mb": max(before["peak_memory_mb"], cost["peak_memory_mb"])}
+    return (
+        {"name": row.name, "settings": row.settings}
+        | figures
+        | seconds
+        | total
+        | {"peak_memory_mb": max(before["peak_memory_mb"], cost["peak_memory_mb"])}
+    )
 
 
 def judge(place: Place, labels: Labels) -> dict[str, dict]:
-    """Figures of a labelling: per pixel, all and by distance to depth edges, and per point where the truth is known."""
+    """Figures of a labelling: per pixel, all and by distance to depth edges, and per point where the truth is
+    known.
+    """
     table = place.scene.class_table()
     figures = _areas(place.judged.confusions(place.judged.look_up(labels.label), place.num_ids), table)
     if place.truth is not None:
@@ -186,7 +260,9 @@ def _seeds(place: Place, masks: Masks, label: Label) -> tuple[Evidence, dict[str
 
 def _fused(place: Place, masks: Masks, label: Label) -> Fusion:
     cloud = with_density(place, label.voxel_size) if label.density else place.cloud
-    return fuse(cloud, masks.views, masks.read, place.surface if label.depth_filter else None, place.num_ids, label)
+    return fuse(
+        cloud, masks.views, masks.read, place.surface if label.depth_filter else None, place.num_ids, label
+    )
 
 
 def _propagated(place: Place, evidence: Evidence, settings: Propagate) -> tuple[Labels, dict[str, float]]:
@@ -207,12 +283,18 @@ def _warm_up(place: Place, masks: Masks) -> None:
 
 @contextmanager
 def _measured() -> Iterator[dict[str, float]]:
-    """CPU seconds of the process, wall seconds and peak memory of the body; memory counts all that the process holds."""
+    """CPU seconds of the process, wall seconds and peak memory of the body; memory counts all that the
+    process holds.
+    """
     cost: dict[str, float] = {}
     reset_peak_memory()
     cpu, wall = time.process_time(), time.perf_counter()
     yield cost
-    cost.update(cpu_seconds=time.process_time() - cpu, wall_seconds=time.perf_counter() - wall, peak_memory_mb=peak_memory_mb())
+    cost.update(
+        cpu_seconds=time.process_time() - cpu,
+        wall_seconds=time.perf_counter() - wall,
+        peak_memory_mb=peak_memory_mb(),
+    )
 
 
 def _kept(command: BenchmarkTables, variant: Variant, row: Row | None) -> dict | None:

@@ -1,4 +1,6 @@
-"""Speed of training: one iteration stage by stage, the rasteriser against the arithmetic limit, whole steps with and without surface terms."""
+"""Speed of training: one iteration stage by stage, the rasteriser against the arithmetic limit, whole steps
+with and without surface terms.
+"""
 
 from __future__ import annotations
 
@@ -38,18 +40,29 @@ _LATE = 0.9  # where in such a run they are: no densification, full size
 
 
 class Iteration:
-    """One training iteration on the first view of a workload, 7 channels: render, L1 + 0.2 SSIM, backward, Adam with vanishing rates."""
+    """One training iteration on the first view of a workload, 7 channels: render, L1 + 0.2 SSIM, backward,
+    Adam with vanishing rates.
+    """
 
     def __init__(self, workload: Workload) -> None:
         view, photo = workload.views[0], workload.photos[0]
-        parameters = {name: tensor.clone().requires_grad_() for name, tensor in workload.gaussians.parameters().items()}
+        parameters = {
+            name: tensor.clone().requires_grad_() for name, tensor in workload.gaussians.parameters().items()
+        }
         self.optimiser = RowAdam(parameters, dict.fromkeys(parameters, 1e-7))
         self.view = view
-        self.target = torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1))).float().div(255).permute(1, 2, 0)
-        self.slopes = [torch.full((3, view.height, view.width), 1e-6).permute(1, 2, 0), torch.full((view.height, view.width), 1e-6)]
+        self.target = (
+            torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1))).float().div(255).permute(1, 2, 0)
+        )
+        self.slopes = [
+            torch.full((3, view.height, view.width), 1e-6).permute(1, 2, 0),
+            torch.full((view.height, view.width), 1e-6),
+        ]
 
     def run(self) -> dict[str, np.ndarray]:
-        """Seconds of each stage, of the `rest` (autograd, allocation) and the `total`: (3,) as in `Stopwatch`."""
+        """Seconds of each stage, of the `rest` (autograd, allocation) and the `total`: (3,) as in
+        `Stopwatch`.
+        """
         watch = Stopwatch()
         with watch.watching(FUNCTIONS), watch.stage("total"):
             rendering = render.render(current(self.optimiser), self.view)
@@ -59,10 +72,15 @@ class Iteration:
             with watch.stage("adam"):
                 self.optimiser.step()
         seconds = {stage: watch.seconds[stage] for stage in STAGES}
-        return seconds | {"rest": watch.seconds["total"] - sum(seconds.values()), "total": watch.seconds["total"]}
+        return seconds | {
+            "rest": watch.seconds["total"] - sum(seconds.values()),
+            "total": watch.seconds["total"],
+        }
 
 
-def measure_training(workload: Workload, repeats: int, rival: Callable[[], float | None] | None = None) -> dict[str, object]:
+def measure_training(
+    workload: Workload, repeats: int, rival: Callable[[], float | None] | None = None
+) -> dict[str, object]:
     """Everything about one iteration; contenders take turns, medians of `repeats` are reported.
 
     rival: runs another program and returns its CPU seconds per iteration at one thread; None = it failed
@@ -80,9 +98,15 @@ def measure_training(workload: Workload, repeats: int, rival: Callable[[], float
         if rival is not None:
             others += [seconds for seconds in [rival()] if seconds is not None]
     record = _describe(workload) | {"threads": threads, "peak_memory_mb": peak_memory_mb()}
-    record |= {"cpu_seconds": _medians(single, 2), "wall_seconds_one_thread": _medians(single, 1), "wall_seconds": _medians(many, 1)}
+    record |= {
+        "cpu_seconds": _medians(single, 2),
+        "wall_seconds_one_thread": _medians(single, 1),
+        "wall_seconds": _medians(many, 1),
+    }
     record["wall_speed_up"] = record["wall_seconds_one_thread"]["total"] / record["wall_seconds"]["total"]
-    record["idle_speed_up"] = record["cpu_seconds"]["total"] / float(np.median([_idle_seconds(run, threads) for run in many]))
+    record["idle_speed_up"] = record["cpu_seconds"]["total"] / float(
+        np.median([_idle_seconds(run, threads) for run in many])
+    )
     record["ceiling_gflops"], record["ceiling_gflops_all_threads"] = np.median(ceilings, axis=0).tolist()
     spent = record["cpu_seconds"]["forward"] + record["cpu_seconds"]["backward"]
     pixels = workload.views[0].width * workload.views[0].height
@@ -95,7 +119,9 @@ def measure_training(workload: Workload, repeats: int, rival: Callable[[], float
 
 
 def measure_steps(workload: Workload, repeats: int) -> dict[str, float]:
-    """CPU seconds at one thread of whole training steps on the first view, late in a run, without and with surface terms (second view as neighbour)."""
+    """CPU seconds at one thread of whole training steps on the first view, late in a run, without and with
+    surface terms (second view as neighbour).
+    """
     with use_threads(1):
         plain, surface = _trainer(workload, plain=True), _trainer(workload, plain=False)
         for trainer in (plain, surface):  # compiles, and renders the neighbour's depth
@@ -103,15 +129,26 @@ def measure_steps(workload: Workload, repeats: int) -> dict[str, float]:
         reset_peak_memory()
         seconds = [[_timed_step(plain), _timed_step(surface)] for _ in range(repeats)]
     plain_seconds, surface_seconds = np.median(seconds, axis=0).tolist()
-    return {"plain_step_cpu_seconds": plain_seconds, "surface_step_cpu_seconds": surface_seconds, "surface_step_ratio": surface_seconds / plain_seconds,
-            "steps_peak_memory_mb": peak_memory_mb()}
+    return {
+        "plain_step_cpu_seconds": plain_seconds,
+        "surface_step_cpu_seconds": surface_seconds,
+        "surface_step_ratio": surface_seconds / plain_seconds,
+        "steps_peak_memory_mb": peak_memory_mb(),
+    }
 
 
 def _describe(workload: Workload) -> dict[str, object]:
     view = workload.views[0]
     fragments, slots, share = count_fragments(workload.gaussians, view)
-    return {"name": workload.name, "gaussians": len(workload.gaussians), "width": view.width, "height": view.height, "visible_share": share,
-            "fragments_per_pixel": fragments, "slots_per_pixel": slots}
+    return {
+        "name": workload.name,
+        "gaussians": len(workload.gaussians),
+        "width": view.width,
+        "height": view.height,
+        "visible_share": share,
+        "fragments_per_pixel": fragments,
+        "slots_per_pixel": slots,
+    }
 
 
 def _medians(runs: list[dict[str, np.ndarray]], clock: int) -> dict[str, float]:
@@ -119,15 +156,26 @@ def _medians(runs: list[dict[str, np.ndarray]], clock: int) -> dict[str, float]:
 
 
 def _idle_seconds(run: dict[str, np.ndarray], threads: int) -> float:
-    """Wall seconds that an iteration would take if no thread had to wait for a core: per stage the busier of the calling thread and the others."""
-    return sum(max(own, (process - own) / max(threads - 1, 1)) for stage, (process, _, own) in run.items() if stage != "total")
+    """Wall seconds that an iteration would take if no thread had to wait for a core: per stage the busier of
+    the calling thread and the others.
+    """
+    return sum(
+        max(own, (process - own) / max(threads - 1, 1))
+        for stage, (process, _, own) in run.items()
+        if stage != "total"
+    )
 
 
 def _trainer(workload: Workload, plain: bool) -> Trainer:
     """A trainer late in its run, with the workload's Gaussians and vanishing rates."""
     points, size = workload.gaussians.means.numpy(), len(workload.gaussians)
-    settings = TrainSettings(iterations=_STEPS, max_gaussians=size, max_size=10_000, sh_degree=0, plain=plain, fill=False)
-    trainer = Trainer(TrainingData(list(workload.views), workload.photos, points, np.zeros(points.shape, np.uint8)), settings)
+    settings = TrainSettings(
+        iterations=_STEPS, max_gaussians=size, max_size=10_000, sh_degree=0, plain=plain, fill=False
+    )
+    trainer = Trainer(
+        TrainingData(list(workload.views), workload.photos, points, np.zeros(points.shape, np.uint8)),
+        settings,
+    )
     for name, tensor in workload.gaussians.parameters().items():
         trainer.optimiser.parameters[name].data.copy_(tensor)
     trainer.optimiser.rates = {name: rate * 1e-6 for name, rate in trainer.optimiser.rates.items()}

@@ -24,7 +24,9 @@ _FULL_SIZE = (1986, 1116)  # of the synthetic photos, px
 
 @dataclass(frozen=True)
 class Ground:
-    """Surface points (P, 3) in a local world frame, their colours (P, 3) uint8, and two views that overlap, at full size."""
+    """Surface points (P, 3) in a local world frame, their colours (P, 3) uint8, and two views that overlap,
+    at full size.
+    """
 
     points: np.ndarray
     colors: np.ndarray
@@ -33,7 +35,9 @@ class Ground:
 
 @dataclass(frozen=True)
 class Workload:
-    """Flat Gaussians on the ground, two pinhole views at the size to be timed, and per view an (H, W, 3) uint8 photo."""
+    """Flat Gaussians on the ground, two pinhole views at the size to be timed, and per view an (H, W, 3)
+    uint8 photo.
+    """
 
     gaussians: Gaussians
     views: tuple[View, View]
@@ -52,17 +56,32 @@ def synthetic_ground(num_points: int = 20_000, seed: int = 0) -> Ground:
     half = np.sqrt(footprint / VISIBLE_SHARE) / 2
     x, y = rng.uniform(-half, half, (2, num_points))
     points = np.stack([x, y, 1.5 * np.sin(0.15 * x) * np.cos(0.11 * y)], 1)
-    colors = 127 + 80 * np.stack([np.sin(0.9 * x + 0.4 * y), np.sin(0.7 * y - 0.5 * x), np.cos(0.6 * x)], 1) + rng.normal(0, 15, (num_points, 3))
+    colors = (
+        127
+        + 80 * np.stack([np.sin(0.9 * x + 0.4 * y), np.sin(0.7 * y - 0.5 * x), np.cos(0.6 * x)], 1)
+        + rng.normal(0, 15, (num_points, 3))
+    )
     numbers = (focal, focal, _FULL_SIZE[0] / 2, _FULL_SIZE[1] / 2)
-    views = [pinhole_view(f"view_{index}.png", _FULL_SIZE, numbers, look_at(np.array([side, -3.0, height]), np.array([side / 2, 0.0, 0.0])))
-             for index, side in enumerate((-5.0, 5.0))]
+    views = [
+        pinhole_view(
+            f"view_{index}.png",
+            _FULL_SIZE,
+            numbers,
+            look_at(np.array([side, -3.0, height]), np.array([side / 2, 0.0, 0.0])),
+        )
+        for index, side in enumerate((-5.0, 5.0))
+    ]
     return Ground(points, colors.clip(0, 255).astype(np.uint8), tuple(views))
 
 
 def ground_of(model: SparseModel) -> Ground:
-    """Sparse points of a COLMAP model; the view that sees nearest to a fifth of them, and its best neighbour. InputError for too small models."""
+    """Sparse points of a COLMAP model; the view that sees nearest to a fifth of them, and its best neighbour.
+    InputError for too small models.
+    """
     if len(model.views) < 2 or len(model.points) < 100:
-        raise InputError(f"the scene has {len(model.views)} photos and {len(model.points)} sparse points: the benchmark needs 2 and 100")
+        raise InputError(
+            f"the scene has {len(model.views)} photos and {len(model.points)} sparse points: the benchmark needs 2 and 100"
+        )
     origin = local_origin(model.views)
     views, points = [undistorted(view.shifted(origin)) for view in model.views], model.points - origin
     shares = [in_image(view, project(view, points)[0]).mean() for view in views]
@@ -73,9 +92,11 @@ def ground_of(model: SparseModel) -> Ground:
 
 
 def build_workload(ground: Ground, num_gaussians: int, max_size: int, seed: int = 0) -> Workload:
-    """Spread Gaussians over a ground and scale them until a view has `FRAGMENTS` contributing fragments per pixel.
+    """Spread Gaussians over a ground and scale them until a view has `FRAGMENTS` contributing fragments per
+    pixel.
 
-    Opacities are exp-normal around 0.27. The photos are renderings with noise, so that gradients are those of a fit that still goes on.
+    Opacities are exp-normal around 0.27. The photos are renderings with noise, so that gradients are those of
+    a fit that still goes on.
     """
     rng = np.random.default_rng(seed)
     gaussians = _spread(ground, num_gaussians, rng)
@@ -89,7 +110,9 @@ def build_workload(ground: Ground, num_gaussians: int, max_size: int, seed: int 
 
 
 def _spread(ground: Ground, count: int, rng: np.random.Generator) -> Gaussians:
-    """Means between points and their neighbours, evenly over the surface; scales from the distances among them, first axis across the surface."""
+    """Means between points and their neighbours, evenly over the surface; scales from the distances among
+    them, first axis across the surface.
+    """
     gaps, near = cKDTree(ground.points).query(ground.points, 7)
     area = np.minimum(gaps[:, -1], np.quantile(gaps[:, -1], 0.95)) ** 2
     chosen = rng.choice(len(ground.points), count, p=area / area.sum())
@@ -99,7 +122,9 @@ def _spread(ground: Ground, count: int, rng: np.random.Generator) -> Gaussians:
     gaussians = Gaussians.from_points(means, ground.colors[chosen])
     stretch = rng.normal(0, 0.3, (count, 3)) + [np.log(_THINNESS), 0.0, 0.0]
     log_scales = gaussians.log_scales + torch.from_numpy(stretch).float()
-    return replace(gaussians, log_scales=log_scales, opacity_logits=torch.from_numpy(rng.normal(-1, 1, count)).float())
+    return replace(
+        gaussians, log_scales=log_scales, opacity_logits=torch.from_numpy(rng.normal(-1, 1, count)).float()
+    )
 
 
 @torch.no_grad()

@@ -1,4 +1,6 @@
-"""Does every annotation have its photo, its size and its class? All that does not fit is gathered and reported in one line."""
+"""Does every annotation have its photo, its size and its class? All that does not fit is gathered and
+reported in one line.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ class Mask:
 
 
 class Checks:
-    """Looks photos, sizes and classes up, and keeps what does not fit: for every kind of mismatch the first example and their number."""
+    """Looks photos, sizes and classes up, and keeps what does not fit: for every kind of mismatch the first
+    example and their number.
+    """
 
     def __init__(self, photo_sizes: dict[str, tuple[int, int]], classes: Classes) -> None:
         """photo_sizes: (width, height) px by photo name, no two of one stem."""
@@ -59,16 +63,28 @@ class Checks:
 
     def photo(self, candidates: tuple[str, ...], origin: str) -> str | None:
         """Name of the photo that has the stem of one of the file names."""
-        found = {name for name in (self._names.get(stem(candidate)) for candidate in candidates) if name is not None}
+        found = {
+            name
+            for name in (self._names.get(stem(candidate)) for candidate in candidates)
+            if name is not None
+        }
         if not found:
             example = next(iter(self._photo_sizes), "none")
-            self.add("photo", f"{_where(candidates[0], origin)} belongs to no photo: {len(self._names)} photos are known, such as {example}")
+            self.add(
+                "photo",
+                f"{_where(candidates[0], origin)} belongs to no photo: {len(self._names)} photos are known, such as {example}",
+            )
         elif len(found) > 1:
-            self.add("ambiguous", f"{origin} is named after a photo, but says that it belongs to another: {' or '.join(sorted(found))}")
+            self.add(
+                "ambiguous",
+                f"{origin} is named after a photo, but says that it belongs to another: {' or '.join(sorted(found))}",
+            )
         return found.pop() if len(found) == 1 else None
 
     def size(self, name: str, stated: tuple[object, object] | None, origin: str) -> tuple[int, int] | None:
-        """(width, height) px of the mask of a photo: as stated if that fits the photo, the photo's own if nothing is stated."""
+        """(width, height) px of the mask of a photo: as stated if that fits the photo, the photo's own if
+        nothing is stated.
+        """
         photo = self._photo_sizes[name]
         if stated is None:
             return photo
@@ -77,10 +93,16 @@ class Checks:
             if width < 1 or height < 1 or (width, height) != tuple(float(value) for value in stated):
                 raise ValueError
         except (ValueError, TypeError, OverflowError):
-            self.add("no size", f"{_where(name, origin)} has a size that is none: {str(stated[0])[:20]} x {str(stated[1])[:20]}")
+            self.add(
+                "no size",
+                f"{_where(name, origin)} has a size that is none: {str(stated[0])[:20]} x {str(stated[1])[:20]}",
+            )
             return None
         if width * height > max(MAX_PIXELS, photo[0] * photo[1]):
-            self.add("too large", f"{_where(name, origin)} is {width}x{height}, but its photo is {photo[0]}x{photo[1]}: more than {MAX_PIXELS} px are refused")
+            self.add(
+                "too large",
+                f"{_where(name, origin)} is {width}x{height}, but its photo is {photo[0]}x{photo[1]}: more than {MAX_PIXELS} px are refused",
+            )
             return None
         try:
             check_mask_aspect(_where(name, origin), (width, height), photo)
@@ -107,7 +129,10 @@ class Checks:
                 'others need a --mapping such as {"wall": "building", "sky": null}'
             )
         if self._mismatches:
-            texts = [text + (f" ({self._counts[kind]} times)" if self._counts[kind] > 1 else "") for kind, text in self._mismatches.items()]
+            texts = [
+                text + (f" ({self._counts[kind]} times)" if self._counts[kind] > 1 else "")
+                for kind, text in self._mismatches.items()
+            ]
             raise InputError(f"cannot import {source}: " + "; ".join(texts))
         if self._skipped:
             skipped = ", ".join(f"{kind} ({count})" for kind, count in sorted(self._skipped.items()))
@@ -116,7 +141,9 @@ class Checks:
 
 def _printable(text: str) -> str:
     """One short line, whatever names a file holds."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text[:MAX_TEXT]) + ("..." if len(text) > MAX_TEXT else "")
+    return "".join(letter if letter.isprintable() else "?" for letter in text[:MAX_TEXT]) + (
+        "..." if len(text) > MAX_TEXT else ""
+    )
 
 
 def _where(name: str, origin: str) -> str:
@@ -125,6 +152,8 @@ def _where(name: str, origin: str) -> str:
 
 
 def stem(name: str) -> str:
-    """File name without folders (of any system) and without the suffix of an image; other dots belong to the name."""
+    """File name without folders (of any system) and without the suffix of an image; other dots belong to the
+    name.
+    """
     path = PureWindowsPath(name)
     return path.stem if path.suffix.lower() in IMAGE_SUFFIXES | {".json", ".webp", ".bmp"} else path.name

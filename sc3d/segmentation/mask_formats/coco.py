@@ -1,7 +1,9 @@
 """COCO instances: one JSON file for many photos, polygons or run-length codes.
 
-Format: https://cocodataset.org/#format-data. The format has no order, and its own tools refuse overlaps: here the smaller region wins, so
-that a car stays on its road. Crowd regions count as their class, because CVAT and Datumaro mark every mask that is not a polygon as one.
+Format: https://cocodataset.org/#format-data. The format has no order, and its own tools refuse overlaps: here
+    the smaller region wins, so
+that a car stays on its road. Crowd regions count as their class, because CVAT and Datumaro mark every mask
+that is not a polygon as one.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ from sc3d.segmentation.mask_formats.outlines import OutlineError, Polygons, Runs
 def read_coco(file: Path) -> Iterator[Drawing]:
     """The drawings of a COCO file, one per image; InputError if it is none."""
     content = read_json(file)
-    images, annotations, categories = (_entries(content, key, file) for key in ("images", "annotations", "categories"))
+    images, annotations, categories = (
+        _entries(content, key, file) for key in ("images", "annotations", "categories")
+    )
     names = {_id(category, "id", file): str(category.get("name", "")) for category in categories}
     by_image = defaultdict(list)
     for annotation in annotations:
@@ -30,7 +34,9 @@ def read_coco(file: Path) -> Iterator[Drawing]:
     known = [_id(image, "id", file) for image in images]
     strangers = by_image.keys() - set(known)
     if strangers or len(set(known)) < len(known):
-        raise InputError(f"{file} has annotations of an image that it does not list, or an image twice: it is damaged")
+        raise InputError(
+            f"{file} has annotations of an image that it does not list, or an image twice: it is damaged"
+        )
     for image, image_id in zip(images, known, strict=True):
         photo, size = str(image.get("file_name", "")), (image.get("width"), image.get("height"))
         shapes = tuple(_shape(annotation, names, file) for annotation in by_image[image_id])
@@ -40,7 +46,9 @@ def read_coco(file: Path) -> Iterator[Drawing]:
 def _entries(content: object, key: str, file: Path) -> list[dict]:
     entries = content.get(key) if isinstance(content, dict) else None
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise InputError(f"{file} is not a COCO file of instances: lists of images, annotations and categories are expected")
+        raise InputError(
+            f"{file} is not a COCO file of instances: lists of images, annotations and categories are expected"
+        )
     return entries
 
 
@@ -77,8 +85,10 @@ def _runs(segmentation: dict, size: tuple[int, int]) -> Runs:
 def decompress(text: str) -> np.ndarray:
     """(N,) int64 counts of a compressed run-length code.
 
-    Each count is 5 bits per character (+48), the lowest first; bit 32 says that more follow, and bit 16 of the last one is the sign. From
-    the fourth count on, the difference to the count two before is stored. Source: rleFrString of the COCO API.
+    Each count is 5 bits per character (+48), the lowest first; bit 32 says that more follow, and bit 16 of
+    the last one is the sign. From
+    the fourth count on, the difference to the count two before is stored. Source: rleFrString of the COCO
+    API.
     """
     try:
         code = np.frombuffer(text.encode("ascii"), np.uint8).astype(np.int64) - 48
@@ -86,7 +96,13 @@ def decompress(text: str) -> np.ndarray:
         code = np.array([-1])
     last = np.flatnonzero(~code & 32)
     first = np.concatenate([[0], last[:-1] + 1])
-    if not len(last) or last[-1] != len(code) - 1 or (code < 0).any() or (code > 63).any() or (last - first > 6).any():
+    if (
+        not len(last)
+        or last[-1] != len(code) - 1
+        or (code < 0).any()
+        or (code > 63).any()
+        or (last - first > 6).any()
+    ):
         raise OutlineError("has a compressed run-length code that is damaged")
     place = np.arange(len(code)) - np.repeat(first, last - first + 1)
     values = np.add.reduceat((code & 31) << 5 * place, first)

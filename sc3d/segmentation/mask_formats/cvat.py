@@ -1,6 +1,8 @@
-"""CVAT for images 1.1: one XML file for many photos; a larger z_order lies on top, and of equal ones the later.
+"""CVAT for images 1.1: one XML file for many photos; a larger z_order lies on top, and of equal ones the
+later.
 
-Format: https://docs.cvat.ai/docs/manual/advanced/xml_format. Read by a parser that refuses document type declarations, and with them
+Format: https://docs.cvat.ai/docs/manual/advanced/xml_format. Read by a parser that refuses document type
+    declarations, and with them
 entities, which can make a small file fill the memory or read others.
 """
 
@@ -55,7 +57,9 @@ class _Document:
         self._shapes: list[tuple[int, Shape]] = []
 
     def refuse(self, *declaration: object) -> None:
-        raise InputError(f"{self.file} has a document type declaration, which CVAT never writes: it is refused")
+        raise InputError(
+            f"{self.file} has a document type declaration, which CVAT never writes: it is refused"
+        )
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         if self._depth == 0 and tag != "annotations":
@@ -67,21 +71,29 @@ class _Document:
             self._image, self._shapes = attributes, []
         elif self._image is not None and tag in WITH_AREA | WITHOUT_AREA:
             outline = partial(_outline, tag, attributes) if tag in WITH_AREA else None
-            self._shapes.append((self._level(attributes), Shape(tag, (attributes.get("label", ""),), outline)))
+            self._shapes.append(
+                (self._level(attributes), Shape(tag, (attributes.get("label", ""),), outline))
+            )
 
     def end(self, tag: str) -> None:
         self._depth -= 1
         if tag == "image" and self._image is not None:
             size = (self._image.get("width"), self._image.get("height"))
             shapes = tuple(shape for _, shape in sorted(self._shapes, key=lambda entry: entry[0]))
-            self.drawings.append(Drawing(str(self.file), (self._image.get("name", ""),), None if None in size else size, shapes))
+            self.drawings.append(
+                Drawing(
+                    str(self.file), (self._image.get("name", ""),), None if None in size else size, shapes
+                )
+            )
             self._image = None
 
     def _level(self, attributes: dict[str, str]) -> int:
         try:
             return int(attributes.get("z_order", 0))
         except ValueError:
-            raise InputError(f"{self.file} has the z_order {attributes['z_order'][:40]!r}: a whole number is expected") from None
+            raise InputError(
+                f"{self.file} has the z_order {attributes['z_order'][:40]!r}: a whole number is expected"
+            ) from None
 
 
 def _outline(tag: str, attributes: dict[str, str], size: tuple[int, int]) -> Polygons | Runs:
@@ -90,9 +102,13 @@ def _outline(tag: str, attributes: dict[str, str], size: tuple[int, int]) -> Pol
         pairs = attributes["points"].replace(";", ",").split(",")
         return polygons([pairs], size)
     if tag == "box":
-        return rectangle([attributes["xtl"], attributes["ytl"]], [attributes["xbr"], attributes["ybr"]], rotation, size)
+        return rectangle(
+            [attributes["xtl"], attributes["ytl"]], [attributes["xbr"], attributes["ybr"]], rotation, size
+        )
     if tag == "ellipse":
-        return ellipse([attributes["cx"], attributes["cy"]], [attributes["rx"], attributes["ry"]], rotation, size)
+        return ellipse(
+            [attributes["cx"], attributes["cy"]], [attributes["rx"], attributes["ry"]], rotation, size
+        )
     box = tuple(int(attributes[key]) for key in ("left", "top", "width", "height"))
     if min(box) < 0 or max(box) > max(size):
         raise OutlineError("lies outside of the image")

@@ -20,7 +20,8 @@ class Shape:
 
     kind: what it is, such as "polygon"
     keys: its class as the file says it: a name, or a name and a number
-    build: makes the outline for an image of (width, height) px, raising OutlineError, KeyError, TypeError or ValueError; None if it has no area
+    build: makes the outline for an image of (width, height) px, raising OutlineError, KeyError, TypeError or
+        ValueError; None if it has no area
     """
 
     kind: str
@@ -36,7 +37,8 @@ class Drawing:
     photos: file names that the photo may have, the likeliest first
     size: (width, height) px that the file states; None where it does not
     shapes: from the bottom to the top
-    smaller_on_top: the file has no order: where shapes overlap, the one with fewer pixels wins, then the lower class id
+    smaller_on_top: the file has no order: where shapes overlap, the one with fewer pixels wins, then the
+        lower class id
     """
 
     origin: str
@@ -47,7 +49,9 @@ class Drawing:
 
 
 def to_mask(drawing: Drawing, checks: Checks) -> tuple[str, Mask] | None:
-    """The photo and its mask, not drawn yet; None if there is nothing to draw or something is wrong, which `checks` keeps."""
+    """The photo and its mask, not drawn yet; None if there is nothing to draw or something is wrong, which
+    `checks` keeps.
+    """
     with_area = [shape for shape in drawing.shapes if shape.build is not None]
     checks.skip(shape.kind for shape in drawing.shapes if shape.build is None)
     if not with_area:
@@ -60,7 +64,11 @@ def to_mask(drawing: Drawing, checks: Checks) -> tuple[str, Mask] | None:
         outline = None if size is None else _build(shape, size, drawing, checks)
         if class_id is not None and outline is not None:
             regions.append((class_id, outline))
-    return None if size is None else (name, Mask(drawing.origin, size, partial(paint, regions, size, drawing.smaller_on_top)))
+    return (
+        None
+        if size is None
+        else (name, Mask(drawing.origin, size, partial(paint, regions, size, drawing.smaller_on_top)))
+    )
 
 
 def _build(shape: Shape, size: tuple[int, int], drawing: Drawing, checks: Checks) -> Polygons | Runs | None:
@@ -70,12 +78,16 @@ def _build(shape: Shape, size: tuple[int, int], drawing: Drawing, checks: Checks
         text = str(error)
     except (ValueError, TypeError, KeyError, OverflowError):
         text = "is not complete or not of this format"
-    checks.add(text, f"the {shape.kind[:40]} of {shape.keys[0][:40]!r} on {drawing.photos[0][-80:]} in {drawing.origin} {text}")
+    checks.add(
+        text,
+        f"the {shape.kind[:40]} of {shape.keys[0][:40]!r} on {drawing.photos[0][-80:]} in {drawing.origin} {text}",
+    )
     return None
 
 
 def paint(regions: list[Region], size: tuple[int, int], smaller_on_top: bool) -> np.ndarray:
-    """(H, W) uint8 class ids, 0 where there is no region; later regions cover earlier ones, or smaller ones larger ones.
+    """(H, W) uint8 class ids, 0 where there is no region; later regions cover earlier ones, or smaller ones
+    larger ones.
 
     size: (width, height) px
     """

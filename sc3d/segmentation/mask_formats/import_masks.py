@@ -1,4 +1,6 @@
-"""Masks that the user already has, in any of the formats of sc3d.segmentation.mask_formats: checked, and drawn into the scene."""
+"""Masks that the user already has, in any of the formats of sc3d.segmentation.mask_formats: checked, and
+drawn into the scene.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ def import_masks(
     confidence: Path | None = None,
     scene_confidence: Path | None = None,
 ) -> list[str]:
-    """Write masks, and confidence maps if given, into the scene as 8-bit grey PNGs whose values are the ids of the class table.
+    """Write masks, and confidence maps if given, into the scene as 8-bit grey PNGs whose values are the ids
+    of the class table.
 
     source: masks in any format; a bare path is looked at
     scene_masks, scene_confidence: folders to write; each is replaced as a whole
@@ -34,7 +37,8 @@ def import_masks(
     confidence: folder of `<photo stem>.png`
     returns: names of the photos that have a mask, in order
 
-    Raises InputError before anything is written if a file does not fit. With `scene_confidence` but no `confidence`, confidence maps that
+    Raises InputError before anything is written if a file does not fit. With `scene_confidence` but no
+    `confidence`, confidence maps that
     the scene already has are removed, because they describe the masks that are replaced.
     """
     if confidence is not None and scene_confidence is None:
@@ -42,8 +46,12 @@ def import_masks(
     source = source if isinstance(source, MaskFiles) else MaskFiles(source)
     in_place = source.path.resolve() == scene_masks.resolve()
     if in_place and (source.mapping is not None or source.format not in ("auto", "index")):
-        raise InputError(f"{source.path} is the scene's own folder, which holds ids of the class table: masks to convert belong elsewhere")
-    masks, maps = check_masks(replace(source, format="index") if in_place else source, photo_sizes, class_table, confidence)
+        raise InputError(
+            f"{source.path} is the scene's own folder, which holds ids of the class table: masks to convert belong elsewhere"
+        )
+    masks, maps = check_masks(
+        replace(source, format="index") if in_place else source, photo_sizes, class_table, confidence
+    )
     _check_target(source.path, scene_masks)
     if scene_confidence is not None:
         _check_target(confidence, scene_confidence)
@@ -58,31 +66,46 @@ def import_masks(
 
 
 def check_masks(
-    source: MaskFiles, photo_sizes: dict[str, tuple[int, int]], class_table: ClassTable, confidence: Path | None = None
+    source: MaskFiles,
+    photo_sizes: dict[str, tuple[int, int]],
+    class_table: ClassTable,
+    confidence: Path | None = None,
 ) -> tuple[dict[str, Mask], dict[str, Path]]:
-    """Masks that are not drawn yet, and confidence maps, by photo name; InputError, in one line, for all that does not fit."""
+    """Masks that are not drawn yet, and confidence maps, by photo name; InputError, in one line, for all that
+    does not fit.
+    """
     masks = read_masks(source, photo_sizes, class_table)
     return masks, {} if confidence is None else _match_confidence(confidence, photo_sizes, masks)
 
 
 def warn_of_turned(photos: list[Path]) -> None:
-    """Warn of photos with an EXIF orientation: annotation programs turn them, COLMAP and sc3d take the pixels as they are stored."""
+    """Warn of photos with an EXIF orientation: annotation programs turn them, COLMAP and sc3d take the pixels
+    as they are stored.
+    """
     turned = []
     for photo in photos:
         with suppress(InputError), open_image(photo) as image:
             if image.getexif().get(0x0112, 1) != 1:
                 turned.append(photo)
     if turned:
-        logger.warning("%s (and %d more) has an EXIF orientation, which annotation programs apply and sc3d does not: "
-                       "see whether its mask lies right", turned[0], len(turned) - 1)
+        logger.warning(
+            "%s (and %d more) has an EXIF orientation, which annotation programs apply and sc3d does not: "
+            "see whether its mask lies right",
+            turned[0],
+            len(turned) - 1,
+        )
 
 
-def _match_confidence(folder: Path, photo_sizes: dict[str, tuple[int, int]], masks: dict[str, Mask]) -> dict[str, Path]:
+def _match_confidence(
+    folder: Path, photo_sizes: dict[str, tuple[int, int]], masks: dict[str, Mask]
+) -> dict[str, Path]:
     """Confidence maps by photo name, each readable and as large as the mask it belongs to."""
     maps = match_masks(folder, photo_sizes, None)
     for name, file in maps.items():
         if name not in masks:
-            raise InputError(f"{file} is the confidence of a mask that does not exist: remove it, or add a mask for {name}")
+            raise InputError(
+                f"{file} is the confidence of a mask that does not exist: remove it, or add a mask for {name}"
+            )
         if image_size(file) != masks[name].size:
             sizes = "x".join(map(str, image_size(file))), "x".join(map(str, masks[name].size))
             raise InputError(f"{file} is {sizes[0]}, but its mask is {sizes[1]}: they must be equal")
@@ -93,7 +116,9 @@ def _match_confidence(folder: Path, photo_sizes: dict[str, tuple[int, int]], mas
 def _check_target(source: Path | None, target: Path) -> None:
     """Refuse to replace a folder that is not the scene's own."""
     if target.is_symlink():
-        raise InputError(f"{target} is a link: remove the link, so that the folder it leads to is not overwritten")
+        raise InputError(
+            f"{target} is a link: remove the link, so that the folder it leads to is not overwritten"
+        )
     if source is not None and target.resolve() in source.resolve().parents:
         raise InputError(f"{source} lies inside {target}, which would be replaced: move it elsewhere")
 

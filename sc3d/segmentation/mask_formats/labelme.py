@@ -66,10 +66,17 @@ def _outline(shape: dict, kind: str, size: tuple[int, int]) -> Polygons | Runs:
 
 
 def _mask(text: str, corners: np.ndarray, size: tuple[int, int]) -> Runs:
-    """A PNG in base64 for the pixels from the first to the second corner, both included; its size is checked before it is decoded."""
+    """A PNG in base64 for the pixels from the first to the second corner, both included; its size is checked
+    before it is decoded.
+    """
     from PIL import Image
 
-    if corners.shape != (2, 2) or (corners < 0).any() or (corners >= size).any() or (corners[1] < corners[0]).any():
+    if (
+        corners.shape != (2, 2)
+        or (corners < 0).any()
+        or (corners >= size).any()
+        or (corners[1] < corners[0]).any()
+    ):
         raise OutlineError("lies outside of the image")
     (left, top), (right, bottom) = corners.astype(int).tolist()
     width, height = right - left + 1, bottom - top + 1

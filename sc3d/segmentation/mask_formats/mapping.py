@@ -35,7 +35,9 @@ class Classes:
         return ", ".join(entry.name for entry in self.table)
 
     def find(self, keys: tuple[str, ...]) -> int | None:
-        """Class id for the first key that the mapping has, or else for a name in the table (upper or lower case); None if there is none."""
+        """Class id for the first key that the mapping has, or else for a name in the table (upper or lower
+        case); None if there is none.
+        """
         for key in keys:
             if self.mapping is not None and key in self.mapping:
                 return self.mapping[key]
@@ -43,7 +45,9 @@ class Classes:
 
     @cached_property
     def by_id(self) -> np.ndarray:
-        """(65536,) int16 class id per value in a PNG, UNKNOWN where there is none. A mapping replaces the numbering of the table."""
+        """(65536,) int16 class id per value in a PNG, UNKNOWN where there is none. A mapping replaces the
+        numbering of the table.
+        """
         table = np.full(1 << 16, UNKNOWN, np.int16)
         table[0] = 0
         if self.mapping is None:
@@ -51,24 +55,37 @@ class Classes:
             return table
         for key, class_id in self.mapping.items():
             if not re.fullmatch(r"[0-9]{1,5}", key) or int(key) >= len(table):
-                raise InputError(f"{self.origin}: {key!r} is no id: PNGs with one id per pixel need whole numbers from 0 to 65535")
+                raise InputError(
+                    f"{self.origin}: {key!r} is no id: PNGs with one id per pixel need whole numbers from 0 to 65535"
+                )
             table[int(key)] = class_id
         return table
 
     @cached_property
     def by_color(self) -> np.ndarray:
-        """(2^24,) int16 class id per colour 0xRRGGBB, UNKNOWN where there is none; black is unlabelled unless it is a class."""
+        """(2^24,) int16 class id per colour 0xRRGGBB, UNKNOWN where there is none; black is unlabelled unless
+        it is a class.
+        """
         if self.mapping is None:
             colors = [(entry.color, entry.id, entry.name) for entry in self.table]
             # The table shows unlabelled pixels in a dark grey, and so do pictures made with it.
-            colors = [((0, 0, 0), 0, "unlabelled"), (tuple(self.table.palette[0].tolist()), 0, "unlabelled"), *colors]
+            colors = [
+                ((0, 0, 0), 0, "unlabelled"),
+                (tuple(self.table.palette[0].tolist()), 0, "unlabelled"),
+                *colors,
+            ]
         else:
-            colors = [((0, 0, 0), 0, "unlabelled"), *((self._color(key), class_id, key) for key, class_id in self.mapping.items())]
+            colors = [
+                ((0, 0, 0), 0, "unlabelled"),
+                *((self._color(key), class_id, key) for key, class_id in self.mapping.items()),
+            ]
         table, owners = np.full(1 << 24, UNKNOWN, np.int16), {}
         for color, class_id, owner in colors:
             code = color[0] << 16 | color[1] << 8 | color[2]
             if owners.get(code, class_id) not in (class_id, 0):
-                raise InputError(f"{self.origin or 'the class table'}: {owner!r} has the colour {color} of another class: colours cannot tell them apart")
+                raise InputError(
+                    f"{self.origin or 'the class table'}: {owner!r} has the colour {color} of another class: colours cannot tell them apart"
+                )
             owners[code] = table[code] = class_id
         return table
 
@@ -78,22 +95,27 @@ class Classes:
             return tuple(bytes.fromhex(code[1]))
         values = re.fullmatch(r"[\[(]?\s*([0-9]{1,3})\s*,\s*([0-9]{1,3})\s*,\s*([0-9]{1,3})\s*[\])]?", key)
         if not values or max(map(int, values.groups())) > 255:
-            raise InputError(f"{self.origin}: {key!r} is no colour: write it as \"#d63c3c\" or \"[214, 60, 60]\"")
+            raise InputError(f'{self.origin}: {key!r} is no colour: write it as "#d63c3c" or "[214, 60, 60]"')
         return tuple(map(int, values.groups()))
 
 
 def read_mapping(mapping: Path | None, table: ClassTable) -> Classes:
     """The table with the mapping of a JSON file, if there is one.
 
-    The file holds an object: keys are ids ("7"), names ("wall") or colours ("#d63c3c", "[214, 60, 60]") of the masks; values are names or ids
+    The file holds an object: keys are ids ("7"), names ("wall") or colours ("#d63c3c", "[214, 60, 60]") of
+    the masks; values are names or ids
     of the table, or null or "ignore" for unlabelled. Raises InputError for anything else.
     """
     if mapping is None:
         return Classes(table)
     content = read_json(mapping)
     if not isinstance(content, dict) or not content:
-        raise InputError(f'{mapping} must hold an object such as {{"wall": "building", "7": "road", "#00ff00": "tree", "sky": null}}')
-    return Classes(table, {key.strip(): _class_id(key, value, table, mapping) for key, value in content.items()}, mapping)
+        raise InputError(
+            f'{mapping} must hold an object such as {{"wall": "building", "7": "road", "#00ff00": "tree", "sky": null}}'
+        )
+    return Classes(
+        table, {key.strip(): _class_id(key, value, table, mapping) for key, value in content.items()}, mapping
+    )
 
 
 def _class_id(key: str, value: object, table: ClassTable, origin: Path) -> int:
@@ -104,11 +126,17 @@ def _class_id(key: str, value: object, table: ClassTable, origin: Path) -> int:
         found = _by_name(value, table)
         if found is None and value.strip().casefold() in UNLABELLED:
             found = 0
-    elif isinstance(value, int) and not isinstance(value, bool) and value in {0, *(entry.id for entry in table)}:
+    elif (
+        isinstance(value, int)
+        and not isinstance(value, bool)
+        and value in {0, *(entry.id for entry in table)}
+    ):
         found = value
     if found is None:
         names = ", ".join(entry.name for entry in table)
-        raise InputError(f"{origin}: {key!r} stands for {value!r}, which is no class: write one of {names}, or null for unlabelled")
+        raise InputError(
+            f"{origin}: {key!r} stands for {value!r}, which is no class: write one of {names}, or null for unlabelled"
+        )
     return found
 
 

@@ -1,8 +1,11 @@
 """Regions as other programs store them, polygons and run-length codes, drawn to pixels.
 
-One rule for all formats: x to the right, y down, px; the top-left pixel covers 0 to 1, and a pixel belongs to a polygon if its centre does.
-So polygons that share an edge neither overlap nor leave a gap, which programs that also draw the boundary's pixels cannot say.
-Everything is checked when it is built, against the size of the image and before memory is taken; OutlineError says what is wrong.
+One rule for all formats: x to the right, y down, px; the top-left pixel covers 0 to 1, and a pixel belongs to
+a polygon if its centre does.
+So polygons that share an edge neither overlap nor leave a gap, which programs that also draw the boundary's
+pixels cannot say.
+Everything is checked when it is built, against the size of the image and before memory is taken; OutlineError
+says what is wrong.
 """
 
 from __future__ import annotations
@@ -44,7 +47,9 @@ class Runs:
 
 @dataclass(frozen=True)
 class Patch:
-    """The pixels of a region: mask is (height, width) bool, its top-left pixel lies at column `left` and row `top`."""
+    """The pixels of a region: mask is (height, width) bool, its top-left pixel lies at column `left` and row
+    `top`.
+    """
 
     left: int
     top: int
@@ -53,18 +58,28 @@ class Patch:
     @property
     def window(self) -> tuple[slice, slice]:
         """Rows and columns of the image that the patch covers."""
-        return slice(self.top, self.top + self.mask.shape[0]), slice(self.left, self.left + self.mask.shape[1])
+        return slice(self.top, self.top + self.mask.shape[0]), slice(
+            self.left, self.left + self.mask.shape[1]
+        )
 
 
 def polygons(rings: Iterable[Sequence], size: tuple[int, int]) -> Polygons:
-    """Build polygons from coordinates, each ring (N, 2) or x, y, x, y, ...; size: (width, height) px of the image."""
+    """Build polygons from coordinates, each ring (N, 2) or x, y, x, y, ...; size: (width, height) px of the
+    image.
+    """
     checked = tuple(_ring(ring, size) for ring in rings)
     if not checked:
         raise OutlineError("has no polygon")
     corners = np.concatenate(checked)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    # What reaches a whole image beyond the edge was drawn on another image; a little beyond is how polygons reach the edge.
-    if (high <= 0).any() or (low >= size).any() or (low < -np.array(size)).any() or (high > 2 * np.array(size)).any():
+    # What reaches a whole image beyond the edge was drawn on another image; a little beyond is how polygons
+    # reach the edge.
+    if (
+        (high <= 0).any()
+        or (low >= size).any()
+        or (low < -np.array(size)).any()
+        or (high > 2 * np.array(size)).any()
+    ):
         raise OutlineError("lies outside of the image")
     return Polygons(checked)
 
@@ -81,19 +96,35 @@ def _ring(ring: Sequence, size: tuple[int, int]) -> np.ndarray:
 
 
 def rectangle(corner: Sequence, opposite: Sequence, rotation: float, size: tuple[int, int]) -> Polygons:
-    """A rectangle from two opposite corners, turned by `rotation` degrees (clockwise as seen) around its centre."""
+    """A rectangle from two opposite corners, turned by `rotation` degrees (clockwise as seen) around its
+    centre.
+    """
     (x0, y0), (x1, y1) = numbers(corner), numbers(opposite)
-    return polygons([_turn(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), ((x0 + x1) / 2, (y0 + y1) / 2), rotation)], size)
+    return polygons(
+        [_turn(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), ((x0 + x1) / 2, (y0 + y1) / 2), rotation)],
+        size,
+    )
 
 
 def ellipse(centre: Sequence, radii: Sequence, rotation: float, size: tuple[int, int]) -> Polygons:
-    """An ellipse with half axes `radii` px, turned by `rotation` degrees (clockwise as seen) around its centre."""
+    """An ellipse with half axes `radii` px, turned by `rotation` degrees (clockwise as seen) around its
+    centre.
+    """
     (x, y), radii = numbers(centre), numbers(radii)
     if not (radii > 0).all() or (radii > 3 * max(size)).any():
         raise OutlineError("is an ellipse whose radii do not fit the image")
     num_points = max(16, math.ceil(math.pi / math.acos(1 - min(MAX_SAGITTA / radii.max(), 0.1))))
     angle = np.arange(num_points) * (2 * np.pi / num_points)
-    return polygons([_turn(np.stack([x + radii[0] * np.cos(angle), y + radii[1] * np.sin(angle)], axis=1), (x, y), rotation)], size)
+    return polygons(
+        [
+            _turn(
+                np.stack([x + radii[0] * np.cos(angle), y + radii[1] * np.sin(angle)], axis=1),
+                (x, y),
+                rotation,
+            )
+        ],
+        size,
+    )
 
 
 def _turn(points: np.ndarray, centre: tuple[float, float], degrees: float) -> np.ndarray:
@@ -107,7 +138,12 @@ def runs(counts: Sequence, box: tuple[int, int, int, int], by_column: bool, size
     if width < 1 or height < 1 or left < 0 or top < 0 or left + width > size[0] or top + height > size[1]:
         raise OutlineError("lies outside of the image")
     lengths = numbers(counts)
-    if (lengths < 0).any() or (lengths > width * height).any() or (lengths != np.floor(lengths)).any() or int(lengths.sum()) != width * height:
+    if (
+        (lengths < 0).any()
+        or (lengths > width * height).any()
+        or (lengths != np.floor(lengths)).any()
+        or int(lengths.sum()) != width * height
+    ):
         raise OutlineError("has a run-length code that does not add up to its width x height")
     return Runs(lengths.astype(np.int64), box, by_column)
 
@@ -131,7 +167,9 @@ def numbers(values: Sequence) -> np.ndarray:
 
 
 def draw(outline: Polygons | Runs, size: tuple[int, int]) -> Patch:
-    """The pixels of a region, in the smallest box that surely holds them; size: (width, height) px of the image."""
+    """The pixels of a region, in the smallest box that surely holds them; size: (width, height) px of the
+    image.
+    """
     if isinstance(outline, Runs):
         return _decode(outline)
     corners = np.concatenate(outline.rings)
@@ -144,10 +182,13 @@ def draw(outline: Polygons | Runs, size: tuple[int, int]) -> Patch:
 
 
 def _fill(ring: np.ndarray, height: int, width: int) -> np.ndarray:
-    """(height, width) bool: pixels whose centre lies inside. Every edge toggles, in each row it crosses, all pixels to the right of it."""
+    """(height, width) bool: pixels whose centre lies inside. Every edge toggles, in each row it crosses, all
+    pixels to the right of it.
+    """
     toggles = np.zeros(height * (width + 1), np.uint8)
     ends = np.roll(ring, -1, axis=0)
-    # From the upper to the lower end, so that an edge that two polygons share, once in each sense, is computed alike.
+    # From the upper to the lower end, so that an edge that two polygons share, once in each sense, is
+    # computed alike.
     swap = (ring[:, 1] > ends[:, 1])[:, None]
     upper, lower = np.where(swap, ends, ring), np.where(swap, ring, ends)
     first, stop = (np.clip(np.ceil(end[:, 1] - 0.5), 0, height).astype(np.int64) for end in (upper, lower))
@@ -158,7 +199,9 @@ def _fill(ring: np.ndarray, height: int, width: int) -> np.ndarray:
         row = stop[edge] - (total[edge] - crossing)
         (x0, y0), (x1, y1) = upper[edge].T, lower[edge].T
         column = np.ceil(x0 + (row + 0.5 - y0) * ((x1 - x0) / (y1 - y0)) - 0.5)
-        np.bitwise_xor.at(toggles, row * (width + 1) + np.clip(column, 0, width).astype(np.int64), np.uint8(1))
+        np.bitwise_xor.at(
+            toggles, row * (width + 1) + np.clip(column, 0, width).astype(np.int64), np.uint8(1)
+        )
     return np.bitwise_xor.accumulate(toggles.reshape(height, width + 1), axis=1)[:, :-1].astype(bool)
 
 
@@ -174,4 +217,6 @@ def _decode(outline: Runs) -> Patch:
     bounds = np.clip(ends, first * length, (last + 1) * length)
     values = np.repeat(np.arange(len(bounds)) % 2 == 1, np.diff(bounds, prepend=first * length))
     lines = values.reshape(int(last - first + 1), length)
-    return Patch(left + int(first), top, lines.T) if outline.by_column else Patch(left, top + int(first), lines)
+    return (
+        Patch(left + int(first), top, lines.T) if outline.by_column else Patch(left, top + int(first), lines)
+    )

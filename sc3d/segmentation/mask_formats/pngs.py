@@ -1,7 +1,9 @@
 """PNGs with one id or one colour per pixel, `<photo stem>.png`; values are taken exactly, nothing is guessed.
 
-Ids are those of the class table, or those of a mapping: then also 16-bit, such as ADE20K's and Cityscapes'. Colours are those of the class
-table or of a mapping; a colour between two classes, as JPEG and smooth scaling leave behind, is an error and not the nearest class.
+Ids are those of the class table, or those of a mapping: then also 16-bit, such as ADE20K's and Cityscapes'.
+Colours are those of the class
+table or of a mapping; a colour between two classes, as JPEG and smooth scaling leave behind, is an error and
+not the nearest class.
 """
 
 from __future__ import annotations
@@ -43,7 +45,8 @@ def read_png(file: Path, colored: bool, classes: Classes) -> np.ndarray:
 
 
 def is_colored(file: Path) -> bool:
-    """Whether a PNG holds colours rather than ids: a palette counts as ids, because that is how index masks are made to be looked at.
+    """Whether a PNG holds colours rather than ids: a palette counts as ids, because that is how index masks
+    are made to be looked at.
 
     A damaged file decides nothing here: it is reported later, with all others.
     """
@@ -82,7 +85,13 @@ def _describe(file: Path, codes: np.ndarray, unknown: np.ndarray, colored: bool,
     code, count = int(codes[row, column]), int(np.count_nonzero(unknown))
     where = "the class table" if classes.mapping is None else str(classes.origin)
     if colored:
-        value, hint = f"the colour #{code:06x}", ": colours are not guessed, save masks without smoothing and not as JPEG"
+        value, hint = (
+            f"the colour #{code:06x}",
+            ": colours are not guessed, save masks without smoothing and not as JPEG",
+        )
     else:
-        value, hint = f"class id {code}", f" (ids {[entry.id for entry in classes.table]})" if classes.mapping is None else ""
+        value, hint = (
+            f"class id {code}",
+            f" (ids {[entry.id for entry in classes.table]})" if classes.mapping is None else "",
+        )
     return f"{file} has {value}, which is not in {where}{hint}; {count} px are of values that are not, the first at column {column}, row {row}"

@@ -1,4 +1,6 @@
-"""Which format is it, and which photo does each mask belong to? Reads any of them to checked masks that are drawn one at a time."""
+"""Which format is it, and which photo does each mask belong to? Reads any of them to checked masks that are
+drawn one at a time.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ class MaskFiles:
     mapping: Path | None = None
 
 
-def read_masks(source: MaskFiles, photo_sizes: dict[str, tuple[int, int]], class_table: ClassTable) -> dict[str, Mask]:
+def read_masks(
+    source: MaskFiles, photo_sizes: dict[str, tuple[int, int]], class_table: ClassTable
+) -> dict[str, Mask]:
     """Masks by photo name, all checked and none drawn yet.
 
     photo_sizes: (width, height) px by photo name
@@ -50,7 +54,9 @@ def read_masks(source: MaskFiles, photo_sizes: dict[str, tuple[int, int]], class
         try:
             for name, mask in _read(file, kind, checks):
                 if name in masks:
-                    checks.add("double", f"{name} has a mask in {masks[name].origin} and another in {mask.origin}")
+                    checks.add(
+                        "double", f"{name} has a mask in {masks[name].origin} and another in {mask.origin}"
+                    )
                 masks.setdefault(name, mask)
         except InputError as error:
             checks.add("file", str(error))
@@ -81,7 +87,9 @@ def detect(path: Path) -> str:
         return "color" if all(is_colored(file) for file in pngs) else "index"
     if path.suffix.lower() in (".zip", ".gz", ".7z"):
         raise InputError(f"no masks in {path}: unpack the archive")
-    raise InputError(f"no masks in {path}: PNG files named like the photos, LabelMe or COCO JSON or CVAT XML are expected")
+    raise InputError(
+        f"no masks in {path}: PNG files named like the photos, LabelMe or COCO JSON or CVAT XML are expected"
+    )
 
 
 def _kind(file: Path) -> str | None:
@@ -97,14 +105,24 @@ def _kind(file: Path) -> str | None:
 def _files(path: Path, kind: str) -> list[Path]:
     files = _find(path, (SUFFIXES[kind],))
     if not files or (kind in ("index", "color") and not path.is_dir()):
-        what = f"a folder of {SUFFIXES[kind]} files named like the photos is" if SUFFIXES[kind] == ".png" else f"a {SUFFIXES[kind]} file or a folder of them is"
+        what = (
+            f"a folder of {SUFFIXES[kind]} files named like the photos is"
+            if SUFFIXES[kind] == ".png"
+            else f"a {SUFFIXES[kind]} file or a folder of them is"
+        )
         raise InputError(f"no masks in {path}: {what} expected for --format {kind}")
     return files
 
 
 def _find(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """The file itself, or the files of a folder by name; annotations also in folders below, PNGs not, because those may be photos."""
+    """The file itself, or the files of a folder by name; annotations also in folders below, PNGs not, because
+    those may be photos.
+    """
     if not path.is_dir():
         return [path] if path.is_file() and path.suffix.lower() in suffixes else []
     found = path.iterdir() if suffixes == (".png",) else path.rglob("*")
-    return sorted(file for file in found if file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file())
+    return sorted(
+        file
+        for file in found
+        if file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file()
+    )

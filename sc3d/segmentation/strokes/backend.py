@@ -1,4 +1,6 @@
-"""Masks from a few strokes, without any model: a pixel classifier on colour and texture, cleaned by an edge-aware filter."""
+"""Masks from a few strokes, without any model: a pixel classifier on colour and texture, cleaned by an
+edge-aware filter.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ class StrokesSettings:
 
 @dataclass(frozen=True)
 class _Learned:
-    """What one photo teaches. features: (N, F); codes: class ids (N,); strokes: (N,) number of the stroke; pixels: (N,) place in the reduced photo."""
+    """What one photo teaches. features: (N, F); codes: class ids (N,); strokes: (N,) number of the stroke;
+    pixels: (N,) place in the reduced photo.
+    """
 
     features: np.ndarray
     labels: np.ndarray
@@ -67,8 +71,12 @@ class _Learned:
 class Strokes:
     """Segmenter that has learned from strokes."""
 
-    def __init__(self, classifier, novelty: Novelty | None, label_of_code: np.ndarray, settings: StrokesSettings) -> None:
-        """classifier: of codes; novelty: of pixels unlike all strokes; label_of_code: (C,) uint8 class id of each code, 0 = background"""
+    def __init__(
+        self, classifier, novelty: Novelty | None, label_of_code: np.ndarray, settings: StrokesSettings
+    ) -> None:
+        """classifier: of codes; novelty: of pixels unlike all strokes; label_of_code: (C,) uint8 class id of
+        each code, 0 = background
+        """
         self._classifier = classifier
         self._novelty = novelty
         self._label_of_code = label_of_code
@@ -76,7 +84,13 @@ class Strokes:
         self.temperature = 1.0  # below 1 sharpens probabilities, above 1 blunts them
 
     @classmethod
-    def learn(cls, folder: Path, photos_folder: Path, class_table: ClassTable, settings: StrokesSettings = StrokesSettings()) -> Strokes:
+    def learn(
+        cls,
+        folder: Path,
+        photos_folder: Path,
+        class_table: ClassTable,
+        settings: StrokesSettings = StrokesSettings(),
+    ) -> Strokes:
         """Learn from all strokes in a folder (see `sc3d.segmentation.strokes.files`) on photos of another.
 
         Raises InputError if there are none, if one belongs to no photo or class, or if a class has none.
@@ -94,23 +108,36 @@ class Strokes:
         folds = deal(strokes, codes, settings.members)
         samples = Samples(np.concatenate([part.features for part in taught]), codes, folds)
         classifier = train(samples, settings.members, settings.trees, settings.steps, settings.seed)
-        learned = cls(classifier, learn_novelty(samples.features, folds), label_of_code.astype(np.uint8), settings)
+        learned = cls(
+            classifier, learn_novelty(samples.features, folds), label_of_code.astype(np.uint8), settings
+        )
         learned.temperature = learned._calibrate(drawn, taught, codes, folds)
-        logger.info("learned from %d strokes on %d photos; temperature %.2f", sum(int(marks.max()) for _, marks in painted), len(drawn), learned.temperature)
+        logger.info(
+            "learned from %d strokes on %d photos; temperature %.2f",
+            sum(int(marks.max()) for _, marks in painted),
+            len(drawn),
+            learned.temperature,
+        )
         return learned
 
     def segment(self, image: np.ndarray) -> Segmentation:
         """Segment a photo.
 
         image: (H, W, 3) uint8 RGB
-        returns: (H, W) uint8 class id, 0 = background or unsure; (H, W) uint8 confidence, probability of the class x 255, 0 where unlabelled
+        returns: (H, W) uint8 class id, 0 = background or unsure; (H, W) uint8 confidence, probability of the
+            class x 255, 0 where unlabelled
         """
         height, width = image.shape[:2]
         small, fine = reduced(image, self._settings.max_size), reduced(image, _FINEST)
         guide = fine.astype(np.float32) / 255
         best, total = np.zeros(guide.shape[:2], np.float32), np.zeros(guide.shape[:2], np.float32)
         labels = np.zeros(guide.shape[:2], np.uint8)
-        lines = fit_lines(small.astype(np.float32) / 255, self._planes(pixel_features(small)), self._settings.radius, self._settings.smoothing)
+        lines = fit_lines(
+            small.astype(np.float32) / 255,
+            self._planes(pixel_features(small)),
+            self._settings.radius,
+            self._settings.smoothing,
+        )
         for label, line in zip([*self._label_of_code, 0], lines, strict=True):
             weight = self._sharpened(line.apply(guide))
             labels[weight > best] = label
@@ -119,31 +146,55 @@ class Strokes:
         sure = best / total
         labels[sure < self._settings.unsure] = 0
         confidence = np.where(labels > 0, np.clip(np.rint(255 * sure), 1, 255), 0).astype(np.uint8)
-        return Segmentation(*(cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST) for values in (labels, confidence)))
+        return Segmentation(
+            *(
+                cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST)
+                for values in (labels, confidence)
+            )
+        )
 
     def _planes(self, features: np.ndarray) -> np.ndarray:
         """(H, W, C + 1) float32 probabilities of the codes, and of none of them."""
         probabilities = self._classifier.probabilities(features)
-        unknown = np.zeros(features.shape[:2], np.float32) if self._novelty is None else self._novelty.share(features)
+        unknown = (
+            np.zeros(features.shape[:2], np.float32)
+            if self._novelty is None
+            else self._novelty.share(features)
+        )
         return np.concatenate([probabilities * (1 - unknown)[..., None], unknown[..., None]], axis=-1)
 
     def _sharpened(self, plane: np.ndarray) -> np.ndarray:
         return np.clip(plane, _FLOOR, 1) ** np.float32(1 / self.temperature)
 
-    def _calibrate(self, drawn: list[PhotoStrokes], taught: list[_Learned], codes: np.ndarray, folds: np.ndarray) -> float:
-        """The temperature that suits strokes as members see them that did not learn from them, after the filter."""
+    def _calibrate(
+        self, drawn: list[PhotoStrokes], taught: list[_Learned], codes: np.ndarray, folds: np.ndarray
+    ) -> float:
+        """The temperature that suits strokes as members see them that did not learn from them, after the
+        filter.
+        """
         from sc3d.segmentation.strokes.pixel_classifier import best_temperature
 
         ends = np.cumsum([0, *(len(part.labels) for part in taught)])
         found, truth = [np.zeros((0, len(self._label_of_code)), np.float32)], [codes[:0]]
-        for index in sorted(range(len(drawn)), key=lambda index: -len(taught[index].labels))[: self._settings.calibration_photos]:
+        for index in sorted(range(len(drawn)), key=lambda index: -len(taught[index].labels))[
+            : self._settings.calibration_photos
+        ]:
             part = slice(ends[index], ends[index + 1])
             small = reduced(read_image(drawn[index].photo), self._settings.max_size)
             features, guide = pixel_features(small), small.astype(np.float32) / 255
             for member in np.unique(folds[part][folds[part] >= 0]):
                 pixels = taught[index].pixels[folds[part] == member]
-                lines = fit_lines(guide, self._classifier.probabilities(features, int(member)), self._settings.radius, self._settings.smoothing)
-                found.append(np.stack([np.clip(line.apply(guide).ravel()[pixels], _FLOOR, 1) for line in lines], axis=1))
+                lines = fit_lines(
+                    guide,
+                    self._classifier.probabilities(features, int(member)),
+                    self._settings.radius,
+                    self._settings.smoothing,
+                )
+                found.append(
+                    np.stack(
+                        [np.clip(line.apply(guide).ravel()[pixels], _FLOOR, 1) for line in lines], axis=1
+                    )
+                )
                 truth.append(codes[part][folds[part] == member])
         return best_temperature(np.concatenate(found), np.concatenate(truth))
 
@@ -158,7 +209,8 @@ def deal(strokes: np.ndarray, codes: np.ndarray, num_parts: int) -> np.ndarray:
     for code in np.unique(codes):
         names, sizes = np.unique(strokes[codes == code], return_counts=True)
         filled = np.zeros(num_parts, np.int64)
-        shuffled = np.random.default_rng(0).permutation(len(names))  # else the columns of a grid would go to one part each
+        # else the columns of a grid would go to one part each
+        shuffled = np.random.default_rng(0).permutation(len(names))
         for index in shuffled[np.argsort(-sizes[shuffled], kind="stable")] if len(names) > 1 else ():
             part = int(filled.argmin())
             filled[part] += sizes[index]
@@ -171,26 +223,42 @@ def _paint(photo: PhotoStrokes, max_size: int) -> tuple[np.ndarray, np.ndarray]:
     return photo.paint(width, height)
 
 
-def _check_classes(painted: list[np.ndarray], class_table: ClassTable, folder: Path, require_all: bool) -> None:
+def _check_classes(
+    painted: list[np.ndarray], class_table: ClassTable, folder: Path, require_all: bool
+) -> None:
     """Raise InputError if too little is drawn; painted: per photo (H, W) int16 class ids."""
     present = set(np.unique(np.concatenate([np.unique(labels) for labels in painted])).tolist()) - {NOTHING}
     missing = [entry.name for entry in class_table if entry.id not in present]
     if missing and (require_all or not present):
-        raise InputError(f"the strokes in {folder} show no {missing[0]!r}: draw some, or take the class out of the class table")
+        raise InputError(
+            f"the strokes in {folder} show no {missing[0]!r}: draw some, or take the class out of the class table"
+        )
     if len(present) < 2:
-        raise InputError(f"the strokes in {folder} show one class only: draw others too, or {BACKGROUND} for what belongs to none")
+        raise InputError(
+            f"the strokes in {folder} show one class only: draw others too, or {BACKGROUND} for what belongs to none"
+        )
 
 
-def _teach(photo: PhotoStrokes, labels: np.ndarray, strokes: np.ndarray, settings: StrokesSettings) -> _Learned:
+def _teach(
+    photo: PhotoStrokes, labels: np.ndarray, strokes: np.ndarray, settings: StrokesSettings
+) -> _Learned:
     """Pixels under the strokes of a photo, a share of each stroke."""
     random = np.random.default_rng([settings.seed, *photo.photo.stem.encode()])
-    rows = np.concatenate([pick(strokes.ravel(), labels.ravel() == label, settings.pixels, random) for label in np.unique(labels[labels != NOTHING])])
+    rows = np.concatenate(
+        [
+            pick(strokes.ravel(), labels.ravel() == label, settings.pixels, random)
+            for label in np.unique(labels[labels != NOTHING])
+        ]
+    )
     features = pixel_features(reduced(read_image(photo.photo), settings.max_size))
-    return _Learned(features.reshape(-1, features.shape[-1])[rows], labels.ravel()[rows], _pieces(strokes, rows), rows)
+    return _Learned(
+        features.reshape(-1, features.shape[-1])[rows], labels.ravel()[rows], _pieces(strokes, rows), rows
+    )
 
 
 def _pieces(strokes: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """(N,) int64 names of the pieces that pixels belong to: large areas are cut along a grid, so that no member lacks all of one.
+    """(N,) int64 names of the pieces that pixels belong to: large areas are cut along a grid, so that no
+    member lacks all of one.
 
     strokes: (H, W) int32 numbers; pixels: (N,) places in it
     """
@@ -199,7 +267,8 @@ def _pieces(strokes: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def pick(strokes: np.ndarray, wanted: np.ndarray, most: int, random: np.random.Generator) -> np.ndarray:
-    """Places of at most about `most` wanted pixels, of each stroke its share, but at least `_LEAST` of small ones: they correct large ones.
+    """Places of at most about `most` wanted pixels, of each stroke its share, but at least `_LEAST` of small
+    ones: they correct large ones.
 
     strokes: (P,) int number of each pixel's stroke; wanted: (P,) bool
     returns: (N,) int places, ascending
@@ -227,4 +296,6 @@ def _check_packages() -> None:
     try:
         import sklearn  # noqa: F401
     except ImportError:
-        raise MissingPackageError("the backend strokes needs scikit-learn: pip install scikit-learn") from None
+        raise MissingPackageError(
+            "the backend strokes needs scikit-learn: pip install scikit-learn"
+        ) from None

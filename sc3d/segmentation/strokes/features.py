@@ -1,4 +1,6 @@
-"""Colour and texture of every pixel at several scales; nothing depends on position or orientation, so that one photo teaches another."""
+"""Colour and texture of every pixel at several scales; nothing depends on position or orientation, so that
+one photo teaches another.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +18,23 @@ def pixel_features(image: np.ndarray) -> np.ndarray:
     """Features of every pixel.
 
     image: (H, W, 3) uint8 RGB
-    returns: (H, W, F) float32: means, standard deviations, band energies, strength and coherence of edges, extremes
+    returns: (H, W, F) float32: means, standard deviations, band energies, strength and coherence of edges,
+        extremes
     """
     channels = _channels(image)
     lightness, green_over_red = channels[0], channels[3]
     planes = channels + [_mean(channel, radius) for channel in channels for radius in RADII]
-    planes += [_deviation(channel, radius) for channel in (lightness, green_over_red) for radius in TEXTURE_RADII]
+    planes += [
+        _deviation(channel, radius) for channel in (lightness, green_over_red) for radius in TEXTURE_RADII
+    ]
     planes += _band_energies(lightness) + _edges(lightness) + _extremes(lightness)
     return np.stack(planes, axis=-1)
 
 
 def _channels(image: np.ndarray) -> list[np.ndarray]:
-    """Lab, and the logarithms of green over red and over blue, which shadow and exposure change little: (H, W) float32 each."""
+    """Lab, and the logarithms of green over red and over blue, which shadow and exposure change little: (H,
+    W) float32 each.
+    """
     lab = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
     red, green, blue = cv2.split(np.log(image.astype(np.float32) + DARK))
     return [*cv2.split(lab), 50 * (green - red), 50 * (green - blue)]
@@ -48,13 +55,19 @@ def _band_energies(lightness: np.ndarray) -> list[np.ndarray]:
     """Mean size of the differences between neighbouring scales: how coarse the texture is."""
     radii = RADII[:-1]
     levels = [lightness, *(_mean(lightness, radius) for radius in radii)]
-    return [5 * np.log(_mean(np.abs(fine - coarse), 4 * radius) + 0.2) for fine, coarse, radius in zip(levels[:-1], levels[1:], radii, strict=True)]
+    return [
+        5 * np.log(_mean(np.abs(fine - coarse), 4 * radius) + 0.2)
+        for fine, coarse, radius in zip(levels[:-1], levels[1:], radii, strict=True)
+    ]
 
 
 def _edges(lightness: np.ndarray) -> list[np.ndarray]:
     """Strength and coherence of the structure tensor: high coherence is one edge, low coherence is foliage."""
     smooth = cv2.GaussianBlur(lightness, (0, 0), 1.0)
-    across, down = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 16), cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 16)
+    across, down = (
+        cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 16),
+        cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 16),
+    )
     planes = []
     for radius in TENSOR_RADII:
         xx, yy, xy = (_mean(product, radius) for product in (across * across, down * down, across * down))

@@ -1,8 +1,11 @@
 """What a user drew on photos: strokes, polygons and colours, read, checked and painted at any size.
 
-LabelMe JSON: shapes of type linestrip, line, point (with `"width": <px>`, which LabelMe keeps although it does not know it), polygon,
-rectangle and circle; coordinates in px from the upper left corner of the photo as it is stored; later shapes cover earlier ones.
-The label is the name of a class, or `_background_` for what belongs to no class. PNG: the colours of the class table; black and
+LabelMe JSON: shapes of type linestrip, line, point (with `"width": <px>`, which LabelMe keeps although it
+does not know it), polygon,
+rectangle and circle; coordinates in px from the upper left corner of the photo as it is stored; later shapes
+cover earlier ones.
+The label is the name of a class, or `_background_` for what belongs to no class. PNG: the colours of the
+class table; black and
 transparent pixels say nothing. A photo may have both, the PNG below.
 """
 
@@ -33,7 +36,9 @@ _LEAST_SHARE = 0.25  # of a reduced pixel that a PNG must cover
 
 @dataclass(frozen=True)
 class Shape:
-    """One stroke or area. label: class id, 0 = background; points: (N, 2) float64 px of the stored photo; width: of strokes, px, 0 = default."""
+    """One stroke or area. label: class id, 0 = background; points: (N, 2) float64 px of the stored photo;
+    width: of strokes, px, 0 = default.
+    """
 
     label: int
     kind: str
@@ -58,9 +63,14 @@ class PhotoStrokes:
     def paint(self, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
         """Draw everything at a size of the photo's aspect.
 
-        returns: (height, width) int16 class ids, 0 = background, NOTHING elsewhere; (height, width) int32 number of the stroke, from 1 on, 0 elsewhere
+        returns: (height, width) int16 class ids, 0 = background, NOTHING elsewhere; (height, width) int32
+            number of the stroke, from 1 on, 0 elsewhere
         """
-        labels, groups, count = np.full((height, width), NOTHING, np.int16), np.zeros((height, width), np.int32), 0
+        labels, groups, count = (
+            np.full((height, width), NOTHING, np.int16),
+            np.zeros((height, width), np.int32),
+            0,
+        )
         if self.picture is not None:
             labels = _reduce(self.picture, width, height)
             groups, count = _components(labels)
@@ -75,11 +85,22 @@ class PhotoStrokes:
 def read_strokes(folder: Path, photos_folder: Path, class_table: ClassTable) -> list[PhotoStrokes]:
     """Strokes of all photos that have some, ordered by photo.
 
-    Raises InputError for a folder without strokes, files that belong to no photo, cannot be read or name unknown classes or colours.
+    Raises InputError for a folder without strokes, files that belong to no photo, cannot be read or name
+    unknown classes or colours.
     """
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (".json", ".png") and file.name[0] != ".") if folder.is_dir() else []
+    files = (
+        sorted(
+            file
+            for file in folder.iterdir()
+            if file.suffix.lower() in (".json", ".png") and file.name[0] != "."
+        )
+        if folder.is_dir()
+        else []
+    )
     if not files:
-        raise InputError(f"no strokes in {folder}: draw some with `sc3d annotate SCENE`, or put LabelMe JSON or PNG files there")
+        raise InputError(
+            f"no strokes in {folder}: draw some with `sc3d annotate SCENE`, or put LabelMe JSON or PNG files there"
+        )
     photos = {photo.stem: photo for photo in find_photos(photos_folder)}
     found: dict[Path, PhotoStrokes] = {}
     for file in files:
@@ -89,11 +110,15 @@ def read_strokes(folder: Path, photos_folder: Path, class_table: ClassTable) -> 
         shapes = () if content is None else parse_shapes(content, file, size, class_table)
         picture = None if content is not None else _read_picture(file, size, class_table)
         before = found.get(photo, PhotoStrokes(photo, size))
-        found[photo] = PhotoStrokes(photo, size, before.shapes + shapes, before.picture if picture is None else picture)
+        found[photo] = PhotoStrokes(
+            photo, size, before.shapes + shapes, before.picture if picture is None else picture
+        )
     return [found[photo] for photo in sorted(found)]
 
 
-def parse_shapes(content: object, origin: Path | str, size: tuple[int, int], class_table: ClassTable) -> tuple[Shape, ...]:
+def parse_shapes(
+    content: object, origin: Path | str, size: tuple[int, int], class_table: ClassTable
+) -> tuple[Shape, ...]:
     """The shapes of a decoded LabelMe file, scaled to the photo; InputError if something is wrong.
 
     origin: names the file in messages; size: (width, height) px of the photo
@@ -109,7 +134,9 @@ def parse_shapes(content: object, origin: Path | str, size: tuple[int, int], cla
         check_mask_aspect(Path(str(origin)), stated, size)
         scale = max(size) / max(stated)
     ids = {entry.name: entry.id for entry in class_table} | {BACKGROUND: 0}
-    return tuple(_parse_shape(shape, f"{origin}: shape {index + 1}", ids, scale) for index, shape in enumerate(shapes))
+    return tuple(
+        _parse_shape(shape, f"{origin}: shape {index + 1}", ids, scale) for index, shape in enumerate(shapes)
+    )
 
 
 def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) -> Shape:
@@ -117,11 +144,15 @@ def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) 
         raise InputError(f"{origin} is not an object")
     label, kind = shape.get("label"), shape.get("shape_type") or "polygon"
     if not isinstance(label, str) or label not in ids:
-        raise InputError(f"{origin} is of the class {str(label)[:40]!r}, which is not in the class table: one of {', '.join(ids)}")
+        raise InputError(
+            f"{origin} is of the class {str(label)[:40]!r}, which is not in the class table: one of {', '.join(ids)}"
+        )
     if not isinstance(kind, str) or kind not in MIN_POINTS:
         raise InputError(f"{origin} is a {str(kind)[:40]!r}: possible are {', '.join(MIN_POINTS)}")
     points, width = shape.get("points"), shape.get("width", 0)
-    if not isinstance(points, list) or not all(isinstance(point, list) and len(point) == 2 and all(map(_is_number, point)) for point in points):
+    if not isinstance(points, list) or not all(
+        isinstance(point, list) and len(point) == 2 and all(map(_is_number, point)) for point in points
+    ):
         raise InputError(f"{origin}: points must be a list of [x, y] in px")
     if len(points) < MIN_POINTS[kind]:
         raise InputError(f"{origin}: a {kind} needs at least {MIN_POINTS[kind]} points")
@@ -131,40 +162,63 @@ def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) 
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and abs(value) < _FAR
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and math.isfinite(value)
+        and abs(value) < _FAR
+    )
 
 
 def _photo_of(file: Path, content: object, photos: dict[str, Path]) -> Path:
     """The photo whose stem is that of `imagePath`, or else that of the file."""
     path = content.get("imagePath") if isinstance(content, dict) else None
-    stems = [*([PureWindowsPath(path).stem] if isinstance(path, str) else []), file.stem]  # PureWindowsPath splits at / and \
+    # PureWindowsPath splits at / and \
+    stems = [*([PureWindowsPath(path).stem] if isinstance(path, str) else []), file.stem]
     photo = next((photos[stem] for stem in stems if stem in photos), None)
     if photo is None:
-        raise InputError(f"{file} belongs to no photo: {len(photos)} photos are known, such as {next(iter(photos.values())).name}")
+        raise InputError(
+            f"{file} belongs to no photo: {len(photos)} photos are known, such as {next(iter(photos.values())).name}"
+        )
     return photo
 
 
 def _read_picture(file: Path, size: tuple[int, int], class_table: ClassTable) -> np.ndarray:
-    """(H, W) int16 class ids of a PNG in the colours of the class table, NOTHING where it is black or transparent."""
+    """(H, W) int16 class ids of a PNG in the colours of the class table, NOTHING where it is black or
+    transparent.
+    """
     check_mask_aspect(file, image_size(file), size)
     with open_image(file, "picture of strokes") as image:
         rgba = np.array(image.convert("RGBA"))
     codes = (rgba[..., :3].astype(np.int32) * [65536, 256, 1]).sum(axis=-1)
     codes[rgba[..., 3] == 0] = 0
     values, places = np.unique(codes, return_inverse=True)
-    ids = {(red << 16) + (green << 8) + blue: entry.id for entry in class_table for red, green, blue in [entry.color]} | {0: NOTHING}
+    ids = {
+        (red << 16) + (green << 8) + blue: entry.id
+        for entry in class_table
+        for red, green, blue in [entry.color]
+    } | {0: NOTHING}
     unknown = [int(value) for value in values if int(value) not in ids]
     if unknown:
-        raise InputError(f"{file} has the colour #{unknown[0]:06x}, which is not in the class table: draw without smoothing, and not as JPEG")
+        raise InputError(
+            f"{file} has the colour #{unknown[0]:06x}, which is not in the class table: draw without smoothing, and not as JPEG"
+        )
     return np.array([ids[int(value)] for value in values], np.int16)[places].reshape(codes.shape)
 
 
 def _reduce(picture: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The class that covers most of each reduced pixel, if it covers a quarter of it: thin strokes must not vanish."""
+    """The class that covers most of each reduced pixel, if it covers a quarter of it: thin strokes must not
+    vanish.
+    """
     ids = np.unique(picture[picture != NOTHING])
     if not len(ids):
         return np.full((height, width), NOTHING, np.int16)
-    shares = np.stack([cv2.resize((picture == label).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) for label in ids])
+    shares = np.stack(
+        [
+            cv2.resize((picture == label).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+            for label in ids
+        ]
+    )
     return np.where(shares.max(axis=0) >= _LEAST_SHARE, ids[shares.argmax(axis=0)], NOTHING).astype(np.int16)
 
 
@@ -179,18 +233,24 @@ def _components(labels: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _draw(shape: Shape, scale: np.ndarray, default_width: float, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool pixels that a shape covers, at least one unless it lies outside; scale: (2,) of x and y; size: (H, W)."""
+    """(H, W) bool pixels that a shape covers, at least one unless it lies outside; scale: (2,) of x and y;
+    size: (H, W).
+    """
     canvas, points = np.zeros(size, np.uint8), shape.points
     if shape.kind == "circle":
         angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-        points = points[0] + np.hypot(*(points[1] - points[0])) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        points = points[0] + np.hypot(*(points[1] - points[0])) * np.stack(
+            [np.cos(angles), np.sin(angles)], axis=1
+        )
     elif shape.kind == "rectangle":
         (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
         points = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
-    fixed = [np.rint((points * scale - 0.5) * 2**_SHIFT).astype(np.int32)]  # OpenCV counts from the centre of the first pixel
+    # OpenCV counts from the centre of the first pixel
+    fixed = [np.rint((points * scale - 0.5) * 2**_SHIFT).astype(np.int32)]
     if shape.kind in ("polygon", "rectangle", "circle"):
         cv2.fillPoly(canvas, fixed, 1, shift=_SHIFT)
     else:
         thickness = min(max(1, round((shape.width or default_width) * float(scale.mean()))), _THICKEST)
-        cv2.polylines(canvas, [np.concatenate([fixed[0], fixed[0][-1:]])], False, 1, thickness, shift=_SHIFT)  # a single point is no line to OpenCV
+        # a single point is no line to OpenCV
+        cv2.polylines(canvas, [np.concatenate([fixed[0], fixed[0][-1:]])], False, 1, thickness, shift=_SHIFT)
     return canvas > 0

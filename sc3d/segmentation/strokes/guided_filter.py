@@ -1,6 +1,7 @@
 """Guided filter: probabilities are smoothed, but not across the edges of the photo.
 
-Source: He, Sun and Tang, "Guided image filtering" (2013), colour guide; the coefficients are found at a reduced size and applied to the
+Source: He, Sun and Tang, "Guided image filtering" (2013), colour guide; the coefficients are found at a
+    reduced size and applied to the
 large photo, as in He and Sun, "Fast guided filter" (2015).
 """
 
@@ -14,7 +15,9 @@ import numpy as np
 
 
 class LocalLines(NamedTuple):
-    """One plane as a linear function of the colour around each pixel: (H, W, 3) float32 slope per unit of grey value 0 to 1; (H, W) float32 offset."""
+    """One plane as a linear function of the colour around each pixel: (H, W, 3) float32 slope per unit of
+    grey value 0 to 1; (H, W) float32 offset.
+    """
 
     slope: np.ndarray
     offset: np.ndarray
@@ -38,18 +41,31 @@ def fit_lines(guide: np.ndarray, planes: np.ndarray, radius: int, smoothing: flo
     for index in range(planes.shape[2]):
         plane = np.ascontiguousarray(planes[..., index])
         plane_mean = _mean(plane, radius)
-        covariance = [_mean(guide[..., channel] * plane, radius) - means[channel] * plane_mean for channel in range(3)]
-        slope = [sum(inverse[min(row, column), max(row, column)] * covariance[column] for column in range(3)) for row in range(3)]
+        covariance = [
+            _mean(guide[..., channel] * plane, radius) - means[channel] * plane_mean for channel in range(3)
+        ]
+        slope = [
+            sum(inverse[min(row, column), max(row, column)] * covariance[column] for column in range(3))
+            for row in range(3)
+        ]
         offset = plane_mean - sum(slope[channel] * means[channel] for channel in range(3))
-        yield LocalLines(np.stack([_mean(values, radius) for values in slope], axis=-1), _mean(offset, radius))
+        yield LocalLines(
+            np.stack([_mean(values, radius) for values in slope], axis=-1), _mean(offset, radius)
+        )
 
 
-def _inverse_covariance(guide: np.ndarray, means: list[np.ndarray], radius: int, smoothing: float) -> dict[tuple[int, int], np.ndarray]:
+def _inverse_covariance(
+    guide: np.ndarray, means: list[np.ndarray], radius: int, smoothing: float
+) -> dict[tuple[int, int], np.ndarray]:
     """Upper half of the inverse of each pixel's 3x3 covariance matrix, by cofactors."""
     cov = {}
     for row in range(3):
         for column in range(row, 3):
-            cov[row, column] = _mean(guide[..., row] * guide[..., column], radius) - means[row] * means[column] + (smoothing if row == column else 0)
+            cov[row, column] = (
+                _mean(guide[..., row] * guide[..., column], radius)
+                - means[row] * means[column]
+                + (smoothing if row == column else 0)
+            )
     inverse = {
         (0, 0): cov[1, 1] * cov[2, 2] - cov[1, 2] ** 2,
         (0, 1): cov[0, 2] * cov[1, 2] - cov[0, 1] * cov[2, 2],

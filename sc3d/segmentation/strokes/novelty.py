@@ -1,4 +1,6 @@
-"""What is unlike every stroke: a classifier would be sure of it all the same, so it is found by its distance to all pixels under strokes."""
+"""What is unlike every stroke: a classifier would be sure of it all the same, so it is found by its distance
+to all pixels under strokes.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +13,19 @@ from scipy.spatial import cKDTree
 _DIMENSIONS = 6  # principal components: more only make distances more alike
 _QUANTILE = 0.995  # of the distances of held-out strokes that still pass for known
 _STEP = 4  # px between the places looked at
-_UNIT = 1.0  # of features: a difference that another photo of the same thing may well show, although strokes do not
+# of features: a difference that another photo of the same thing may well show, although strokes do not
+_UNIT = 1.0
 _NARROW = 5  # such steps: what is narrower is no object
 _MOST = 15_000  # pixels to compare with
 
 
 @dataclass(frozen=True)
 class _Space:
-    """Where distances are measured: principal components, half whitened because the first say most, and what they leave over.
+    """Where distances are measured: principal components, half whitened because the first say most, and what
+    they leave over.
 
-    centre, scale: (F,) of the features; axes: (6, F) orthonormal; sizes: (6,) divisors; rest: divisor of the remainder
+    centre, scale: (F,) of the features; axes: (6, F) orthonormal; sizes: (6,) divisors; rest: divisor of the
+        remainder
     """
 
     centre: np.ndarray
@@ -30,7 +35,9 @@ class _Space:
     rest: float = 1.0
 
     def place(self, features: np.ndarray) -> np.ndarray:
-        """(N, 7) places of (N, F) features; the last coordinate is the distance from the plane of the components, where strange colours show."""
+        """(N, 7) places of (N, F) features; the last coordinate is the distance from the plane of the
+        components, where strange colours show.
+        """
         scaled = (features - self.centre) / self.scale
         components = scaled @ self.axes.T
         rest = np.sqrt(np.maximum((scaled**2).sum(axis=1) - (components**2).sum(axis=1), 0))
@@ -54,12 +61,14 @@ class Novelty:
         sparse = features[::_STEP, ::_STEP]
         distances = self.known.query(self.space.place(sparse.reshape(-1, features.shape[-1])))[0]
         share = np.clip(distances / self.reach - 1, 0, 1).reshape(sparse.shape[:2]).astype(np.float32)
-        share = cv2.morphologyEx(share, cv2.MORPH_OPEN, np.ones((_NARROW, _NARROW), np.uint8))  # windows across an edge are unlike both sides
+        # windows across an edge are unlike both sides
+        share = cv2.morphologyEx(share, cv2.MORPH_OPEN, np.ones((_NARROW, _NARROW), np.uint8))
         return cv2.resize(share, features.shape[1::-1], interpolation=cv2.INTER_LINEAR)
 
 
 def learn_novelty(features: np.ndarray, folds: np.ndarray) -> Novelty | None:
-    """Learn what strokes look like, and how far apart those of different parts are; None if there are not two parts to compare.
+    """Learn what strokes look like, and how far apart those of different parts are; None if there are not two
+    parts to compare.
 
     features: (N, F) float32 of pixels under strokes; folds: (N,) int part of each, -1 = none
     """
@@ -70,12 +79,19 @@ def learn_novelty(features: np.ndarray, folds: np.ndarray) -> Novelty | None:
     places = space.place(features)
     thinned = slice(None, None, -(-len(features) // _MOST))
     distances = [cKDTree(places[folds != part][thinned]).query(places[folds == part])[0] for part in parts]
-    return Novelty(space, cKDTree(places[thinned]), max(float(np.quantile(np.concatenate(distances), _QUANTILE)), _UNIT))
+    return Novelty(
+        space, cKDTree(places[thinned]), max(float(np.quantile(np.concatenate(distances), _QUANTILE)), _UNIT)
+    )
 
 
 def _fit(features: np.ndarray) -> _Space:
     centre, scale = features.mean(axis=0), features.std(axis=0) + _UNIT
     _, sizes, axes = np.linalg.svd((features - centre) / scale, full_matrices=False)
-    space = _Space(centre, scale, axes[:_DIMENSIONS], np.sqrt(np.maximum(sizes[:_DIMENSIONS] / np.sqrt(len(features)), _UNIT)))
+    space = _Space(
+        centre,
+        scale,
+        axes[:_DIMENSIONS],
+        np.sqrt(np.maximum(sizes[:_DIMENSIONS] / np.sqrt(len(features)), _UNIT)),
+    )
     rest = max(float(space.place(features)[:, -1].std()), _UNIT)
     return _Space(space.centre, space.scale, space.axes, space.sizes, rest)

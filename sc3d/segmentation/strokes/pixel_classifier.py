@@ -1,6 +1,8 @@
-"""A classifier of feature vectors: small neural networks and randomised trees, which err in different places, trained crosswise.
+"""A classifier of feature vectors: small neural networks and randomised trees, which err in different places,
+trained crosswise.
 
-Strokes are dealt out to as many parts as there are members; each member learns from all parts but its own. So every stroke is judged by a
+Strokes are dealt out to as many parts as there are members; each member learns from all parts but its own. So
+every stroke is judged by a
 member that has not seen it, which is what calibration needs, and all members together have seen all strokes.
 """
 
@@ -17,13 +19,17 @@ from sklearn.ensemble import ExtraTreesClassifier
 _CHUNK = 1 << 17  # pixels at once
 _BATCH = 512
 _RATE = 6e-3  # peak of the learning rate
-_SHARPEST = 0.4  # temperature; strokes lie where it is easy, so that all may be right and still say nothing of edges
-_CLIP = 0.05  # the networks see features within these quantiles of the strokes: far outside, they would be sure of anything
+# temperature; strokes lie where it is easy, so that all may be right and still say nothing of edges
+_SHARPEST = 0.4
+# the networks see features within these quantiles of the strokes: far outside, they would be sure of anything
+_CLIP = 0.05
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Pixels under strokes. features: (N, F) float32; codes: (N,) int64 0 to num_codes - 1, all present; folds: (N,) int64, -1 = in every training set."""
+    """Pixels under strokes. features: (N, F) float32; codes: (N,) int64 0 to num_codes - 1, all present;
+    folds: (N,) int64, -1 = in every training set.
+    """
 
     features: np.ndarray
     codes: np.ndarray
@@ -56,7 +62,9 @@ class PixelClassifier:
         """
         rows = features.reshape(-1, features.shape[-1])
         members = self.members if member is None else self.members[member : member + 1]
-        found = [self._classify(rows[start : start + _CHUNK], members) for start in range(0, len(rows), _CHUNK)]
+        found = [
+            self._classify(rows[start : start + _CHUNK], members) for start in range(0, len(rows), _CHUNK)
+        ]
         return np.concatenate(found).reshape(*features.shape[:-1], -1)
 
     def _classify(self, rows: np.ndarray, members: tuple[Member, ...]) -> np.ndarray:
@@ -72,21 +80,31 @@ def train(samples: Samples, num_members: int, num_trees: int, num_steps: int, se
 
     num_trees: of all members together; num_steps: of gradient descent, per member
     """
-    low, high = (np.quantile(samples.features, share, axis=0).astype(np.float32) for share in (_CLIP, 1 - _CLIP))
+    low, high = (
+        np.quantile(samples.features, share, axis=0).astype(np.float32) for share in (_CLIP, 1 - _CLIP)
+    )
     clipped = np.clip(samples.features, low, high)
     centre, scale = clipped.mean(axis=0), clipped.std(axis=0) + 1e-3
     scaled, members = (clipped - centre) / scale, []
     for index in range(num_members):
         used = samples.folds != index
         codes = samples.codes[used]
-        weights = (1 / np.sqrt(np.bincount(codes)))[codes]  # rare classes count more, but not as much as frequent ones
+        # rare classes count more, but not as much as frequent ones
+        weights = (1 / np.sqrt(np.bincount(codes)))[codes]
         network = _train_network(scaled[used], codes, weights, num_steps, seed + index)
-        forest = ExtraTreesClassifier(max(1, num_trees // num_members), min_samples_leaf=5, max_features="sqrt", random_state=seed + index)
+        forest = ExtraTreesClassifier(
+            max(1, num_trees // num_members),
+            min_samples_leaf=5,
+            max_features="sqrt",
+            random_state=seed + index,
+        )
         members.append(Member(network, forest.fit(samples.features[used], codes, weights)))
     return PixelClassifier(tuple(members), low, high, centre, scale)
 
 
-def _train_network(scaled: np.ndarray, codes: np.ndarray, weights: np.ndarray, num_steps: int, seed: int) -> torch.nn.Module:
+def _train_network(
+    scaled: np.ndarray, codes: np.ndarray, weights: np.ndarray, num_steps: int, seed: int
+) -> torch.nn.Module:
     """Two hidden layers; batches are drawn by weight."""
     with _one_thread(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -94,10 +112,14 @@ def _train_network(scaled: np.ndarray, codes: np.ndarray, weights: np.ndarray, n
         optimiser = torch.optim.AdamW(network.parameters(), _RATE, weight_decay=1e-2)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, num_steps)
         inputs, targets = torch.from_numpy(scaled), torch.from_numpy(codes)
-        batches = torch.multinomial(torch.from_numpy(weights), num_steps * _BATCH, replacement=True).view(num_steps, _BATCH)
+        batches = torch.multinomial(torch.from_numpy(weights), num_steps * _BATCH, replacement=True).view(
+            num_steps, _BATCH
+        )
         for batch in batches:
             optimiser.zero_grad()
-            torch.nn.functional.cross_entropy(network(inputs[batch]), targets[batch], label_smoothing=0.02).backward()
+            torch.nn.functional.cross_entropy(
+                network(inputs[batch]), targets[batch], label_smoothing=0.02
+            ).backward()
             optimiser.step()
             schedule.step()
     return network.eval()
@@ -112,7 +134,9 @@ def _network(num_features: int, num_codes: int, width: int = 64) -> torch.nn.Mod
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Sums over a batch must not depend on the number of threads, and threads do not pay for matrices this small."""
+    """Sums over a batch must not depend on the number of threads, and threads do not pay for matrices this
+    small.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -122,7 +146,8 @@ def _one_thread() -> Iterator[None]:
 
 
 def best_temperature(probabilities: np.ndarray, codes: np.ndarray) -> float:
-    """The exponent's inverse T for which p ** (1 / T), normalised, describes (N, C) probabilities of known (N,) codes best; 1 if there are none.
+    """The exponent's inverse T for which p ** (1 / T), normalised, describes (N, C) probabilities of known
+    (N,) codes best; 1 if there are none.
 
     Source: Guo et al., "On calibration of modern neural networks" (2017).
     """
@@ -132,7 +157,13 @@ def best_temperature(probabilities: np.ndarray, codes: np.ndarray) -> float:
 
     def loss(temperature: float) -> float:
         scaled = logarithms / temperature
-        return float((np.log(np.exp(scaled - scaled.max(axis=1, keepdims=True)).sum(axis=1)) + scaled.max(axis=1) - scaled[rows, codes]).mean())
+        return float(
+            (
+                np.log(np.exp(scaled - scaled.max(axis=1, keepdims=True)).sum(axis=1))
+                + scaled.max(axis=1)
+                - scaled[rows, codes]
+            ).mean()
+        )
 
     candidates = np.geomspace(_SHARPEST, 5, 65)
     return float(candidates[np.argmin([loss(candidate) for candidate in candidates])])

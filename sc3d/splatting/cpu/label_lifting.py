@@ -1,7 +1,9 @@
 """Numba kernels: how much of each class every Gaussian shows in a view.
 
-The walk of `kernels_raster` with the same operations, hence the same fragments and weights; instead of compositing colours it sums the weights w
-of a fragment over the pixels of each class. A tile keeps one plane of mask weights per class that occurs in it, mostly one or two.
+The walk of `kernels_raster` with the same operations, hence the same fragments and weights; instead of
+compositing colours it sums the weights w
+of a fragment over the pixels of each class. A tile keeps one plane of mask weights per class that occurs in
+it, mostly one or two.
 """
 
 from __future__ import annotations
@@ -41,10 +43,14 @@ _ZERO = np.float32(0.0)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _lift_tile(records, ranks, instances, first, last, origin_x, origin_y, rows, columns, classes, pixels, contributions):
-    """Runs a tile front to back and writes sum(w * mask weight) of each instance and class into contributions (P, C).
+def _lift_tile(
+    records, ranks, instances, first, last, origin_x, origin_y, rows, columns, classes, pixels, contributions
+):
+    """Runs a tile front to back and writes sum(w * mask weight) of each instance and class into contributions
+    (P, C).
 
-    classes: (K,) columns of contributions; pixels: planes transmittance and mask weight of each of the K classes
+    classes: (K,) columns of contributions; pixels: planes transmittance and mask weight of each of the K
+        classes
     """
     lane, low, high, limit = ramp(), splat(LOG2_MIN_ALPHA), splat(MAX_ALPHA), splat(MIN_TRANSMITTANCE)
     lines, ends = np.empty(3 * TILE, np.float32), np.empty(2 * TILE, np.int32)
@@ -57,7 +63,12 @@ def _lift_tile(records, ranks, instances, first, last, origin_x, origin_y, rows,
         minus_decay = splat(-records[base + 3])
         sums[:] = _ZERO
         for row in range(first_row, last_row + 1):
-            column, end, centre, peak = np.int64(ends[row]), np.int64(ends[TILE + row]), lines[TILE + row], splat(lines[2 * TILE + row])
+            column, end, centre, peak = (
+                np.int64(ends[row]),
+                np.int64(ends[TILE + row]),
+                lines[TILE + row],
+                splat(lines[2 * TILE + row]),
+            )
             while column < end:
                 place = row * STRIDE + column
                 transmittance = load(pixels, place)
@@ -66,11 +77,15 @@ def _lift_tile(records, ranks, instances, first, last, origin_x, origin_y, rows,
                     continue
                 u = lane + splat(np.float32(column - LANES) - centre)
                 exponent = fma(minus_decay * u, u, peak)
-                alpha = where_at_least(exponent, low, where_at_least(transmittance, limit, minimum(exp2(exponent), high)))
+                alpha = where_at_least(
+                    exponent, low, where_at_least(transmittance, limit, minimum(exp2(exponent), high))
+                )
                 w = alpha * transmittance
                 store(pixels, place, transmittance - w)
                 for k in range(classes.shape[0]):
-                    store(sums, k * LANES, fma(w, load(pixels, place + (k + 1) * PLANE), load(sums, k * LANES)))
+                    store(
+                        sums, k * LANES, fma(w, load(pixels, place + (k + 1) * PLANE), load(sums, k * LANES))
+                    )
         for k in range(classes.shape[0]):
             contributions[np.int64(instances[entry]), classes[k]] = total(load(sums, k * LANES))
 
@@ -96,8 +111,10 @@ def _classes_of(columns_image, top, left, rows, columns, slots):
 def lift(records, ranks, instances, starts, order, columns_image, weights, contributions):
     """Sums of all tiles.
 
-    records: (M * 16,) in depth order; ranks, instances: (P,) tile by tile, starts (tiles + 1,); order: (tiles,) permutation, for balance
-    columns_image: (H, W) uint8 column of contributions that the pixel's class has, NONE = no label; weights: (H, W) float32 of the mask
+    records: (M * 16,) in depth order; ranks, instances: (P,) tile by tile, starts (tiles + 1,); order:
+        (tiles,) permutation, for balance
+    columns_image: (H, W) uint8 column of contributions that the pixel's class has, NONE = no label; weights:
+        (H, W) float32 of the mask
     contributions: (P, C) float32, zero on entry
     """
     height, width = columns_image.shape
@@ -115,16 +132,31 @@ def lift(records, ranks, instances, starts, order, columns_image, weights, contr
                 for column in range(columns):
                     label = columns_image[top + row, left + column]
                     if label != NONE:
-                        pixels[(1 + slots[label]) * PLANE + row * STRIDE + column] = weights[top + row, left + column]
-            _lift_tile(records, ranks, instances, starts[tile], starts[tile + 1], np.float32(left), np.float32(top), rows, columns, classes,
-                       pixels, contributions)
+                        pixels[(1 + slots[label]) * PLANE + row * STRIDE + column] = weights[
+                            top + row, left + column
+                        ]
+            _lift_tile(
+                records,
+                ranks,
+                instances,
+                starts[tile],
+                starts[tile + 1],
+                np.float32(left),
+                np.float32(top),
+                rows,
+                columns,
+                classes,
+                pixels,
+                contributions,
+            )
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
 def collect(visible, offsets, contributions, ids, scale, evidence):
     """Adds the sums of each Gaussian's instances, times `scale` and rounded, to evidence (N, num_ids) int64.
 
-    ids: (C,) column of evidence of each column of contributions. Whole numbers: the order of views does not matter.
+    ids: (C,) column of evidence of each column of contributions. Whole numbers: the order of views does not
+        matter.
     """
     for rank in numba.prange(visible.shape[0]):
         for k in range(ids.shape[0]):

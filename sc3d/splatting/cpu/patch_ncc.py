@@ -1,8 +1,11 @@
-"""1 - NCC of patches warped by their planes, with its analytic gradient, as one kernel; `losses.patch_dissimilarity_reference` is the slow twin.
+"""1 - NCC of patches warped by their planes, with its analytic gradient, as one kernel;
+`losses.patch_dissimilarity_reference` is the slow twin.
 
-A patch pixel with ray r (z = 1) lands at q = d R r - t (n . r), projected. With grey values a_p of the photo and b_p sampled at q_p, and
+A patch pixel with ray r (z = 1) lands at q = d R r - t (n . r), projected. With grey values a_p of the photo
+and b_p sampled at q_p, and
 g_p = db_p / d(n, d), all sums that NCC and its gradient need are gathered in one pass:
-    d NCC = sum_p [(a_p - mean a) / (P s) - NCC (b_p - mean b) / (P (var b + e))] g_p,   s = sqrt((var a + e)(var b + e)).
+    d NCC = sum_p [(a_p - mean a) / (P s) - NCC (b_p - mean b) / (P (var b + e))] g_p,   s = sqrt((var a +
+    e)(var b + e)).
 """
 
 from __future__ import annotations
@@ -19,10 +22,12 @@ NOISE = 1 / 255**2
 def patch_dissimilarity(
     normals: Tensor, distances: Tensor, pixels: Tensor, greys: tuple[Tensor, Tensor], cameras: np.ndarray
 ) -> tuple[Tensor, Tensor]:
-    """(M,) 1 - NCC, differentiable in `normals` (M, 3) and `distances` (M,); (M,) bool: both patches lie inside their images.
+    """(M,) 1 - NCC, differentiable in `normals` (M, 3) and `distances` (M,); (M,) bool: both patches lie
+    inside their images.
 
     pixels: (M, 2) int64 column, row; greys: (H, W) and (h, w)
-    cameras: (20,) fx fy cx cy of both views, R (9, row by row) and t (3) from the first to the second camera frame
+    cameras: (20,) fx fy cx cy of both views, R (9, row by row) and t (3) from the first to the second camera
+        frame
     """
     return _Patches.apply(normals, distances, pixels, greys, cameras)
 
@@ -34,7 +39,16 @@ class _Patches(torch.autograd.Function):
         values, inside = np.empty(len(planes), np.float32), np.empty(len(planes), np.bool_)
         slopes = np.empty((len(planes), 4), np.float32)
         grey, other = (image.detach().contiguous().numpy() for image in greys)
-        _compare(planes, pixels.contiguous().numpy(), grey, other, cameras.astype(np.float32), values, inside, slopes)
+        _compare(
+            planes,
+            pixels.contiguous().numpy(),
+            grey,
+            other,
+            cameras.astype(np.float32),
+            values,
+            inside,
+            slopes,
+        )
         ctx.save_for_backward(torch.from_numpy(slopes))
         inside = torch.from_numpy(inside)
         ctx.mark_non_differentiable(inside)
@@ -48,13 +62,17 @@ class _Patches(torch.autograd.Function):
 
 @numba.njit(parallel=True, cache=True, fastmath=True)
 def _compare(planes, pixels, grey, other, camera, values, inside, slopes):
-    """Fill values, inside and slopes (d value / d (n, d)) patch by patch; a patch that leaves an image has value 1 and slope 0."""
+    """Fill values, inside and slopes (d value / d (n, d)) patch by patch; a patch that leaves an image has
+    value 1 and slope 0.
+    """
     for patch in numba.prange(len(planes)):
         column, row = pixels[patch, 0], pixels[patch, 1]
         values[patch] = 1
         slopes[patch] = 0
         within = 3 <= column < grey.shape[1] - 3 and 3 <= row < grey.shape[0] - 3
-        inside[patch] = within and _compare_one(planes[patch], column, row, grey, other, camera, values[patch:], slopes[patch])
+        inside[patch] = within and _compare_one(
+            planes[patch], column, row, grey, other, camera, values[patch:], slopes[patch]
+        )
 
 
 @numba.njit(cache=True, fastmath=True, inline="always")
@@ -82,14 +100,25 @@ def _compare_one(plane, column, row, grey, other, camera, value, slope):
             return False
         left, top = min(int(u - half), other.shape[1] - 2), min(int(v - half), other.shape[0] - 2)
         fu, fv = u - half - np.float32(left), v - half - np.float32(top)
-        b00, b01, b10, b11 = other[top, left], other[top, left + 1], other[top + 1, left], other[top + 1, left + 1]
+        b00, b01, b10, b11 = (
+            other[top, left],
+            other[top, left + 1],
+            other[top + 1, left],
+            other[top + 1, left + 1],
+        )
         a, b = grey[i, j], (one - fv) * (b00 + fu * (b01 - b00)) + fv * (b10 + fu * (b11 - b10))
         c0 = ((one - fv) * (b01 - b00) + fv * (b11 - b10)) * camera[4] / q2
         c1 = ((one - fu) * (b10 - b00) + fu * (b11 - b01)) * camera[5] / q2
         c2 = -(c0 * p0 + c1 * p1)
         by_along = -(c0 * t0 + c1 * t1 + c2 * t2)
         d0, d1, d2, d3 = by_along * x, by_along * y, by_along, c0 * r0 + c1 * r1 + c2 * r2
-        sum_a, sum_b, sum_aa, sum_bb, sum_ab = sum_a + a, sum_b + b, sum_aa + a * a, sum_bb + b * b, sum_ab + a * b
+        sum_a, sum_b, sum_aa, sum_bb, sum_ab = (
+            sum_a + a,
+            sum_b + b,
+            sum_aa + a * a,
+            sum_bb + b * b,
+            sum_ab + a * b,
+        )
         g0, g1, g2, g3 = g0 + d0, g1 + d1, g2 + d2, g3 + d3
         ag0, ag1, ag2, ag3 = ag0 + a * d0, ag1 + a * d1, ag2 + a * d2, ag3 + a * d3
         bg0, bg1, bg2, bg3 = bg0 + b * d0, bg1 + b * d1, bg2 + b * d2, bg3 + b * d3

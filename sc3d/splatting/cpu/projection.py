@@ -1,12 +1,18 @@
-"""Numba kernels that turn Gaussians into screen-space records, and gradients of records into gradients of Gaussians.
+"""Numba kernels that turn Gaussians into screen-space records, and gradients of records into gradients of
+Gaussians.
 
-The exponent of a splat is written with the Schur complement of its 2D covariance S instead of its inverse: with dx, dy = pixel - mean,
+The exponent of a splat is written with the Schur complement of its 2D covariance S instead of its inverse:
+with dx, dy = pixel - mean,
     d^T S^-1 d = a u^2 + h dy^2,   u = dx - m dy,   a = Syy / det S,   h = 1 / Syy,   m = Sxy / Syy
-which needs two multiplications per pixel, has no cancellation for thin diagonal splats, and gives the pixel interval of a row at once.
+which needs two multiplications per pixel, has no cancellation for thin diagonal splats, and gives the pixel
+interval of a row at once.
 
-Record of a Gaussian, 16 float32 (64 bytes): mean x, y (px); m; a and h in units of 2^-x (times log2(e) / 2); log2 opacity; half extents in x and y
-(px) of the ellipse where alpha falls to 1/255; colour (3); normal (3) and plane distance, camera frame; dy of the right-most point of that ellipse.
-Arithmetic is float64 inside: far Gaussians of a large scene keep their place, and it costs nothing in scalar code.
+Record of a Gaussian, 16 float32 (64 bytes): mean x, y (px); m; a and h in units of 2^-x (times log2(e) / 2);
+log2 opacity; half extents in x and y
+(px) of the ellipse where alpha falls to 1/255; colour (3); normal (3) and plane distance, camera frame; dy of
+the right-most point of that ellipse.
+Arithmetic is float64 inside: far Gaussians of a large scene keep their place, and it costs nothing in scalar
+code.
 """
 
 from __future__ import annotations
@@ -22,7 +28,8 @@ NEAR = 0.01  # near plane, world units
 DILATION = 0.3  # px^2 added to the diagonal of the 2D covariance
 MIN_ALPHA = 1.0 / 255.0
 LOG2E_HALF = 0.5 * math.log2(math.e)
-_REACH = math.sqrt(2.0 * math.log(255.0)) + 0.01  # standard deviations at which an opaque splat falls to 1/255
+# standard deviations at which an opaque splat falls to 1/255
+_REACH = math.sqrt(2.0 * math.log(255.0)) + 0.01
 _SLACK = 1e-3  # extents are this much too large (in log2 alpha), so that rounding never hides a fragment
 
 _C1 = 0.4886025119029199
@@ -71,40 +78,71 @@ def _basis_slopes(degree, x, y, z, slopes):
         slopes[12, 2] = _C3[3] * (6 * z * z - 3 * x * x - 3 * y * y)
         slopes[13, 0] = -_C3[2] * (4 * z * z - 3 * x * x - y * y)
         slopes[13, 1], slopes[13, 2] = 2 * _C3[2] * x * y, -8 * _C3[2] * x * z
-        slopes[14, 0], slopes[14, 1], slopes[14, 2] = 2 * _C3[4] * x * z, -2 * _C3[4] * y * z, _C3[4] * (x * x - y * y)
+        slopes[14, 0], slopes[14, 1], slopes[14, 2] = (
+            2 * _C3[4] * x * z,
+            -2 * _C3[4] * y * z,
+            _C3[4] * (x * x - y * y),
+        )
         slopes[15, 0], slopes[15, 1], slopes[15, 2] = -3 * _C3[0] * (x * x - y * y), 6 * _C3[0] * x * y, 0.0
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _mean_cam(means, i, camera):
     x, y, z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-    return (camera[0] * x + camera[1] * y + camera[2] * z + camera[9],
-            camera[3] * x + camera[4] * y + camera[5] * z + camera[10],
-            camera[6] * x + camera[7] * y + camera[8] * z + camera[11])
+    return (
+        camera[0] * x + camera[1] * y + camera[2] * z + camera[9],
+        camera[3] * x + camera[4] * y + camera[5] * z + camera[10],
+        camera[6] * x + camera[7] * y + camera[8] * z + camera[11],
+    )
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _jacobian(x, y, z, camera):
-    """The four non-zero entries of d pixel / d mean_cam, with x / z and y / z clamped; and whether each was inside its limits."""
+    """The four non-zero entries of d pixel / d mean_cam, with x / z and y / z clamped; and whether each was
+    inside its limits.
+    """
     inverse = 1.0 / z
     slope_x, slope_y, j00, j11 = x * inverse, y * inverse, camera[12] * inverse, camera[13] * inverse
-    limited_x, limited_y = min(max(slope_x, camera[21]), camera[22]), min(max(slope_y, camera[23]), camera[24])
+    limited_x, limited_y = (
+        min(max(slope_x, camera[21]), camera[22]),
+        min(max(slope_y, camera[23]), camera[24]),
+    )
     return j00, j11, -j00 * limited_x, -j11 * limited_y, limited_x == slope_x, limited_y == slope_y
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _axes_cam(quats, i, camera, rotation, axes):
     """rotation (3, 3) world_from_gaussian and axes = cam_from_world @ rotation; returns 1 / |quat|."""
-    w, x, y, z = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+    w, x, y, z = (
+        np.float64(quats[i, 0]),
+        np.float64(quats[i, 1]),
+        np.float64(quats[i, 2]),
+        np.float64(quats[i, 3]),
+    )
     scale = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     w, x, y, z = w * scale, x * scale, y * scale, z * scale
-    rotation[0, 0], rotation[0, 1], rotation[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    rotation[1, 0], rotation[1, 1], rotation[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    rotation[2, 0], rotation[2, 1], rotation[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    rotation[0, 0], rotation[0, 1], rotation[0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    rotation[1, 0], rotation[1, 1], rotation[1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    rotation[2, 0], rotation[2, 1], rotation[2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
     for row in range(3):
         for column in range(3):
-            axes[row, column] = (camera[3 * row] * rotation[0, column] + camera[3 * row + 1] * rotation[1, column]
-                                 + camera[3 * row + 2] * rotation[2, column])
+            axes[row, column] = (
+                camera[3 * row] * rotation[0, column]
+                + camera[3 * row + 1] * rotation[1, column]
+                + camera[3 * row + 2] * rotation[2, column]
+            )
     return scale
 
 
@@ -134,7 +172,11 @@ def _covariance(axes, scales, j00, j11, j02, j12, rows):
 def _touches(centre, half, size):
     """Whether [centre - half, centre + half] holds a pixel centre of 0.5, 1.5, ... size - 0.5; False for NaN."""
     low, high = centre - half, centre + half
-    return low <= size - 0.5 and high >= 0.5 and math.ceil(max(low, 0.5) - 0.5) <= math.floor(min(high, size - 0.5) - 0.5)
+    return (
+        low <= size - 0.5
+        and high >= 0.5
+        and math.ceil(max(low, 0.5) - 0.5) <= math.floor(min(high, size - 0.5) - 0.5)
+    )
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -146,17 +188,40 @@ def _colour(sh, degree, i, basis, channel):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _project_one(i, means, log_scales, quats, opacity_logits, sh, degree, camera, rotation, axes, scales, rows, basis, records):
-    """Fills the record of Gaussian i; returns (depth, 3 sigma radius in px), both 0 if it cannot touch the image."""
+def _project_one(
+    i,
+    means,
+    log_scales,
+    quats,
+    opacity_logits,
+    sh,
+    degree,
+    camera,
+    rotation,
+    axes,
+    scales,
+    rows,
+    basis,
+    records,
+):
+    """Fills the record of Gaussian i; returns (depth, 3 sigma radius in px), both 0 if it cannot touch the
+    image.
+    """
     x, y, z = _mean_cam(means, i, camera)
     if not z >= NEAR:
         return 0.0, 0.0
     width, height = camera[16], camera[17]
     j00, j11, j02, j12, _, _ = _jacobian(x, y, z, camera)
     mean_x, mean_y = j00 * x + camera[14], j11 * y + camera[15]
-    bound = _REACH * math.exp(max(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2]))  # a sphere around it, before any expensive work
+    # a sphere around it, before any expensive work
+    bound = _REACH * math.exp(max(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2]))
     half_x, half_y = bound * (j00 + abs(j02)) + _REACH, bound * (j11 + abs(j12)) + _REACH
-    if not (mean_x + half_x > 0.0 and mean_x - half_x < width and mean_y + half_y > 0.0 and mean_y - half_y < height):
+    if not (
+        mean_x + half_x > 0.0
+        and mean_x - half_x < width
+        and mean_y + half_y > 0.0
+        and mean_y - half_y < height
+    ):
         return 0.0, 0.0
     log_opacity = -math.log2(np.float32(1.0) + math.exp(-opacity_logits[i]))
     room = log_opacity - math.log2(MIN_ALPHA) + _SLACK
@@ -168,7 +233,12 @@ def _project_one(i, means, log_scales, quats, opacity_logits, sh, degree, camera
     sxx, sxy, syy = _covariance(axes, scales, j00, j11, j02, j12, rows)
     determinant = sxx * syy - sxy * sxy
     half_x, half_y = math.sqrt(room / LOG2E_HALF * sxx), math.sqrt(room / LOG2E_HALF * syy)
-    if not (determinant > 0.0 and math.isfinite(determinant) and _touches(mean_x, half_x, width) and _touches(mean_y, half_y, height)):
+    if not (
+        determinant > 0.0
+        and math.isfinite(determinant)
+        and _touches(mean_x, half_x, width)
+        and _touches(mean_y, half_y, height)
+    ):
         return 0.0, 0.0
     distance = math.sqrt(x * x + y * y + z * z)
     if degree > 0:
@@ -178,7 +248,11 @@ def _project_one(i, means, log_scales, quats, opacity_logits, sh, degree, camera
     facing = axes[0, axis] * x + axes[1, axis] * y + axes[2, axis] * z
     sign = -1.0 if facing > 0.0 else 1.0
     records[i, 0], records[i, 1], records[i, 2] = mean_x, mean_y, sxy / syy
-    records[i, 3], records[i, 4], records[i, 5] = LOG2E_HALF * syy / determinant, LOG2E_HALF / syy, log_opacity
+    records[i, 3], records[i, 4], records[i, 5] = (
+        LOG2E_HALF * syy / determinant,
+        LOG2E_HALF / syy,
+        log_opacity,
+    )
     records[i, 6], records[i, 7], records[i, 15] = half_x, half_y, half_x * sxy / sxx
     for k in range(3):
         records[i, 8 + k] = max(_colour(sh, degree, i, basis, k), 0.0)
@@ -190,15 +264,37 @@ def _project_one(i, means, log_scales, quats, opacity_logits, sh, degree, camera
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
 def project(means, log_scales, quats, opacity_logits, sh, degree, camera, order, records, depths, radii):
-    """Records (N, 16), camera depths (N,) and 3 sigma radii (N,), px; 0 where a Gaussian cannot touch the image.
+    """Records (N, 16), camera depths (N,) and 3 sigma radii (N,), px; 0 where a Gaussian cannot touch the
+    image.
 
-    camera: (25,) float64: rotation (9, row-major), translation (3), fx, fy, cx, cy, width, height, camera centre (3), and the limits of
+    camera: (25,) float64: rotation (9, row-major), translation (3), fx, fy, cx, cy, width, height, camera
+        centre (3), and the limits of
         x / z (2) and y / z (2) beyond which the Jacobian is that of the limit
     order: permutation of the chunks, for balance between threads
     """
     count = means.shape[0]
     for item in numba.prange(order.shape[0]):
-        rotation, axes, scales, rows, basis = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty((2, 3)), np.full(16, _C0)
+        rotation, axes, scales, rows, basis = (
+            np.empty((3, 3)),
+            np.empty((3, 3)),
+            np.empty(3),
+            np.empty((2, 3)),
+            np.full(16, _C0),
+        )
         for i in range(order[item] * CHUNK, min(count, (order[item] + 1) * CHUNK)):
             depths[i], radii[i] = _project_one(
-                i, means, log_scales, quats, opacity_logits, sh, degree, camera, rotation, axes, scales, rows, basis, records)
+                i,
+                means,
+                log_scales,
+                quats,
+                opacity_logits,
+                sh,
+                degree,
+                camera,
+                rotation,
+                axes,
+                scales,
+                rows,
+                basis,
+                records,
+            )

@@ -1,4 +1,6 @@
-"""Numba kernels: from per-instance raster gradients to gradients of the five parameter tensors (reverse of `kernels_project`)."""
+"""Numba kernels: from per-instance raster gradients to gradients of the five parameter tensors (reverse of
+`kernels_project`).
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,10 @@ from sc3d.splatting.cpu.projection import (
     _smallest,
 )
 
-# sums over pixels in one raster gradient record; s = d loss / d ln(alpha), w = weight, g = d loss / d output channel
-SUMS = 16  # s, s u, s u^2, s dy, s u dy, s dy^2, |ds/dx|, |ds/dy|, w g (colour 3, normal 3, plane distance), spare
+# sums over pixels in one raster gradient record; s = d loss / d ln(alpha), w = weight, g = d loss / d output
+# channel
+# s, s u, s u^2, s dy, s u dy, s dy^2, |ds/dx|, |ds/dy|, w g (colour 3, normal 3, plane distance), spare
+SUMS = 16
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -44,7 +48,9 @@ def _plane_gradient(sums, axes, axis, x, y, z, grad_axes, grad_mean):
 
 @numba.njit(cache=True, error_model="numpy")
 def _colour_gradient(i, sums, means, sh, degree, camera, basis, slopes, grad_sh, grad_means):
-    """Gradient of the SH coefficients, and of the mean through the viewing direction. Channels clamped at 0 have none."""
+    """Gradient of the SH coefficients, and of the mean through the viewing direction. Channels clamped at 0
+    have none.
+    """
     dx, dy, dz = means[i, 0] - camera[18], means[i, 1] - camera[19], means[i, 2] - camera[20]
     distance = math.sqrt(dx * dx + dy * dy + dz * dz)
     dx, dy, dz = dx / distance, dy / distance, dz / distance
@@ -71,9 +77,24 @@ def _quat_gradient(i, quats, scale, g, grad_quats):
     """Gradient of the unnormalised quaternion from g (3, 3), that of the rotation matrix; scale = 1 / |quat|."""
     w, x, y, z = quats[i, 0] * scale, quats[i, 1] * scale, quats[i, 2] * scale, quats[i, 3] * scale
     gw = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
-    gx = 2 * (y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]) - 2 * x * (g[1, 1] + g[2, 2]))
-    gy = 2 * (x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) + w * (g[0, 2] - g[2, 0]) - 2 * y * (g[0, 0] + g[2, 2]))
-    gz = 2 * (x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) + w * (g[1, 0] - g[0, 1]) - 2 * z * (g[0, 0] + g[1, 1]))
+    gx = 2 * (
+        y * (g[0, 1] + g[1, 0])
+        + z * (g[0, 2] + g[2, 0])
+        + w * (g[2, 1] - g[1, 2])
+        - 2 * x * (g[1, 1] + g[2, 2])
+    )
+    gy = 2 * (
+        x * (g[0, 1] + g[1, 0])
+        + z * (g[1, 2] + g[2, 1])
+        + w * (g[0, 2] - g[2, 0])
+        - 2 * y * (g[0, 0] + g[2, 2])
+    )
+    gz = 2 * (
+        x * (g[0, 2] + g[2, 0])
+        + y * (g[1, 2] + g[2, 1])
+        + w * (g[1, 0] - g[0, 1])
+        - 2 * z * (g[0, 0] + g[1, 1])
+    )
     along = gw * w + gx * x + gy * y + gz * z
     grad_quats[i, 0], grad_quats[i, 1] = (gw - along * w) * scale, (gx - along * x) * scale
     grad_quats[i, 2], grad_quats[i, 3] = (gy - along * y) * scale, (gz - along * z) * scale
@@ -81,7 +102,9 @@ def _quat_gradient(i, quats, scale, g, grad_quats):
 
 @numba.njit(cache=True, error_model="numpy")
 def _screen_gradient(sums, a, h, m):
-    """Gradient of the 2D mean (x, y) and of Sxx, Sxy, Syy from the pixel sums (see `kernels_project` for a, h, m)."""
+    """Gradient of the 2D mean (x, y) and of Sxx, Sxy, Syy from the pixel sums (see `kernels_project` for a,
+    h, m).
+    """
     grad_x = a * sums[1]
     grad_y = h * sums[3] - m * grad_x
     grad_a, grad_h, grad_m = -0.5 * sums[2], -0.5 * sums[5], a * sums[4]
@@ -92,8 +115,12 @@ def _screen_gradient(sums, a, h, m):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _projection_gradient(screen, rows, axes, scales, jacobian, x, y, z, camera, grad_axes, grad_log_scales, grad_mean):
-    """Reverse of the 2D mean and covariance: adds to grad_axes (3, 3), grad_log_scales (3,) and grad_mean (3,), camera frame."""
+def _projection_gradient(
+    screen, rows, axes, scales, jacobian, x, y, z, camera, grad_axes, grad_log_scales, grad_mean
+):
+    """Reverse of the 2D mean and covariance: adds to grad_axes (3, 3), grad_log_scales (3,) and grad_mean
+    (3,), camera frame.
+    """
     grad_x, grad_y, grad_sxx, grad_sxy, grad_syy = screen
     j00, j11, j02, j12, free_x, free_y = jacobian
     g00, g11, g02, g12 = 0.0, 0.0, 0.0, 0.0
@@ -106,7 +133,11 @@ def _projection_gradient(screen, rows, axes, scales, jacobian, x, y, z, camera, 
         g11 += second * axes[1, k]
         g02 += first * axes[2, k]
         g12 += second * axes[2, k]
-        grad_axes[0, k], grad_axes[1, k], grad_axes[2, k] = j00 * first, j11 * second, j02 * first + j12 * second
+        grad_axes[0, k], grad_axes[1, k], grad_axes[2, k] = (
+            j00 * first,
+            j11 * second,
+            j02 * first + j12 * second,
+        )
     grad_mean[0] = j00 * grad_x
     grad_mean[1] = j11 * grad_y
     grad_mean[2] = -(j00 * x * grad_x + j11 * y * grad_y + j00 * g00 + j11 * g11 + j02 * g02 + j12 * g12) / z
@@ -120,17 +151,38 @@ def _projection_gradient(screen, rows, axes, scales, jacobian, x, y, z, camera, 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
 def project_backward(
-    visible, offsets, gradients, means, log_scales, quats, opacity_logits, sh, degree, camera,
-    grad_means, grad_log_scales, grad_quats, grad_opacity_logits, grad_sh, gradient, absolute_gradient,
+    visible,
+    offsets,
+    gradients,
+    means,
+    log_scales,
+    quats,
+    opacity_logits,
+    sh,
+    degree,
+    camera,
+    grad_means,
+    grad_log_scales,
+    grad_quats,
+    grad_opacity_logits,
+    grad_sh,
+    gradient,
+    absolute_gradient,
 ):
-    """Fills the rows of visible Gaussians in the five gradients (zero elsewhere) and in the two densification statistics.
+    """Fills the rows of visible Gaussians in the five gradients (zero elsewhere) and in the two densification
+    statistics.
 
     visible: (M,) Gaussian ids; offsets: (M + 1,) first raster gradient of each in gradients (P, 16)
     """
     count = visible.shape[0]
     for item in numba.prange((count + CHUNK - 1) // CHUNK):
         rotation, axes, scales, rows = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty((2, 3))
-        grad_axes, grad_rotation, grad_scales, grad_mean = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+        grad_axes, grad_rotation, grad_scales, grad_mean = (
+            np.empty((3, 3)),
+            np.empty((3, 3)),
+            np.empty(3),
+            np.empty(3),
+        )
         basis, slopes, sums = np.empty(16), np.empty((16, 3)), np.empty(SUMS)
         for rank in range(item * CHUNK, min(count, (item + 1) * CHUNK)):
             i = visible[rank]
@@ -140,15 +192,27 @@ def project_backward(
             scale = _axes_cam(quats, i, camera, rotation, axes)
             for k in range(3):
                 scales[k] = math.exp(log_scales[i, k])
-            sxx, sxy, syy = _covariance(axes, scales, jacobian[0], jacobian[1], jacobian[2], jacobian[3], rows)
+            sxx, sxy, syy = _covariance(
+                axes, scales, jacobian[0], jacobian[1], jacobian[2], jacobian[3], rows
+            )
             screen = _screen_gradient(sums, syy / (sxx * syy - sxy * sxy), 1.0 / syy, sxy / syy)
-            _projection_gradient(screen, rows, axes, scales, jacobian, x, y, z, camera, grad_axes, grad_scales, grad_mean)
+            _projection_gradient(
+                screen, rows, axes, scales, jacobian, x, y, z, camera, grad_axes, grad_scales, grad_mean
+            )
             _plane_gradient(sums, axes, _smallest(log_scales, i), x, y, z, grad_axes, grad_mean)
             for row in range(3):
                 grad_log_scales[i, row] = grad_scales[row]
-                grad_means[i, row] = camera[row] * grad_mean[0] + camera[3 + row] * grad_mean[1] + camera[6 + row] * grad_mean[2]
+                grad_means[i, row] = (
+                    camera[row] * grad_mean[0]
+                    + camera[3 + row] * grad_mean[1]
+                    + camera[6 + row] * grad_mean[2]
+                )
                 for k in range(3):
-                    grad_rotation[row, k] = camera[row] * grad_axes[0, k] + camera[3 + row] * grad_axes[1, k] + camera[6 + row] * grad_axes[2, k]
+                    grad_rotation[row, k] = (
+                        camera[row] * grad_axes[0, k]
+                        + camera[3 + row] * grad_axes[1, k]
+                        + camera[6 + row] * grad_axes[2, k]
+                    )
             _quat_gradient(i, quats, scale, grad_rotation, grad_quats)
             _colour_gradient(i, sums, means, sh, degree, camera, basis, slopes, grad_sh, grad_means)
             grad_opacity_logits[i] = sums[0] / (1.0 + math.exp(opacity_logits[i]))

@@ -1,9 +1,13 @@
 """Numba kernels that composite tiles front to back.
 
-Inside a tile the Gaussian is the outer loop, its rows come next, and runs of 8 pixels between the ends of its ellipse are the inner one.
-All pixel state of a tile lives in one small flat buffer, plane after plane, with rows padded so that a run may start at any column;
-padding and pixels outside the image have transmittance 0 and so never count. See `kernels_project` for the record and its u, m, a, h.
-`kernels_unraster` repeats the walk: what decides whether a fragment counts is the same operations in both, so both see the same fragments.
+Inside a tile the Gaussian is the outer loop, its rows come next, and runs of 8 pixels between the ends of its
+ellipse are the inner one.
+All pixel state of a tile lives in one small flat buffer, plane after plane, with rows padded so that a run
+may start at any column;
+padding and pixels outside the image have transmittance 0 and so never count. See `kernels_project` for the
+record and its u, m, a, h.
+`kernels_unraster` repeats the walk: what decides whether a fragment counts is the same operations in both, so
+both see the same fragments.
 """
 
 from __future__ import annotations
@@ -72,7 +76,11 @@ def measure_rows(records, base, origin_x, origin_y, rows, columns, lines, ends):
     """
     mean_y, half_y = records[base + 1] - origin_y, records[base + 7]
     mean_x, slope = splat(records[base] - origin_x - _HALF), splat(records[base + 2])
-    minus_decay_y, log_opacity, inverse_decay = splat(-records[base + 4]), splat(records[base + 5]), splat(_ONE / records[base + 3])
+    minus_decay_y, log_opacity, inverse_decay = (
+        splat(-records[base + 4]),
+        splat(records[base + 5]),
+        splat(_ONE / records[base + 3]),
+    )
     for row in range(0, TILE, LANES):
         dy = ramp() + splat(np.float32(row) + _HALF - mean_y)
         peak, centre = fma(minus_decay_y * dy, dy, log_opacity), fma(slope, dy, mean_x)
@@ -87,8 +95,12 @@ def measure_rows(records, base, origin_x, origin_y, rows, columns, lines, ends):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _forward_tile(records, ranks, instances, first, last, origin_x, origin_y, rows, columns, geometry, pixels, contributions):
-    """Composites one tile into `pixels`; contributions (P, 2): sum of weights and largest transmittance of each instance."""
+def _forward_tile(
+    records, ranks, instances, first, last, origin_x, origin_y, rows, columns, geometry, pixels, contributions
+):
+    """Composites one tile into `pixels`; contributions (P, 2): sum of weights and largest transmittance of
+    each instance.
+    """
     lane, low, high, limit = ramp(), splat(LOG2_MIN_ALPHA), splat(MAX_ALPHA), splat(MIN_TRANSMITTANCE)
     lines, ends = np.empty(3 * TILE, np.float32), np.empty(2 * TILE, np.int32)
     for entry in range(first, last):
@@ -98,11 +110,20 @@ def _forward_tile(records, ranks, instances, first, last, origin_x, origin_y, ro
         first_row, last_row = measure_rows(records, base, origin_x, origin_y, rows, columns, lines, ends)
         minus_decay = splat(-records[base + 3])
         red, green, blue = splat(records[base + 8]), splat(records[base + 9]), splat(records[base + 10])
-        normal_x, normal_y, normal_z = splat(records[base + 11]), splat(records[base + 12]), splat(records[base + 13])
+        normal_x, normal_y, normal_z = (
+            splat(records[base + 11]),
+            splat(records[base + 12]),
+            splat(records[base + 13]),
+        )
         distance = splat(records[base + 14])
         weight, brightest = splat(_ZERO), splat(_ZERO)
         for row in range(first_row, last_row + 1):
-            column, end, centre, peak = np.int64(ends[row]), np.int64(ends[TILE + row]), lines[TILE + row], splat(lines[2 * TILE + row])
+            column, end, centre, peak = (
+                np.int64(ends[row]),
+                np.int64(ends[TILE + row]),
+                lines[TILE + row],
+                splat(lines[2 * TILE + row]),
+            )
             while column < end:
                 place = row * STRIDE + column
                 transmittance = load(pixels, place)
@@ -111,7 +132,9 @@ def _forward_tile(records, ranks, instances, first, last, origin_x, origin_y, ro
                     continue
                 u = lane + splat(np.float32(column) - centre)
                 exponent = fma(minus_decay * u, u, peak)
-                alpha = where_at_least(exponent, low, where_at_least(transmittance, limit, minimum(exp2(exponent), high)))
+                alpha = where_at_least(
+                    exponent, low, where_at_least(transmittance, limit, minimum(exp2(exponent), high))
+                )
                 w = alpha * transmittance
                 store(pixels, place, transmittance - w)
                 weight = weight + w
@@ -126,15 +149,20 @@ def _forward_tile(records, ranks, instances, first, last, origin_x, origin_y, ro
                     store(pixels, place + 7 * PLANE, fma(w, distance, load(pixels, place + 7 * PLANE)))
                 column += LANES
         instance, seen = np.int64(instances[entry]), largest(brightest)
-        contributions[instance, 0], contributions[instance, 1] = total(weight), seen if seen >= MIN_TRANSMITTANCE else _ZERO
+        contributions[instance, 0], contributions[instance, 1] = (
+            total(weight),
+            seen if seen >= MIN_TRANSMITTANCE else _ZERO,
+        )
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
 def rasterise(records, ranks, instances, starts, order, background, geometry, image, contributions):
     """Composites all tiles.
 
-    records: (M * 16,) in depth order; ranks, instances: (P,) tile by tile, starts (tiles + 1,); order: (tiles,) permutation, for balance
-    background: (3,); image: (8, H, W) filled with colour, normal, plane distance, alpha; contributions: (P, 2), zero on entry
+    records: (M * 16,) in depth order; ranks, instances: (P,) tile by tile, starts (tiles + 1,); order:
+        (tiles,) permutation, for balance
+    background: (3,); image: (8, H, W) filled with colour, normal, plane distance, alpha; contributions: (P,
+        2), zero on entry
     """
     height, width = image.shape[1], image.shape[2]
     tiles_x = (width + TILE - 1) // TILE
@@ -144,13 +172,27 @@ def rasterise(records, ranks, instances, starts, order, background, geometry, im
         rows, columns = min(TILE, height - top), min(TILE, width - left)
         pixels = np.empty(CHANNELS * PLANE, np.float32)
         open_tile(pixels, rows, columns)
-        _forward_tile(records, ranks, instances, starts[tile], starts[tile + 1], np.float32(left), np.float32(top), rows, columns, geometry,
-                      pixels, contributions)
+        _forward_tile(
+            records,
+            ranks,
+            instances,
+            starts[tile],
+            starts[tile + 1],
+            np.float32(left),
+            np.float32(top),
+            rows,
+            columns,
+            geometry,
+            pixels,
+            contributions,
+        )
         for row in range(rows):
             for column in range(columns):
                 place = row * STRIDE + column
                 for channel in range(3):
-                    image[channel, top + row, left + column] = pixels[place + (channel + 1) * PLANE] + pixels[place] * background[channel]
+                    image[channel, top + row, left + column] = (
+                        pixels[place + (channel + 1) * PLANE] + pixels[place] * background[channel]
+                    )
                 for channel in range(3, 7):
                     image[channel, top + row, left + column] = pixels[place + (channel + 1) * PLANE]
                 image[7, top + row, left + column] = _ONE - pixels[place]
@@ -158,7 +200,9 @@ def rasterise(records, ranks, instances, starts, order, background, geometry, im
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
 def collect_contributions(visible, offsets, contributions, weight, max_transmittance):
-    """Per Gaussian: sum of its instances' weights and largest transmittance; rows of invisible Gaussians are not touched."""
+    """Per Gaussian: sum of its instances' weights and largest transmittance; rows of invisible Gaussians are
+    not touched.
+    """
     for rank in numba.prange(visible.shape[0]):
         total_weight, largest_seen = 0.0, _ZERO
         for instance in range(offsets[rank], offsets[rank + 1]):

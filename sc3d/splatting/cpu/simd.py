@@ -1,7 +1,9 @@
-"""Eight float32 lanes as one numba value, so that kernels say themselves what is vectorised instead of hoping for LLVM.
+"""Eight float32 lanes as one numba value, so that kernels say themselves what is vectorised instead of hoping
+for LLVM.
 
 Only what the rasteriser and SSIM need. Everything maps to single LLVM instructions without fast-math flags:
-the same expression gives the same bits in every kernel, on which the agreement of forward and backward pass rests.
+the same expression gives the same bits in every kernel, on which the agreement of forward and backward pass
+rests.
 """
 
 from __future__ import annotations
@@ -37,10 +39,17 @@ class _LanesModel(models.PrimitiveModel):
 def _register(symbol, instruction: str, num_operands: int = 2) -> None:
     signature_ = signature(lanes, *[lanes] * num_operands)
     infer_global(symbol)(type(f"_{instruction}", (ConcreteTemplate,), {"cases": [signature_]}))
-    lower_builtin(symbol, *[lanes] * num_operands)(lambda context, builder, sig, args: getattr(builder, instruction)(*args))
+    lower_builtin(symbol, *[lanes] * num_operands)(
+        lambda context, builder, sig, args: getattr(builder, instruction)(*args)
+    )
 
 
-for _symbol, _instruction in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv")):
+for _symbol, _instruction in (
+    (operator.add, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.truediv, "fdiv"),
+):
     _register(_symbol, _instruction)
 
 
@@ -54,7 +63,9 @@ def _splat(builder, scalar):
 
 
 def _fma(builder, a, b, c):
-    function = get_or_insert_function(builder.module, ir.FunctionType(_FLOATS, [_FLOATS] * 3), f"llvm.fmuladd.v{LANES}f32")
+    function = get_or_insert_function(
+        builder.module, ir.FunctionType(_FLOATS, [_FLOATS] * 3), f"llvm.fmuladd.v{LANES}f32"
+    )
     return builder.call(function, [a, b, c])
 
 
@@ -71,83 +82,105 @@ def _shuffle(builder, a, b, order: list[int]):
 @intrinsic
 def load(typingctx, array, index):
     """Eight neighbours of a flat contiguous float32 array from `index`; no bounds check, any alignment."""
+
     def codegen(context, builder, sig, args):
         return builder.load(_address(context, builder, sig.args[0], args[0], sig.args[1], args[1]), align=4)
+
     return lanes(array, index), codegen
 
 
 @intrinsic
 def store(typingctx, array, index, value):
     """Write eight neighbours of a flat contiguous float32 array from `index`; no bounds check, any alignment."""
+
     def codegen(context, builder, sig, args):
-        builder.store(args[2], _address(context, builder, sig.args[0], args[0], sig.args[1], args[1]), align=4)
+        builder.store(
+            args[2], _address(context, builder, sig.args[0], args[0], sig.args[1], args[1]), align=4
+        )
         return context.get_dummy_value()
+
     return types.none(array, index, value), codegen
 
 
 @intrinsic
 def splat(typingctx, scalar):
     """All lanes equal to one number, rounded to float32."""
+
     def codegen(context, builder, sig, args):
         return _splat(builder, context.cast(builder, args[0], sig.args[0], types.float32))
+
     return lanes(scalar), codegen
 
 
 @intrinsic
 def ramp(typingctx):
     """0, 1, ... 7."""
+
     def codegen(context, builder, sig, args):
         return ir.Constant(_FLOATS, [float(lane) for lane in range(LANES)])
+
     return lanes(), codegen
 
 
 @intrinsic
 def fma(typingctx, a, b, c):
     """a * b + c, with one rounding where the processor has it."""
+
     def codegen(context, builder, sig, args):
         return _fma(builder, *args)
+
     return lanes(a, b, c), codegen
 
 
 @intrinsic
 def minimum(typingctx, a, b):
     """Lane-wise minimum; b where a is NaN."""
+
     def codegen(context, builder, sig, args):
         return builder.select(builder.fcmp_ordered("<", *args), *args)
+
     return lanes(a, b), codegen
 
 
 @intrinsic
 def maximum(typingctx, a, b):
     """Lane-wise maximum; b where a is NaN."""
+
     def codegen(context, builder, sig, args):
         return builder.select(builder.fcmp_ordered(">", *args), *args)
+
     return lanes(a, b), codegen
 
 
 @intrinsic
 def absolute(typingctx, a):
     """Lane-wise |a|."""
+
     def codegen(context, builder, sig, args):
         bits = builder.bitcast(args[0], _INTS)
         return builder.bitcast(builder.and_(bits, ir.Constant(_INTS, [0x7FFFFFFF] * LANES)), _FLOATS)
+
     return lanes(a), codegen
 
 
 @intrinsic
 def where_at_least(typingctx, a, b, value):
     """`value` in the lanes where a >= b, else 0 (also where a or b is NaN)."""
+
     def codegen(context, builder, sig, args):
         return builder.select(builder.fcmp_ordered(">=", args[0], args[1]), args[2], _constant(0.0))
+
     return lanes(a, b, value), codegen
 
 
 @intrinsic
 def any_at_least(typingctx, a, b):
     """True if a >= b in any lane."""
+
     def codegen(context, builder, sig, args):
         bits = builder.bitcast(builder.fcmp_ordered(">=", args[0], args[1]), ir.IntType(LANES))
         return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
+
     return types.boolean(a, b), codegen
 
 
@@ -159,6 +192,7 @@ _ROUND = 12582912.0  # 1.5 * 2^23: adding it leaves the nearest integer in the l
 @intrinsic
 def exp2(typingctx, x):
     """2^x for -126 < x < 127, relative error about 2e-7; outside that range the result is meaningless."""
+
     def codegen(context, builder, sig, args):
         shifted = builder.fadd(args[0], _constant(_ROUND))
         fraction = builder.fsub(args[0], builder.fsub(shifted, _constant(_ROUND)))
@@ -167,21 +201,28 @@ def exp2(typingctx, x):
             power = _fma(builder, power, fraction, _constant(coefficient))
         exponent = builder.shl(builder.bitcast(shifted, _INTS), ir.Constant(_INTS, [23] * LANES))
         return builder.bitcast(builder.add(builder.bitcast(power, _INTS), exponent), _FLOATS)
+
     return lanes(x), codegen
 
 
 @intrinsic
 def sums(typingctx, a, b, c, d, e, f, g, h):
     """The eight sums over lanes of eight vectors, as one vector; always added in the same order."""
+
     def codegen(context, builder, sig, args):
-        stages = [([0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]),
-                  ([0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]),
-                  ([0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15])]
+        stages = [
+            ([0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]),
+            ([0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]),
+            ([0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15]),
+        ]
         vectors = list(args)
         for low, high in stages:
             pairs = zip(vectors[::2], vectors[1::2], strict=True)
-            vectors = [builder.fadd(_shuffle(builder, p, q, low), _shuffle(builder, p, q, high)) for p, q in pairs]
+            vectors = [
+                builder.fadd(_shuffle(builder, p, q, low), _shuffle(builder, p, q, high)) for p, q in pairs
+            ]
         return vectors[0]
+
     return lanes(a, b, c, d, e, f, g, h), codegen
 
 
@@ -195,34 +236,44 @@ def _reduce(builder, vector, combine):
 @intrinsic
 def store_whole(typingctx, array, index, value):
     """Write the lanes, truncated towards zero, to a flat contiguous int32 array from `index`."""
+
     def codegen(context, builder, sig, args):
         data = context.make_array(sig.args[0])(context, builder, args[0]).data
         place = builder.gep(data, [context.cast(builder, args[1], sig.args[1], types.int64)])
         builder.store(builder.fptosi(args[2], _INTS), builder.bitcast(place, _INTS.as_pointer()), align=4)
         return context.get_dummy_value()
+
     return types.none(array, index, value), codegen
 
 
 @intrinsic
 def root(typingctx, a):
     """Lane-wise square root."""
+
     def codegen(context, builder, sig, args):
-        function = get_or_insert_function(builder.module, ir.FunctionType(_FLOATS, [_FLOATS]), f"llvm.sqrt.v{LANES}f32")
+        function = get_or_insert_function(
+            builder.module, ir.FunctionType(_FLOATS, [_FLOATS]), f"llvm.sqrt.v{LANES}f32"
+        )
         return builder.call(function, args)
+
     return lanes(a), codegen
 
 
 @intrinsic
 def total(typingctx, a):
     """Sum over lanes, float32."""
+
     def codegen(context, builder, sig, args):
         return _reduce(builder, args[0], builder.fadd)
+
     return types.float32(a), codegen
 
 
 @intrinsic
 def largest(typingctx, a):
     """Maximum over lanes, float32."""
+
     def codegen(context, builder, sig, args):
         return _reduce(builder, args[0], lambda p, q: builder.select(builder.fcmp_ordered(">", p, q), p, q))
+
     return types.float32(a), codegen

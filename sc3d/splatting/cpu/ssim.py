@@ -1,7 +1,9 @@
 """SSIM and the image loss 0.8 L1 + 0.2 (1 - SSIM) as fused kernels with an analytic backward pass.
 
-Window 11, sigma 1.5, zero padding, constants 0.01^2 and 0.03^2: the same numbers as an 11 x 11 grouped convolution. With mx, my, P, Q = blurs of
-x, y, x^2 + y^2, x y:   S = A1 A2 / (B1 B2),  A1 = 2 mx my + c1,  A2 = 2 (Q - mx my) + c2,  B1 = mx^2 + my^2 + c1,  B2 = P - mx^2 - my^2 + c2,
+Window 11, sigma 1.5, zero padding, constants 0.01^2 and 0.03^2: the same numbers as an 11 x 11 grouped
+convolution. With mx, my, P, Q = blurs of
+x, y, x^2 + y^2, x y:   S = A1 A2 / (B1 B2),  A1 = 2 mx my + c1,  A2 = 2 (Q - mx my) + c2,  B1 = mx^2 + my^2 +
+c1,  B2 = P - mx^2 - my^2 + c2,
 and since the window is symmetric   d sum(S) / dx = blur(dS/dmx) + 2 x blur(dS/dP) + y blur(dS/dQ).
 """
 
@@ -21,7 +23,9 @@ _ROWS, _COLUMNS = 64, 128  # block of one work item; 11 rows of it stay in the f
 _WIDTH = _COLUMNS + 2 * _HALO
 _PLANE = (_ROWS + 2 * _RADIUS) * _WIDTH
 _WEIGHTS = np.exp(-0.5 * (np.arange(_RADIUS + 1) / 1.5) ** 2)
-_W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(weight) for weight in _WEIGHTS / (_WEIGHTS[0] + 2 * _WEIGHTS[1:].sum()))
+_W0, _W1, _W2, _W3, _W4, _W5 = (
+    np.float32(weight) for weight in _WEIGHTS / (_WEIGHTS[0] + 2 * _WEIGHTS[1:].sum())
+)
 _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
 _ZERO = np.float32(0.0)
 
@@ -32,9 +36,11 @@ def ssim_loss(image: Tensor, target: Tensor) -> Tensor:
 
 
 def image_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """(1 - ssim_weight) mean |image - target| + ssim_weight (1 - mean SSIM) of two (H, W, 3) images; differentiable in `image` only.
+    """(1 - ssim_weight) mean |image - target| + ssim_weight (1 - mean SSIM) of two (H, W, 3) images;
+    differentiable in `image` only.
 
-    Fastest for float32 images stored plane by plane (as `render` returns them), e.g. `target.permute(2, 0, 1).contiguous().permute(1, 2, 0)`.
+    Fastest for float32 images stored plane by plane (as `render` returns them), e.g. `target.permute(2, 0,
+    1).contiguous().permute(1, 2, 0)`.
     """
     if device.has_kernels(image):
         return _ImageLoss.apply(image, target, 1.0 - ssim_weight, ssim_weight)
@@ -53,7 +59,9 @@ def image_loss_torch(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
 
 def _blurred(planes: Tensor) -> Tensor:
     """(P, H, W) planes under the window, zero outside."""
-    taps = planes.new_tensor(np.concatenate([_WEIGHTS[:0:-1], _WEIGHTS]) / (_WEIGHTS[0] + 2 * _WEIGHTS[1:].sum()))
+    taps = planes.new_tensor(
+        np.concatenate([_WEIGHTS[:0:-1], _WEIGHTS]) / (_WEIGHTS[0] + 2 * _WEIGHTS[1:].sum())
+    )
     down = torch.nn.functional.conv2d(planes[:, None], taps[None, None, :, None], padding=(_RADIUS, 0))
     return torch.nn.functional.conv2d(down, taps[None, None, None, :], padding=(0, _RADIUS))[:, 0]
 
@@ -72,7 +80,15 @@ class _ImageLoss(torch.autograd.Function):
         difference, similarity = sums.sum(axis=0) / x.size
         if ctx.needs_input_grad[0]:
             gradient = torch.empty(channels, height, width)
-            _similarity_slope(x, y, blocks, slopes, np.float32(l1_weight / x.size), np.float32(-ssim_weight / x.size), gradient.numpy())
+            _similarity_slope(
+                x,
+                y,
+                blocks,
+                slopes,
+                np.float32(l1_weight / x.size),
+                np.float32(-ssim_weight / x.size),
+                gradient.numpy(),
+            )
             ctx.save_for_backward(gradient)
         return image.new_tensor(l1_weight * difference + ssim_weight * (1.0 - similarity))
 
@@ -106,12 +122,12 @@ def _fill(plane, width, top, left, buffer, offset):
     for row in range(_ROWS + 2 * _RADIUS):
         y, base = top + row - _RADIUS, offset + row * _WIDTH
         if y < 0 or y >= height:
-            buffer[base:base + _WIDTH] = _ZERO
+            buffer[base : base + _WIDTH] = _ZERO
         else:
             shift = base - (left - _HALO)
-            buffer[base:shift + first] = _ZERO
-            buffer[shift + first:shift + last] = plane[y, first:last]
-            buffer[shift + last:base + _WIDTH] = _ZERO
+            buffer[base : shift + first] = _ZERO
+            buffer[shift + first : shift + last] = plane[y, first:last]
+            buffer[shift + last : base + _WIDTH] = _ZERO
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -142,7 +158,11 @@ def _similarity_block(buffer, lines, flat, place, plane_size, stride, rows, colu
             value = a1 * a2 * inverse
             inverse_b2 = b1 * inverse
             target = place + row * stride + column
-            store(flat, target, two * fma(mean_y * (a2 - a1), inverse, value * mean_x * (inverse_b2 - b2 * inverse)))
+            store(
+                flat,
+                target,
+                two * fma(mean_y * (a2 - a1), inverse, value * mean_x * (inverse_b2 - b2 * inverse)),
+            )
             store(flat, target + plane_size, splat(_ZERO) - value * inverse_b2)
             store(flat, target + 2 * plane_size, two * a1 * inverse)
             inside, left = splat(np.float32(columns - 1 - column)), ramp()
@@ -170,7 +190,15 @@ def _similarity(x, y, blocks, slopes, sums):
             store(buffer, place + 3 * _PLANE, a * b)
         rows, columns = min(_ROWS, height - top), min(_COLUMNS, width - left)
         sums[item, 0], sums[item, 1] = _similarity_block(
-            buffer, lines, flat, (channel * height + top) * stride + left, channels * height * stride, stride, rows, columns)
+            buffer,
+            lines,
+            flat,
+            (channel * height + top) * stride + left,
+            channels * height * stride,
+            stride,
+            rows,
+            columns,
+        )
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -186,10 +214,14 @@ def _slope_block(buffer, lines, line, l1_weight, ssim_weight, gradient, top, lef
         for column in range(0, columns, LANES):
             here = _HALO + column
             x, y = load(buffer, 3 * _PLANE + base + here), load(buffer, 4 * _PLANE + base + here)
-            slope = fma(x + x, _blur(lines, here + _WIDTH, 1), fma(y, _blur(lines, here + 2 * _WIDTH, 1), _blur(lines, here, 1)))
+            slope = fma(
+                x + x,
+                _blur(lines, here + _WIDTH, 1),
+                fma(y, _blur(lines, here + 2 * _WIDTH, 1), _blur(lines, here, 1)),
+            )
             sign = where_at_least(x - y, tiny, one) - where_at_least(y - x, tiny, one)
             store(line, column, fma(weight, slope, absolute_weight * sign))
-        gradient[top + row, left:left + columns] = line[:columns]
+        gradient[top + row, left : left + columns] = line[:columns]
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
@@ -198,7 +230,11 @@ def _similarity_slope(x, y, blocks, slopes, l1_weight, ssim_weight, gradient):
     height, width = x.shape[1], x.shape[2]
     for item in numba.prange(blocks[0] * blocks[1] * blocks[2]):
         channel, top, left = _block(item, blocks)
-        buffer, lines, line = np.empty(5 * _PLANE, np.float32), np.empty(3 * _WIDTH, np.float32), np.empty(_COLUMNS, np.float32)
+        buffer, lines, line = (
+            np.empty(5 * _PLANE, np.float32),
+            np.empty(3 * _WIDTH, np.float32),
+            np.empty(_COLUMNS, np.float32),
+        )
         for plane in range(3):
             _fill(slopes[plane, channel], width, top, left, buffer, plane * _PLANE)
         _fill(x[channel], width, top, left, buffer, 3 * _PLANE)

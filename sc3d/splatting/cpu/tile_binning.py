@@ -1,7 +1,9 @@
 """Numba kernels that sort records into tiles of 16 x 16 px: which Gaussians touch which tile, front to back.
 
-An *instance* is a (Gaussian, tile) pair. Instances are numbered Gaussian by Gaussian, so that what each of them sums up can be added per Gaussian
-in a fixed order, whatever the number of threads. Only tiles that the ellipse of alpha >= 1/255 really touches are listed.
+An *instance* is a (Gaussian, tile) pair. Instances are numbered Gaussian by Gaussian, so that what each of
+them sums up can be added per Gaussian
+in a fixed order, whatever the number of threads. Only tiles that the ellipse of alpha >= 1/255 really touches
+are listed.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ import numpy as np
 from sc3d.splatting.cpu.projection import MIN_ALPHA
 
 TILE = 16
-ROOM = np.float32(-math.log2(MIN_ALPHA) + 5e-4)  # log2 alpha above 1/255; half the slack of the extents in `kernels_project`
+# log2 alpha above 1/255; half the slack of the extents in `kernels_project`
+ROOM = np.float32(-math.log2(MIN_ALPHA) + 5e-4)
 _HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0.0), np.float32(1.0)
 
 
@@ -23,7 +26,8 @@ def first_pixel(low, limit):
     """Smallest pixel index >= 0 whose centre is >= low, at most limit."""
     place = min(max(low - _HALF, _ZERO), np.float32(limit))
     whole = np.int64(place)
-    return whole + np.int64(np.float32(whole) < place)  # math.ceil would be a library call in the innermost loops
+    # math.ceil would be a library call in the innermost loops
+    return whole + np.int64(np.float32(whole) < place)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -35,12 +39,16 @@ def last_pixel(high, limit):
 @numba.njit(cache=True, error_model="numpy")
 def _tile_rows(record, height):
     """First and last tile row that the ellipse of a record touches."""
-    return first_pixel(record[1] - record[7], height) // TILE, last_pixel(record[1] + record[7], height - 1) // TILE
+    return first_pixel(record[1] - record[7], height) // TILE, last_pixel(
+        record[1] + record[7], height - 1
+    ) // TILE
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _tile_columns(record, tile_row, width, height):
-    """First and last tile column that the ellipse touches between the first and last pixel centre of a tile row; empty if first > last."""
+    """First and last tile column that the ellipse touches between the first and last pixel centre of a tile
+    row; empty if first > last.
+    """
     mean_y, half_y, extreme = record[1], record[7], record[15]
     top = max(np.float32(tile_row * TILE) + _HALF - mean_y, -half_y)
     bottom = min(np.float32(min((tile_row + 1) * TILE, height)) - _HALF - mean_y, half_y)
@@ -58,7 +66,8 @@ def _tile_columns(record, tile_row, width, height):
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
 def count_instances(near_to_far, visible, all_records, records, width, height, histograms, counts):
-    """Copies records (M, 16) in depth order; counts tiles per Gaussian, and Gaussians per tile in each of several blocks of the depth order.
+    """Copies records (M, 16) in depth order; counts tiles per Gaussian, and Gaussians per tile in each of
+    several blocks of the depth order.
 
     near_to_far: (M,) order of visible (M,), the ids of all_records that matter
     counts: (M,) in the order of `visible`; histograms: (blocks, tiles), zero on entry
@@ -82,7 +91,9 @@ def count_instances(near_to_far, visible, all_records, records, width, height, h
 
 @numba.njit(cache=True, error_model="numpy")
 def place_blocks(histograms, starts):
-    """Turns counts (blocks, tiles) into each block's first place in each tile, tile by tile; starts (tiles + 1,)."""
+    """Turns counts (blocks, tiles) into each block's first place in each tile, tile by tile; starts (tiles +
+    1,).
+    """
     place = 0
     for tile in range(histograms.shape[1]):
         starts[tile] = place

@@ -1,4 +1,6 @@
-"""What the browser draws: the cloud in a node per class and step of detail, the splats in a node per class, and the cameras."""
+"""What the browser draws: the cloud in a node per class and step of detail, the splats in a node per class,
+and the cameras.
+"""
 
 from __future__ import annotations
 
@@ -27,16 +29,26 @@ _SEEING_COLOR = (0, 158, 115)  # of cameras that see the picked point
 
 
 class CloudLayer:
-    """The first points of a cloud, in chunks: what is added, hidden or recoloured is sent once, and the rest stays in the browser.
+    """The first points of a cloud, in chunks: what is added, hidden or recoloured is sent once, and the rest
+    stays in the browser.
 
     root: name of its node in the scene tree; node /ROOT/CLASS holds the chunks of a class
     """
 
-    def __init__(self, server: viser.ViserServer, shown: ShownCloud, root: str, by: Colouring, hidden: set[int] = frozenset()) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        shown: ShownCloud,
+        root: str,
+        by: Colouring,
+        hidden: set[int] = frozenset(),
+    ) -> None:
         self._scene, self._shown, self._by, self._relief, self._scale = server.scene, shown, by, True, 1.0
         self._root = server.scene.add_frame(f"/{root}", show_axes=False)
         self._classes = {
-            label: server.scene.add_frame(f"/{root}/{node_name(shown.class_table, label)}", show_axes=False, visible=label not in hidden)
+            label: server.scene.add_frame(
+                f"/{root}/{node_name(shown.class_table, label)}", show_axes=False, visible=label not in hidden
+            )
             for label in shown.class_counts
         }
         self._chunks: list[list[tuple[np.ndarray, viser.PointCloudHandle]]] = []
@@ -49,7 +61,9 @@ class CloudLayer:
 
     def show_points(self, count: int) -> None:
         """Show about the first `count` points: whole chunks, at least one."""
-        wanted = max(1, min(round(count / self._shown.chunk), -(-len(self._shown.points) // self._shown.chunk)))
+        wanted = max(
+            1, min(round(count / self._shown.chunk), -(-len(self._shown.points) // self._shown.chunk))
+        )
         with self._lock:
             for handles in self._chunks[wanted:]:
                 for _, handle in handles:
@@ -96,8 +110,12 @@ class CloudLayer:
             rows = start + np.flatnonzero(labels == label)
             if len(rows):
                 handle = self._scene.add_point_cloud(
-                    f"{node.name}/{number:02d}", self._shown.points[rows], colors[rows],
-                    point_size=self._point_size(), precision="float32", point_shading="flat",
+                    f"{node.name}/{number:02d}",
+                    self._shown.points[rows],
+                    colors[rows],
+                    point_size=self._point_size(),
+                    precision="float32",
+                    point_shading="flat",
                 )
                 handles.append((rows, handle))
         return handles
@@ -107,7 +125,12 @@ class SplatLayer:
     """The Gaussians, a node per class, or one node if they have no labels; loaded when they are first shown."""
 
     def __init__(
-        self, server: viser.ViserServer, load: Callable[[], ShownSplats], shown: ShownCloud, by: Colouring, hidden: set[int] = frozenset(),
+        self,
+        server: viser.ViserServer,
+        load: Callable[[], ShownSplats],
+        shown: ShownCloud,
+        by: Colouring,
+        hidden: set[int] = frozenset(),
     ) -> None:
         """load: reads them; shown: has the frame of the viewer and the class table"""
         self._server, self._load, self._shown, self._by, self._hidden = server, load, shown, by, set(hidden)
@@ -144,14 +167,22 @@ class SplatLayer:
         splats = self._splats = self._load()
         scene, gaussians, colors = self._server.scene, splats.gaussians, self._colors()
         self._root = scene.add_frame("/splats", show_axes=False)
-        means, opacities = gaussians.means.numpy() + (splats.origin - self._shown.origin), gaussians.opacities.numpy()[:, None]
+        means, opacities = (
+            gaussians.means.numpy() + (splats.origin - self._shown.origin),
+            gaussians.opacities.numpy()[:, None],
+        )
         covariances, unit = half_precision(gaussians.covariances.numpy())
         label = np.zeros(len(means), np.uint8) if splats.label is None else splats.label
         for present in np.unique(label).tolist():
             rows = np.flatnonzero(label == present)
             name = "all" if splats.label is None else node_name(self._shown.class_table, present)
             handle = scene.add_gaussian_splats(
-                f"/splats/{name}", (means[rows] / unit).astype(np.float32), covariances[rows], colors[rows], opacities[rows], scale=unit,
+                f"/splats/{name}",
+                (means[rows] / unit).astype(np.float32),
+                covariances[rows],
+                colors[rows],
+                opacities[rows],
+                scale=unit,
                 visible=splats.label is None or present not in self._hidden,
             )
             self._nodes[present] = rows, handle
@@ -172,8 +203,15 @@ class CameraLayer:
             pinhole = undistorted(view)
             fov, aspect = field_of_view(pinhole)
             handle = server.scene.add_camera_frustum(
-                f"/cameras/{Path(view.name).stem}", fov, aspect, thickness=_LINE_WIDTH, thickness_units="screen", color=LINE_COLOR,
-                wxyz=orientation(view), position=view.centre, variant="filled",
+                f"/cameras/{Path(view.name).stem}",
+                fov,
+                aspect,
+                thickness=_LINE_WIDTH,
+                thickness_units="screen",
+                color=LINE_COLOR,
+                wxyz=orientation(view),
+                position=view.centre,
+                variant="filled",
             )
             handle.scale = depth / handle.compute_canonical_frustum_size()[2]
             self._handles[view.name] = handle
@@ -210,10 +248,12 @@ def node_name(table: ClassTable | None, label: int) -> str:
 
 
 def half_precision(covariances: np.ndarray) -> tuple[np.ndarray, float]:
-    """Covariances in a unit in which they fit into the 16-bit floats that browsers get; splats beyond that are drawn smaller.
+    """Covariances in a unit in which they fit into the 16-bit floats that browsers get; splats beyond that
+    are drawn smaller.
 
     covariances: (N, 3, 3), world units squared
-    returns: (N, 3, 3) float32 in units squared; the unit, in world units: a few times the size of the median splat
+    returns: (N, 3, 3) float32 in units squared; the unit, in world units: a few times the size of the median
+        splat
     """
     squared = np.trace(covariances, axis1=1, axis2=2).astype(np.float64)
     unit = _SPLAT_UNIT * float(np.sqrt(np.median(squared))) if len(squared) else 1.0

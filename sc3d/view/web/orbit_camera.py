@@ -18,7 +18,9 @@ _NEAR, _FAR = 1 / 500, 50.0  # of the distance to what is looked at
 
 @dataclass(frozen=True)
 class OrbitPose:
-    """position, look_at: (3,), the latter in the middle of the picture and the point to turn around; up: (3,) unit; fov: vertical, radians."""
+    """position, look_at: (3,), the latter in the middle of the picture and the point to turn around; up: (3,)
+    unit; fov: vertical, radians.
+    """
 
     position: np.ndarray
     look_at: np.ndarray
@@ -27,7 +29,9 @@ class OrbitPose:
 
     @classmethod
     def of(cls, view: View, middle: np.ndarray, upright: bool) -> OrbitPose:
-        """middle: (3,) of what is looked at, whose depth the point to turn around has; upright: turn around +z unless the view is straight down"""
+        """middle: (3,) of what is looked at, whose depth the point to turn around has; upright: turn around
+        +z unless the view is straight down
+        """
         forward, image_up = view.cam_from_world[2, :3], -view.cam_from_world[1, :3]
         towards = float((np.asarray(middle, np.float64) - view.centre) @ forward)
         distance = towards if towards > 0 else float(np.linalg.norm(middle - view.centre)) or 1.0
@@ -41,14 +45,24 @@ class OrbitPose:
 
     def start(self, camera: viser.InitialCameraConfig) -> None:
         """Let browsers start here."""
-        camera.position, camera.look_at, camera.up, camera.fov = self.position, self.look_at, self.up, self.fov
+        camera.position, camera.look_at, camera.up, camera.fov = (
+            self.position,
+            self.look_at,
+            self.up,
+            self.fov,
+        )
         camera.near, camera.far = _NEAR * self.distance, _FAR * self.distance
 
     def move(self, client: viser.ClientHandle) -> None:
         """Move one browser here."""
         camera = client.camera
         with client.atomic():
-            camera.position, camera.look_at, camera.up_direction, camera.fov = self.position, self.look_at, self.up, self.fov
+            camera.position, camera.look_at, camera.up_direction, camera.fov = (
+                self.position,
+                self.look_at,
+                self.up,
+                self.fov,
+            )
 
 
 def orientation(view: View) -> np.ndarray:
@@ -57,6 +71,10 @@ def orientation(view: View) -> np.ndarray:
 
 
 def field_of_view(pinhole: View) -> tuple[float, float]:
-    """Vertical field of view, radians, and width over height of a view without distortion, as if its principal point were in the middle."""
+    """Vertical field of view, radians, and width over height of a view without distortion, as if its
+    principal point were in the middle.
+    """
     (focal_x, _, _), (_, focal_y, _) = pinhole.matrix[:2]
-    return float(2 * np.arctan(pinhole.height / 2 / focal_y)), float(pinhole.width / focal_x / (pinhole.height / focal_y))
+    return float(2 * np.arctan(pinhole.height / 2 / focal_y)), float(
+        pinhole.width / focal_x / (pinhole.height / focal_y)
+    )

@@ -1,4 +1,6 @@
-"""A page in the browser that shows a scene (viser): served on this machine, or written into one file that opens from disk."""
+"""A page in the browser that shows a scene (viser): served on this machine, or written into one file that
+opens from disk.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,8 @@ PAGE_POINTS, FILE_POINTS, FILE_SPLATS = 1_000_000, 300_000, 200_000  # shown at 
 _TITLE = "sc3d"
 _WINDOW = (1600, 1000)  # px; the start holds the whole scene in a window of this shape
 
-# Chromium starts no worker of viser's from a blob: address in a page from disk; without that address viser uses a data: address, which works.
+# Chromium starts no worker of viser's from a blob: address in a page from disk; without that address viser
+# uses a data: address, which works.
 _WORKER_FROM_DISK = (
     "if(location.protocol==='file:'){const make=URL.createObjectURL.bind(URL);"
     "URL.createObjectURL=blob=>blob instanceof Blob&&blob.type.startsWith('text/javascript')?'':make(blob)}"
@@ -50,9 +53,11 @@ class WebView:
     """What a page shows.
 
     inspector: has the cloud, the class table and all views
-    load_splats: reads the Gaussians, None = there are none; splats_first: they are shown instead of the cloud at the start, and in a file
+    load_splats: reads the Gaussians, None = there are none; splats_first: they are shown instead of the cloud
+        at the start, and in a file
     by: colouring at the start; classes: ids shown at the start, None = all; cameras: draw them
-    photo: name of the photo to look at and through at the start; from_above: straight down at the start; num_points: 0 = a default
+    photo: name of the photo to look at and through at the start; from_above: straight down at the start;
+        num_points: 0 = a default
     """
 
     scene: Scene
@@ -73,7 +78,8 @@ class WebView:
 
 @contextlib.contextmanager
 def serving(view: WebView, host: str = LOCAL, port: int = 0) -> Iterator[str]:
-    """Serve the page as long as the context lasts; yields its address. port: 0 = any; the next free one if it is taken.
+    """Serve the page as long as the context lasts; yields its address. port: 0 = any; the next free one if it
+    is taken.
 
     Raises MissingPackageError without viser.
     """
@@ -82,7 +88,9 @@ def serving(view: WebView, host: str = LOCAL, port: int = 0) -> Iterator[str]:
         hidden = _hidden(view, shown)
         cloud = CloudLayer(server, shown, "cloud", view.by, hidden)
         cloud.show_points(view.num_points or PAGE_POINTS)
-        splats = None if view.load_splats is None else SplatLayer(server, view.load_splats, shown, view.by, hidden)
+        splats = (
+            None if view.load_splats is None else SplatLayer(server, view.load_splats, shown, view.by, hidden)
+        )
         views = [one.shifted(shown.origin) for one in view.drawn_views]
         cameras = CameraLayer(server, views, frustum_depth(views, shown.points) if views else 1.0)
         page = Page(server, view.scene, shown, views, view.inspector, cloud, splats, cameras)
@@ -98,7 +106,9 @@ def serving(view: WebView, host: str = LOCAL, port: int = 0) -> Iterator[str]:
 def serve(view: WebView, host: str, port: int) -> None:
     """Serve the page until Ctrl + C or SIGTERM."""
     ended = threading.Event()
-    before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         with serving(view, host, port) as address:
             if host not in (LOCAL, "localhost", "::1"):
@@ -111,7 +121,9 @@ def serve(view: WebView, host: str, port: int) -> None:
 
 
 def write_page(path: Path, view: WebView) -> None:
-    """Write a page that opens from disk, without a server: every colouring of the cloud as a node of its own that can be switched on and off."""
+    """Write a page that opens from disk, without a server: every colouring of the cloud as a node of its own
+    that can be switched on and off.
+    """
     shown = _shown(view)
     with _server(LOCAL, 0) as server:
         hidden = _hidden(view, shown)
@@ -120,7 +132,9 @@ def write_page(path: Path, view: WebView) -> None:
             layer.show_points(min(len(shown.points), view.num_points or FILE_POINTS))
             layer.show(by == view.by and not view.splats_first)
         if view.splats_first:
-            SplatLayer(server, lambda: view.load_splats().most_visible(FILE_SPLATS), shown, view.by, hidden).show(True)
+            SplatLayer(
+                server, lambda: view.load_splats().most_visible(FILE_SPLATS), shown, view.by, hidden
+            ).show(True)
         views = [one.shifted(shown.origin) for one in view.drawn_views]
         CameraLayer(server, views, frustum_depth(views, shown.points) if views else 1.0)
         _start(server, view, shown, views)
@@ -130,7 +144,9 @@ def write_page(path: Path, view: WebView) -> None:
 
 
 def _for_disk(page: str, legend: str) -> str:
-    """viser's page with a legend, and with a worker that starts in pages from disk too: without it splats are not sorted by depth."""
+    """viser's page with a legend, and with a worker that starts in pages from disk too: without it splats are
+    not sorted by depth.
+    """
     style = "position:fixed;left:0;bottom:0;padding:.5em;background:rgba(255,255,255,.85);font-family:sans-serif;z-index:10"
     head, body = page.index("<head>") + len("<head>"), page.rindex("</body>")
     added = f"<div style='{style}'>{legend}</div>" if legend else ""
@@ -166,7 +182,11 @@ def _server(host: str, port: int) -> Iterator[viser.ViserServer]:
 def _shown(view: WebView) -> ShownCloud:
     points = view.inspector.cloud.point.positions
     views = view.inspector.views
-    middle = np.median([one.centre for one in views], axis=0) if views else points[: max(1, len(points) // 2)].cpu().numpy().mean(axis=0)
+    middle = (
+        np.median([one.centre for one in views], axis=0)
+        if views
+        else points[: max(1, len(points) // 2)].cpu().numpy().mean(axis=0)
+    )
     return ShownCloud.of(view.inspector.cloud, np.round(middle), view.inspector.class_table)
 
 
@@ -175,9 +195,13 @@ def _hidden(view: WebView, shown: ShownCloud) -> set[int]:
 
 
 def _start(server: viser.ViserServer, view: WebView, shown: ShownCloud, views: list[View]) -> OrbitPose:
-    """Set the camera that a browser starts with; returns the pose that shows the whole scene, in the frame of `shown`."""
+    """Set the camera that a browser starts with; returns the pose that shows the whole scene, in the frame of
+    `shown`.
+    """
     points = without_outliers(shown.points.astype(np.float64))
-    above = aerial_view(np.concatenate([points, *(one.centre[None] for one in views)]), _WINDOW, view.from_above)
+    above = aerial_view(
+        np.concatenate([points, *(one.centre[None] for one in views)]), _WINDOW, view.from_above
+    )
     home = OrbitPose.of(above, shown.middle, upright=True)
     photo = next((one for one in views if one.name == view.photo), None)
     (home if photo is None else OrbitPose.of(photo, shown.middle, upright=False)).start(server.initial_camera)

@@ -52,13 +52,20 @@ class ShowPanel:
         self._page, self.hidden, gui = page, set(hidden), page.server.gui
         with gui.add_folder("Show"):
             if page.splats is not None:
-                layers = gui.add_dropdown("Layers", ("cloud", "splats", "both"), initial_value="splats" if splats_first else "cloud")
+                layers = gui.add_dropdown(
+                    "Layers", ("cloud", "splats", "both"), initial_value="splats" if splats_first else "cloud"
+                )
                 layers.on_update(lambda _: self._choose_layers(layers.value))
                 self._choose_layers(layers.value)
             self._by = gui.add_dropdown("Colour by", page.shown.colourings, initial_value=by)
             self._legend = gui.add_html(legend_html(by, page.shown))
             has_relief = page.shown.has_relief
-            self._relief = gui.add_checkbox("relief", has_relief, visible=has_relief, hint="light from the north-west; not on photo colours")
+            self._relief = gui.add_checkbox(
+                "relief",
+                has_relief,
+                visible=has_relief,
+                hint="light from the north-west; not on photo colours",
+            )
             for handle in (self._by, self._relief):
                 handle.on_update(lambda _: self._color())
             self._add_classes(gui)
@@ -70,7 +77,13 @@ class ShowPanel:
     def _add_sliders(self, gui: viser.GuiApi) -> None:
         layer, total, chunk = self._page.cloud, len(self._page.shown.points), self._page.shown.chunk
         if total > chunk:
-            points = gui.add_slider("Thousand points", _thousands(chunk), _thousands(total), _thousands(chunk), _thousands(layer.count))
+            points = gui.add_slider(
+                "Thousand points",
+                _thousands(chunk),
+                _thousands(total),
+                _thousands(chunk),
+                _thousands(layer.count),
+            )
             points.on_update(lambda _: layer.show_points(round(1000 * points.value)))
         size = gui.add_slider("Point size", 0.25, 4.0, 0.25, 1.0)
         size.on_update(lambda _: layer.resize(size.value))
@@ -80,8 +93,13 @@ class ShowPanel:
         if table is None:
             return
         counts = self._page.shown.class_counts
-        for label in [*(label for label in counts if label), *([0] if 0 in counts or self._page.splats is not None else [])]:
-            box = gui.add_checkbox(table.name(label), label not in self.hidden, hint=f"{counts.get(label, 0):,} points")
+        for label in [
+            *(label for label in counts if label),
+            *([0] if 0 in counts or self._page.splats is not None else []),
+        ]:
+            box = gui.add_checkbox(
+                table.name(label), label not in self.hidden, hint=f"{counts.get(label, 0):,} points"
+            )
             box.on_update(lambda _, label=label, box=box: self._show_class(label, box.value))
 
     def _choose_layers(self, name: str) -> None:
@@ -130,9 +148,15 @@ class PhotoPanel:
         self._page.cameras.hide(None)
         found = None
         if name != _NO_PHOTO:
-            found = photo_pictures(self._page.scene, self._views[name], self._page.shown.class_table, _PHOTO_SIZE)
+            found = photo_pictures(
+                self._page.scene, self._views[name], self._page.shown.class_table, _PHOTO_SIZE
+            )
         self._pictures.content = "" if found is None else pictures_html(found)
-        thumbnails = {} if found is None or found.photo is None else {name: thumbnail(found.photo, self._views[name], _THUMBNAIL_SIZE)}
+        thumbnails = (
+            {}
+            if found is None or found.photo is None
+            else {name: thumbnail(found.photo, self._views[name], _THUMBNAIL_SIZE)}
+        )
         self._page.cameras.set_images(thumbnails)
 
     def _look(self, client: viser.ClientHandle | None, where: str) -> None:
@@ -152,7 +176,9 @@ class PointPanel:
         self._page, self._panel, self._busy = page, panel, threading.Lock()
         with page.server.gui.add_folder("Point"):
             self._text = page.server.gui.add_html(_note(_PICK_HINT))
-        page.server.scene.on_click(modifier="cmd/ctrl")(lambda event: self._pick(np.array(event.ray_origin), np.array(event.ray_direction)))
+        page.server.scene.on_click(modifier="cmd/ctrl")(
+            lambda event: self._pick(np.array(event.ray_origin), np.array(event.ray_direction))
+        )
 
     def _pick(self, origin: np.ndarray, direction: np.ndarray) -> None:
         shown, layer = self._page.shown, self._page.cloud
@@ -164,30 +190,49 @@ class PointPanel:
             picked = self._page.inspector.look_up(int(shown.rows[rows[found]]))
         self._page.cameras.mark(picked.photos)
         radius = max(2 * shown.spacing_at(layer.count), 0.004 * shown.extent)
-        self._page.server.scene.add_icosphere(  # without light and shadow, which take seconds where there is no GPU
-            "/picked", radius, _PICKED_COLOR, material="toon3", cast_shadow=False, receive_shadow=False, position=picked.position - shown.origin,
+        # without light and shadow, which take seconds where there is no GPU
+        self._page.server.scene.add_icosphere(
+            "/picked",
+            radius,
+            _PICKED_COLOR,
+            material="toon3",
+            cast_shadow=False,
+            receive_shadow=False,
+            position=picked.position - shown.origin,
         )
         self._text.content = point_html(picked)
 
 
 def legend_html(by: Colouring, shown: ShownCloud) -> str:
-    """What the colours mean, as HTML: swatches of classes and states, or a colour scale; empty for photo colours."""
+    """What the colours mean, as HTML: swatches of classes and states, or a colour scale; empty for photo
+    colours.
+    """
     scale = color_scale(by)
     if scale is not None:
         stops = ", ".join(_css(color) for color in scale.colors[::15])
         bar = f"<span style='display:block;height:.8em;background:linear-gradient(90deg, {stops})'></span>"
         return f"<div style='padding:0 .75em;font-size:.8em'>{bar}<span>{escape(scale.low)}</span><span style='float:right'>{escape(scale.high)}</span></div>"
     present = set(shown.class_counts) if by == "label" else None
-    swatch = "<span style='display:inline-block;width:.8em;height:.8em;margin-right:.4em;background:{}'></span>{}"
-    entries = [swatch.format(_css(color), escape(name)) for name, color in legend_entries(by, shown.class_table, present)]
+    swatch = (
+        "<span style='display:inline-block;width:.8em;height:.8em;margin-right:.4em;background:{}'></span>{}"
+    )
+    entries = [
+        swatch.format(_css(color), escape(name))
+        for name, color in legend_entries(by, shown.class_table, present)
+    ]
     entries = [f"<span style='margin-right:1em'>{entry}</span>" for entry in entries]
     return f"<div style='padding:0 .75em;font-size:.8em'>{' '.join(entries)}</div>" if entries else ""
 
 
 def pictures_html(found: PhotoPictures) -> str:
-    """Photo and mask as HTML that holds them: viser's own pictures are loaded from addresses that it withdraws while they load."""
-    pictures = [f"{_note(label)}<img alt='{label}' style='display:block;width:100%' src='{jpeg_uri(picture)}'>"
-                for label, picture in (("photo", found.photo), ("mask", found.mask)) if picture is not None]
+    """Photo and mask as HTML that holds them: viser's own pictures are loaded from addresses that it
+    withdraws while they load.
+    """
+    pictures = [
+        f"{_note(label)}<img alt='{label}' style='display:block;width:100%' src='{jpeg_uri(picture)}'>"
+        for label, picture in (("photo", found.photo), ("mask", found.mask))
+        if picture is not None
+    ]
     return f"<div style='padding:.25em .75em'>{''.join(pictures)}</div>{_note(found.note)}"
 
 
@@ -195,7 +240,9 @@ def point_html(picked: PickedPoint) -> str:
     """A picked point as HTML."""
     facts = [*picked.facts(), *([("", ", ".join(picked.photos))] if picked.photos else [])]
     cell = "<td style='padding-right:1em;vertical-align:top'>{}</td>"
-    rows = "".join(f"<tr>{cell.format(escape(name))}{cell.format(escape(value))}</tr>" for name, value in facts)
+    rows = "".join(
+        f"<tr>{cell.format(escape(name))}{cell.format(escape(value))}</tr>" for name, value in facts
+    )
     return f"<div style='padding:0 .75em;font-size:.8em;line-height:1.4'><table>{rows}</table></div>"
 
 

@@ -21,7 +21,9 @@ _OPACITY = 0.6  # of a mask over its photo
 
 @dataclass(frozen=True)
 class PhotoPictures:
-    """photo: (H, W, 3) uint8 RGB, None if the file is missing; mask: the class colours over it, None without a mask; note: what is missing, or ""."""
+    """photo: (H, W, 3) uint8 RGB, None if the file is missing; mask: the class colours over it, None without
+    a mask; note: what is missing, or "".
+    """
 
     photo: np.ndarray | None
     mask: np.ndarray | None
@@ -46,7 +48,8 @@ def photo_pictures(scene: Scene, view: View, table: ClassTable | None, max_size:
 
 
 def overlay(photo: np.ndarray | None, labels: np.ndarray, table: ClassTable) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: class colours over a photo of the same size, which stays as it is where there is no label; None: on white.
+    """(H, W, 3) uint8 RGB: class colours over a photo of the same size, which stays as it is where there is
+    no label; None: on white.
 
     photo: (H, W, 3) uint8; labels: (H, W) uint8
     """
@@ -56,7 +59,9 @@ def overlay(photo: np.ndarray | None, labels: np.ndarray, table: ClassTable) -> 
 
 
 def thumbnail(photo: np.ndarray, view: View, max_size: int) -> np.ndarray:
-    """(h, w, 3) uint8 RGB: a photo of any size as its undistorted (pinhole) view shows it, longest side at most `max_size` px."""
+    """(h, w, 3) uint8 RGB: a photo of any size as its undistorted (pinhole) view shows it, longest side at
+    most `max_size` px.
+    """
     return resample(photo, view, fitted(view, (max_size, max_size)))
 
 

@@ -1,6 +1,8 @@
-"""Makes the files beside it with each format's own library, and with it what that library draws: read by test_mask_imports.py.
+"""Makes the files beside it with each format's own library, and with it what that library draws: read by
+test_mask_imports.py.
 
-Run once, by hand, in an environment of its own: pip install labelme==6.3.1 datumaro==1.13.12 cvat-sdk==2.80.0 pycocotools==2.0.11, then
+Run once, by hand, in an environment of its own: pip install labelme==6.3.1 datumaro==1.13.12 cvat-sdk==2.80.0
+pycocotools==2.0.11, then
 python tests/mask_files/make.py. The files are committed so that the tests need none of these packages.
 """
 
@@ -90,7 +92,9 @@ def export(name: str, entries: list[dm.DatasetItem], found: str, target: Path) -
 
 
 def make_coco() -> None:
-    """Datumaro's file, with polygons and plain run-length codes; then the same with pycocotools' compressed codes for all regions."""
+    """Datumaro's file, with polygons and plain run-length codes; then the same with pycocotools' compressed
+    codes for all regions.
+    """
     export("coco_instances", items(boxes=False), "*.json", HERE / "coco.json")
     coco = COCO(HERE / "coco.json")
     content = json.loads((HERE / "coco.json").read_text())
@@ -108,7 +112,9 @@ def make_coco() -> None:
 
 
 def make_cvat() -> None:
-    """Datumaro's file, to which is added what it cannot write: an ellipse, and a mask in a box of its own as CVAT's SDK codes it."""
+    """Datumaro's file, to which is added what it cannot write: an ellipse, and a mask in a box of its own as
+    CVAT's SDK codes it.
+    """
     export("cvat", items(boxes=True), "*.xml", HERE / "cvat.xml")
     region = blob(7) & (np.arange(WIDTH) > 50)
     *code, left, top, right, bottom = cvat_masks.encode_mask(region)

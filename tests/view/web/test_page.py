@@ -1,4 +1,6 @@
-"""The page in headless Chromium: loads, hides a class, answers clicks on a camera and on a point, turns, and talks to this machine only."""
+"""The page in headless Chromium: loads, hides a class, answers clicks on a camera and on a point, turns, and
+talks to this machine only.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,12 @@ from tests.builders import CLASSES, ORIGIN, ground, inspector_of, labelled_scene
 ROAD, GRASS = CLASSES[0]["color"], CLASSES[1]["color"]
 SIZE = (900, 600)  # px of the browser's window
 LEFT = (slice(None), slice(0, SIZE[0] // 2))  # where the panel is not
-OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
+OPTIONS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+]
 LOCAL = {("http", "127.0.0.1"), ("ws", "127.0.0.1"), ("blob", None), ("data", None), ("file", None)}
 
 
@@ -79,12 +86,22 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[object]:
     pytest.importorskip("viser", reason="the viewer in the browser needs viser: pip install 'sc3d[web]'")
-    api = pytest.importorskip("playwright.sync_api", reason="the page is tested with playwright: pip install playwright")
-    program = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
+    api = pytest.importorskip(
+        "playwright.sync_api", reason="the page is tested with playwright: pip install playwright"
+    )
+    program = next(
+        (
+            found
+            for name in ("chromium", "chromium-browser", "google-chrome")
+            if (found := shutil.which(name))
+        ),
+        None,
+    )
     if program is None:
         pytest.skip("the page is tested in Chromium: apt install chromium")
     with api.sync_playwright() as playwright:
-        headless = {name: value for name, value in os.environ.items() if name != "DISPLAY"}  # with a display that does not answer there is no WebGL
+        # with a display that does not answer there is no WebGL
+        headless = {name: value for name, value in os.environ.items() if name != "DISPLAY"}
         started = playwright.chromium.launch(executable_path=program, args=OPTIONS, env=headless)
         yield started
         started.close()
@@ -105,7 +122,9 @@ def visit(browser: object, address: str, size: tuple[int, int] = SIZE) -> Iterat
         yield found
     finally:
         page.close()
-    assert {(parts.scheme, parts.hostname) for parts in map(urlsplit, found.requests)} <= LOCAL, found.requests
+    assert {(parts.scheme, parts.hostname) for parts in map(urlsplit, found.requests)} <= LOCAL, (
+        found.requests
+    )
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +134,8 @@ def served(scene: Scene, browser: object) -> Iterator[Visit]:
 
     with serving(WebView(scene, inspector_of(scene))) as address, visit(browser, address) as found:
         found.page.get_by_text("Colour by", exact=True).wait_for()
-        found.page.locator(".mantine-Notification-closeButton").click()  # viser's remark on software rendering lies over the cameras
+        # viser's remark on software rendering lies over the cameras
+        found.page.locator(".mantine-Notification-closeButton").click()
         yield found
         assert any(url.startswith("ws://") for url in found.requests)
 
@@ -124,24 +144,33 @@ def served(scene: Scene, browser: object) -> Iterator[Visit]:
 def opened(served: Visit) -> Iterator[Visit]:
     """The page as it looks at the start; at the end, nothing may have gone wrong in the browser."""
     served.page.get_by_role("button", name="Overview").click()
-    served.wait_for(lambda: served.share(ROAD) > 0.05 and served.share(GRASS) > 0.05 and served.is_still(), "road and grass in their own colours")
+    served.wait_for(
+        lambda: served.share(ROAD) > 0.05 and served.share(GRASS) > 0.05 and served.is_still(),
+        "road and grass in their own colours",
+    )
     yield served
     assert served.errors == []
 
 
 def in_canvas(page: object, pose: OrbitPose, fov: float | None = None) -> tuple[View, np.ndarray]:
-    """What the page shows when it looks from a pose of the viewer's frame: a view of the canvas' size, and (2,) its corner in the page, px."""
+    """What the page shows when it looks from a pose of the viewer's frame: a view of the canvas' size, and
+    (2,) its corner in the page, px.
+    """
     box = page.locator("canvas").last.bounding_box()
     focal = box["height"] / 2 / np.tan((fov or pose.fov) / 2)
     calibration = (focal, focal, box["width"] / 2, box["height"] / 2)
     size = (int(box["width"]), int(box["height"]))
-    return pinhole_view("canvas", size, calibration, look_at(pose.position, pose.look_at, tuple(pose.up))), np.array([box["x"], box["y"]])
+    return pinhole_view(
+        "canvas", size, calibration, look_at(pose.position, pose.look_at, tuple(pose.up))
+    ), np.array([box["x"], box["y"]])
 
 
 def home_of(scene: Scene) -> tuple[OrbitPose, ShownCloud]:
     """The pose that the page starts with, and the cloud in its frame."""
     centres = np.array([view.centre for view in views()])
-    shown = ShownCloud.of(inspector_of(scene).cloud, np.round(np.median(centres, axis=0)), scene.class_table())
+    shown = ShownCloud.of(
+        inspector_of(scene).cloud, np.round(np.median(centres, axis=0)), scene.class_table()
+    )
     points = np.concatenate([without_outliers(shown.points.astype(np.float64)), centres - shown.origin])
     return OrbitPose.of(aerial_view(points, (1600, 1000)), shown.middle, upright=True), shown
 
@@ -163,7 +192,7 @@ def test_class_is_switched_off_and_on(opened):
     opened.wait_for(lambda: opened.share(GRASS) == 0, "grass to go")
     hidden = opened.picture
     road = (before == ROAD).all(axis=-1)
-    road[:, LEFT[1].stop:] = False  # the panel has a swatch of it
+    road[:, LEFT[1].stop :] = False  # the panel has a swatch of it
     assert (hidden[road] == ROAD).all() and opened.share(ROAD) > 0.05  # and nothing but grass went
     box.click()
     opened.wait_for(lambda: np.array_equal(opened.picture[LEFT], before[LEFT]), "the same picture as before")
@@ -172,13 +201,19 @@ def test_class_is_switched_off_and_on(opened):
 def test_clicked_camera_shows_its_photo_and_mask_and_is_looked_through(scene, opened):
     page, view = opened.page, views()[3]
     click_camera(page, scene, view.name)
-    opened.wait_for(lambda: view.name in page.evaluate("[...document.querySelectorAll('input')].map(box => box.value)"), "the clicked camera's name")
+    opened.wait_for(
+        lambda: view.name in page.evaluate("[...document.querySelectorAll('input')].map(box => box.value)"),
+        "the clicked camera's name",
+    )
     expected = photo_pictures(scene, view, scene.class_table(), 800)
     for label, picture in (("photo", expected.photo), ("mask", expected.mask)):
         image = page.locator(f"img[alt={label}]")
         image.wait_for()
         shown = decoded(base64.b64decode(image.get_attribute("src").split(",")[1])).astype(int)
-        assert image.evaluate("one => one.complete && one.naturalWidth") == view.width and np.abs(shown - picture).mean() < 2
+        assert (
+            image.evaluate("one => one.complete && one.naturalWidth") == view.width
+            and np.abs(shown - picture).mean() < 2
+        )
     page.get_by_role("button", name="Through it").click()
     opened.wait_for(lambda: agreement(opened.picture, page, view) > 0.97, "what the photo's camera sees")
     page.get_by_role("button", name="Overview").click()
@@ -186,9 +221,13 @@ def test_clicked_camera_shows_its_photo_and_mask_and_is_looked_through(scene, op
 
 
 def agreement(picture: np.ndarray, page: object, view: View) -> float:
-    """Share of the pixels of road and grass that show what a photo's camera sees there, with its centre in the middle; 0 if there are few."""
+    """Share of the pixels of road and grass that show what a photo's camera sees there, with its centre in
+    the middle; 0 if there are few.
+    """
     forward = view.cam_from_world[2, :3]
-    pose = OrbitPose(view.centre, view.centre + forward, -view.cam_from_world[1, :3], field_of_view(undistorted(view))[0])
+    pose = OrbitPose(
+        view.centre, view.centre + forward, -view.cam_from_world[1, :3], field_of_view(undistorted(view))[0]
+    )
     window, corner = in_canvas(page, pose)
     left, top = corner.astype(int)
     directions, _ = rays(window)
@@ -226,12 +265,27 @@ def test_what_is_known_of_a_picked_point(scene, opened):
         page.mouse.click(*(corner + project(window, ORIGIN + [target] - shown.origin)[0][0]))
         page.keyboard.up("Control")
         rows = page.locator("tr", has_text="position")
-        opened.wait_for(lambda: rows.count() == 1 and np.linalg.norm(position_in(rows) - ORIGIN - target) < 0.2, "a point near the click")
+        opened.wait_for(
+            lambda: rows.count() == 1 and np.linalg.norm(position_in(rows) - ORIGIN - target) < 0.2,
+            "a point near the click",
+        )
         row = int(np.argmin(np.linalg.norm(points - position_in(rows), axis=1)))
-        facts = dict(cells.all_inner_texts() for cells in (line.locator("td") for line in page.locator("tr").all()))
-        label, confidence, state = (cloud.point[name][row].item() for name in ("label", "confidence", "state"))
-        assert (facts["class"], facts["confidence"], facts["state"]) == (scene.class_table().name(label), f"{confidence:.2f}", STATES[state].name)
-        assert label == (1 if target[0] < 0 else 3) and facts["seen by"] == "5 photos" and facts["votes"].startswith(facts["class"])
+        facts = dict(
+            cells.all_inner_texts() for cells in (line.locator("td") for line in page.locator("tr").all())
+        )
+        label, confidence, state = (
+            cloud.point[name][row].item() for name in ("label", "confidence", "state")
+        )
+        assert (facts["class"], facts["confidence"], facts["state"]) == (
+            scene.class_table().name(label),
+            f"{confidence:.2f}",
+            STATES[state].name,
+        )
+        assert (
+            label == (1 if target[0] < 0 else 3)
+            and facts["seen by"] == "5 photos"
+            and facts["votes"].startswith(facts["class"])
+        )
 
 
 def position_in(rows: object) -> np.ndarray:
@@ -240,40 +294,91 @@ def position_in(rows: object) -> np.ndarray:
 
 
 def two_layers() -> ShownSplats:
-    """Splats of class 1 above splats of class 3, given front to back: drawn in that order, the ones below would cover the ones above."""
+    """Splats of class 1 above splats of class 3, given front to back: drawn in that order, the ones below
+    would cover the ones above.
+    """
     x, y = np.meshgrid(np.linspace(-4, 4, 25), np.linspace(-4, 4, 25))
-    means = np.concatenate([np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1) for height in (3.0, 0.0)])
+    means = np.concatenate(
+        [np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1) for height in (3.0, 0.0)]
+    )
     count = len(means)
-    gaussians = Gaussians(torch.from_numpy(means).float(), torch.full((count, 3), float(np.log(0.3))), torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-                          torch.full((count,), 6.0), torch.zeros(count, 1, 3))
-    return ShownSplats(gaussians, np.round(ORIGIN), np.repeat(np.uint8([1, 3]), x.size), np.ones(count, np.float32))
+    gaussians = Gaussians(
+        torch.from_numpy(means).float(),
+        torch.full((count, 3), float(np.log(0.3))),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        torch.full((count,), 6.0),
+        torch.zeros(count, 1, 3),
+    )
+    return ShownSplats(
+        gaussians, np.round(ORIGIN), np.repeat(np.uint8([1, 3]), x.size), np.ones(count, np.float32)
+    )
 
 
 def test_file_opens_from_disk_and_sorts_splats_by_depth(scene, browser, tmp_path):
     from sc3d.view.web.page import WebView, write_page
 
     splats = two_layers()
-    view = WebView(scene, Inspector(splats.centres(), scene.model.views, scene.class_table(), scene.mesh), lambda: splats, splats_first=True, cameras=False,
-                   from_above=True)
+    view = WebView(
+        scene,
+        Inspector(splats.centres(), scene.model.views, scene.class_table(), scene.mesh),
+        lambda: splats,
+        splats_first=True,
+        cameras=False,
+        from_above=True,
+    )
     write_page(tmp_path / "page.html", view)
     with visit(browser, f"file://{tmp_path}/page.html", (500, 500)) as found:
         middle = (slice(220, 280), slice(220, 280))  # below the remark on software rendering
-        found.wait_for(lambda: np.abs(np.median(found.picture[middle].reshape(-1, 3), axis=0) - ROAD).max() < 12, "the upper splats to cover the lower ones")
+        found.wait_for(
+            lambda: np.abs(np.median(found.picture[middle].reshape(-1, 3), axis=0) - ROAD).max() < 12,
+            "the upper splats to cover the lower ones",
+        )
         assert found.page.get_by_text("road", exact=True).count() == 1  # the legend
         assert not [url for url in found.requests if urlsplit(url).hostname]  # not even this machine
-        assert not [text for text in found.errors if "computeBoundingSphere" not in text]  # viser's splats have flat corners, of which three.js complains
+        # viser's splats have flat corners, of which three.js complains
+        assert not [text for text in found.errors if "computeBoundingSphere" not in text]
 
 
 def test_file_holds_every_colouring(scene, tmp_path):
     pytest.importorskip("viser", reason="the viewer in the browser needs viser: pip install 'sc3d[web]'")
-    main(["view", str(scene.path), "--html", str(tmp_path / "page.html"), "--points", "3000", "--classes", "road"])
+    main(
+        [
+            "view",
+            str(scene.path),
+            "--html",
+            str(tmp_path / "page.html"),
+            "--points",
+            "3000",
+            "--classes",
+            "road",
+        ]
+    )
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert "__VISER_EMBED_DATA__" in page and page.index("URL.createObjectURL=blob") < page.index("__VISER_EMBED_DATA__") and "rgb(150,150,160)" in page
+    assert (
+        "__VISER_EMBED_DATA__" in page
+        and page.index("URL.createObjectURL=blob") < page.index("__VISER_EMBED_DATA__")
+        and "rgb(150,150,160)" in page
+    )
     messages = embedded_messages(page)
-    names = {message["name"]: message["props"] for message in messages if message.get("type") == "PointCloudMessage"}
-    assert {name.split("/")[1] for name in names} == {f"cloud by {by}" for by in ("label", "confidence", "state", "disagreement")}
-    hidden = {message["name"] for message in messages if message.get("type") == "SetSceneNodeVisibilityMessage" and not message["visible"]}
-    assert {"/cloud by label/grass", "/cloud by confidence", "/cloud by state", "/cloud by disagreement"} <= hidden and "/cloud by label" not in hidden
+    names = {
+        message["name"]: message["props"]
+        for message in messages
+        if message.get("type") == "PointCloudMessage"
+    }
+    assert {name.split("/")[1] for name in names} == {
+        f"cloud by {by}" for by in ("label", "confidence", "state", "disagreement")
+    }
+    hidden = {
+        message["name"]
+        for message in messages
+        if message.get("type") == "SetSceneNodeVisibilityMessage" and not message["visible"]
+    }
+    assert {
+        "/cloud by label/grass",
+        "/cloud by confidence",
+        "/cloud by state",
+        "/cloud by disagreement",
+    } <= hidden and "/cloud by label" not in hidden
 
 
 def embedded_messages(page: str) -> list[dict]:
@@ -283,6 +388,8 @@ def embedded_messages(page: str) -> list[dict]:
 
     start = page.index('__VISER_EMBED_DATA__="') + len('__VISER_EMBED_DATA__="')
     packed = base64.b64decode(page[start : page.index('"', start)])
-    inner = zstandard.ZstdDecompressor().decompress(packed[8:], max_output_size=int.from_bytes(packed[:8], "little"))
+    inner = zstandard.ZstdDecompressor().decompress(
+        packed[8:], max_output_size=int.from_bytes(packed[:8], "little")
+    )
     length = int.from_bytes(inner[:8], "little")
     return [message for _, message in msgspec.msgpack.decode(inner[8 : 8 + length])["messages"]]

@@ -1,4 +1,6 @@
-"""The parts of the page in the browser, without a browser: poses, layers, texts, pictures, options, and who can reach it."""
+"""The parts of the page in the browser, without a browser: poses, layers, texts, pictures, options, and who
+can reach it.
+"""
 
 from __future__ import annotations
 
@@ -55,14 +57,21 @@ def test_pose_is_that_of_the_view():
     middle = np.array([2.0, 1.0, 0.0])
     view = pinhole_view("a", (400, 300), (500, 500, 200, 150), look_at(np.array([5.0, -30, 20]), middle))
     pose = OrbitPose.of(view, middle, upright=True)
-    assert np.allclose(pose.position, [5, -30, 20]) and np.allclose(pose.look_at, middle) and np.allclose(pose.up, [0, 0, 1])
+    assert (
+        np.allclose(pose.position, [5, -30, 20])
+        and np.allclose(pose.look_at, middle)
+        and np.allclose(pose.up, [0, 0, 1])
+    )
     assert np.isclose(np.tan(pose.fov / 2), 150 / 500)
     assert OrbitPose.of(view, middle, upright=False).up @ [0, 0, 1] > 0.5  # the top of the photo
     down = pinhole_view("b", (400, 300), (500, 500, 200, 150), look_at(np.array([0.0, 0, 20]), np.zeros(3)))
     assert np.allclose(OrbitPose.of(down, np.zeros(3), upright=True).up, [0, 1, 0])
     turned = orientation(view)  # wxyz
     w, x, y, z = turned
-    assert np.allclose([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], (middle - pose.position) / np.linalg.norm(middle - pose.position))
+    assert np.allclose(
+        [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+        (middle - pose.position) / np.linalg.norm(middle - pose.position),
+    )
 
 
 def test_covariances_fit_into_half_precision():
@@ -75,7 +84,8 @@ def test_covariances_fit_into_half_precision():
     assert np.isfinite(half).all()
     error = np.abs(half * unit**2 - covariances).max(axis=(1, 2)) / np.trace(covariances, axis1=1, axis2=2)
     assert error[np.arange(500) != 7].max() < 2e-3  # half of the last of 11 bits, and the smallest number
-    assert np.allclose(sent[7] / sent[7, 0, 0], covariances[7] / covariances[7, 0, 0], rtol=1e-4)  # smaller, but of the same shape
+    # smaller, but of the same shape
+    assert np.allclose(sent[7] / sent[7, 0, 0], covariances[7] / covariances[7, 0, 0], rtol=1e-4)
 
 
 def test_photo_and_mask_are_laid_over_one_another(scene, tmp_path):
@@ -107,12 +117,22 @@ def test_layers_send_each_point_once_in_its_class(scene):
     with layer_server() as server:
         layer = CloudLayer(server, shown, "cloud", "label", hidden={3})
         layer.show_points(10**9)
-        sent = {name: handle for name, handle in server.scene._handle_from_node_name.items() if name.count("/") == 3}
+        sent = {
+            name: handle
+            for name, handle in server.scene._handle_from_node_name.items()
+            if name.count("/") == 3
+        }
         points = np.concatenate([handle.points for handle in sent.values()])
-        assert layer.count == len(points) == len(shown.points) and np.array_equal(np.unique(points, axis=0), np.unique(shown.points, axis=0))
+        assert layer.count == len(points) == len(shown.points) and np.array_equal(
+            np.unique(points, axis=0), np.unique(shown.points, axis=0)
+        )
         assert all((handle.colors == ROAD).all() == ("/road/" in name) for name, handle in sent.items())
         assert points.dtype == np.float32 and np.abs(points).max() < 20  # local, not UTM
-        parents = {name: handle.visible for name, handle in server.scene._handle_from_node_name.items() if name.count("/") == 2}
+        parents = {
+            name: handle.visible
+            for name, handle in server.scene._handle_from_node_name.items()
+            if name.count("/") == 2
+        }
         assert parents == {"/cloud/road": True, "/cloud/grass": False}
         layer.show_class(3, True)
         layer.color_by("confidence")
@@ -127,9 +147,17 @@ def test_fewer_points_are_a_thinner_cloud(scene, monkeypatch):
         layer = CloudLayer(server, shown, "cloud", "label")
         for wanted, chunks in ((2000, 4), (500, 1), (0, 1), (1010, 2), (10**9, -(-len(shown.points) // 500))):
             layer.show_points(wanted)
-            nodes = [handle for name, handle in server.scene._handle_from_node_name.items() if name.count("/") == 3]
-            assert sum(len(handle.points) for handle in nodes) == layer.count == min(500 * chunks, len(shown.points))
-            assert len({handle.point_size for handle in nodes}) == 1 and np.isclose(nodes[0].point_size, 0.9 * shown.spacing_at(layer.count))
+            nodes = [
+                handle for name, handle in server.scene._handle_from_node_name.items() if name.count("/") == 3
+            ]
+            assert (
+                sum(len(handle.points) for handle in nodes)
+                == layer.count
+                == min(500 * chunks, len(shown.points))
+            )
+            assert len({handle.point_size for handle in nodes}) == 1 and np.isclose(
+                nodes[0].point_size, 0.9 * shown.spacing_at(layer.count)
+            )
 
 
 def test_frusta_lie_where_the_cameras_are(scene):
@@ -138,7 +166,9 @@ def test_frusta_lie_where_the_cameras_are(scene):
         layer.mark(["photo_1.jpg"])
         for view in views():
             handle = server.scene._handle_from_node_name[f"/cameras/{Path(view.name).stem}"]
-            assert np.allclose(handle.position, view.centre - ORIGIN, atol=1e-6) and np.allclose(np.abs(handle.wxyz @ orientation(view)), 1)
+            assert np.allclose(handle.position, view.centre - ORIGIN, atol=1e-6) and np.allclose(
+                np.abs(handle.wxyz @ orientation(view)), 1
+            )
             assert np.isclose(handle.scale * handle.compute_canonical_frustum_size()[2], 2.0)
             assert (handle.color == (0, 158, 115)) == (view.name == "photo_1.jpg")
 
@@ -150,18 +180,29 @@ def listening(address: str) -> set[str]:
         rows = [line.split() for line in Path(f"/proc/net/{file}").read_text().splitlines()[1:]]
         for host, its_port in (row[1].split(":") for row in rows if row[3] == "0A"):
             if int(its_port, 16) == port:
-                found.add(socket.inet_ntop(family, struct.pack(f"={words}I", *(int(host[8 * word : 8 * word + 8], 16) for word in range(words)))))
+                found.add(
+                    socket.inet_ntop(
+                        family,
+                        struct.pack(
+                            f"={words}I", *(int(host[8 * word : 8 * word + 8], 16) for word in range(words))
+                        ),
+                    )
+                )
     return found
 
 
 @linux
-@pytest.mark.parametrize(("host", "expected"), [(None, "127.0.0.1"), ("127.0.0.2", "127.0.0.2"), ("0.0.0.0", "0.0.0.0")])
+@pytest.mark.parametrize(
+    ("host", "expected"), [(None, "127.0.0.1"), ("127.0.0.2", "127.0.0.2"), ("0.0.0.0", "0.0.0.0")]
+)
 def test_page_is_served_to_this_machine_only_unless_told_otherwise(scene, host, expected):
     pytest.importorskip("viser", reason="the viewer in the browser needs viser: pip install 'sc3d[web]'")
     from sc3d.view.web.page import WebView, serving
 
     with serving(WebView(scene, inspector_of(scene)), *([host] if host else [])) as address:
-        assert address.startswith(f"http://{'localhost' if host == '0.0.0.0' else expected}:") and listening(address) == {expected}
+        assert address.startswith(f"http://{'localhost' if host == '0.0.0.0' else expected}:") and listening(
+            address
+        ) == {expected}
     assert listening(address) == set()
 
 
@@ -169,11 +210,24 @@ def test_page_is_served_to_this_machine_only_unless_told_otherwise(scene, host, 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_command_serves_this_machine_until_it_is_ended(scene, number):
     pytest.importorskip("viser", reason="the viewer in the browser needs viser: pip install 'sc3d[web]'")
-    command = [sys.executable, "-c", "from sc3d.cli import main; main()", "view", str(scene.path), "--web", "--port", "0"]
+    command = [
+        sys.executable,
+        "-c",
+        "from sc3d.cli import main; main()",
+        "view",
+        str(scene.path),
+        "--web",
+        "--port",
+        "0",
+    ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as running:
         try:
             lines = iter(running.stderr.readline, "")
-            address = next(found[1] for line in lines if (found := re.match(r"open (http://127\.0\.0\.1:\d+) in a browser", line)))
+            address = next(
+                found[1]
+                for line in lines
+                if (found := re.match(r"open (http://127\.0\.0\.1:\d+) in a browser", line))
+            )
             assert listening(address) == {"127.0.0.1"}
             running.send_signal(number)
             rest = running.stderr.read()
@@ -207,11 +261,19 @@ def test_missing_viser_says_how_to_install_it(scene, monkeypatch, capfd):
     assert ended.value.code == 1 and "pip install 'sc3d[web]'" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    (["--web", "--html", "a.html"], "choose one of"), (["--html", "a.txt"], "ends in .html"), (["--web", "--screenshot", "a.png"], "choose one of"),
-    (["--splats"], "--web"), (["--web", "--classes", "house"], "choose from road, grass"), (["--web", "--port", "70000"], "65535"),
-    (["--web", "--splats", "--by", "disagreement"], "splats have no disagreement"), (["--web", "--by", "photo"], "no photo colours"),
-])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--web", "--html", "a.html"], "choose one of"),
+        (["--html", "a.txt"], "ends in .html"),
+        (["--web", "--screenshot", "a.png"], "choose one of"),
+        (["--splats"], "--web"),
+        (["--web", "--classes", "house"], "choose from road, grass"),
+        (["--web", "--port", "70000"], "65535"),
+        (["--web", "--splats", "--by", "disagreement"], "splats have no disagreement"),
+        (["--web", "--by", "photo"], "no photo colours"),
+    ],
+)
 def test_options_that_do_not_fit_are_one_line(scene, options, message, capfd):
     pytest.importorskip("viser", reason="the viewer in the browser needs viser: pip install 'sc3d[web]'")
     with pytest.raises(SystemExit) as ended:
