@@ -1,4 +1,4 @@
-"""Gaussians to a surface: depth of every view, checked against its neighbours, fused into a TSDF (METHOD
+"""Gaussians to a surface: depth of every view, checked against its neighbors, fused into a TSDF (METHOD
 section 1, Surface).
 """
 
@@ -27,7 +27,7 @@ from sc3d.splatting.evaluation import depth_map
 from sc3d.splatting.gaussians import Gaussians
 
 MAX_ANGLE = 80.0  # degrees between ray and normal
-NUM_NEIGHBOURS = 6
+NUM_NEIGHBORS = 6
 MIN_PART = 100  # triangles; smaller components are floaters
 ROUNDS = 4  # of completion, each with every fourth view
 MARGIN = 0.03  # share of the depth by which a surface must lie behind to be another one
@@ -41,7 +41,7 @@ LOOSE = 4.0  # px; how far two views may disagree where nothing better is known
 class Surfaces:
     """mesh, cloud: in the views' local world; voxel_size: world units.
 
-    confirmed: share of all pixels whose depth was confirmed by neighbour views; coverage: share whose ray
+    confirmed: share of all pixels whose depth was confirmed by neighbor views; coverage: share whose ray
         hits the mesh
     """
 
@@ -57,13 +57,13 @@ class DepthViews:
     """The views whose depth is fused.
 
     views: pinhole; image: index to (H, W, 3) uint8 RGB of the view's size
-    neighbours: per view, rows of views that see the same surface; depth_range: nearest and farthest depth,
+    neighbors: per view, rows of views that see the same surface; depth_range: nearest and farthest depth,
         world units
     """
 
     views: list[View]
     image: Callable[[int], np.ndarray]
-    neighbours: list[np.ndarray]
+    neighbors: list[np.ndarray]
     depth_range: tuple[float, float]
 
 
@@ -145,32 +145,32 @@ def _complete(
         first, depth = first_surface(surface, view), maps.read(row).numpy()
         # where nothing is hit, or only something far behind
         before = depth < (1 - MARGIN) * first.range * first.ray_z
-        squares, centres = pixel_squares(view, depth, data.image(row), before & accept(maps, row, first))
+        squares, centers = pixel_squares(view, depth, data.image(row), before & accept(maps, row, first))
         parts.append(
             (
                 squares,
-                cloud_in_order(centres.voxel_down_sample(voxel_size))
-                if len(centres.point.positions)
-                else centres,
+                cloud_in_order(centers.voxel_down_sample(voxel_size))
+                if len(centers.point.positions)
+                else centers,
             )
         )
     return _joined(parts)
 
 
 def _agreed(maps: _DepthMaps, row: int, first: FirstSurface) -> np.ndarray:
-    """(H, W) bool: as high as the surroundings, and more neighbours agree than look through it."""
+    """(H, W) bool: as high as the surroundings, and more neighbors agree than look through it."""
     return maps.usual(row) & (maps.counts(row, LOOSE) > maps.blocks(row))
 
 
 def _unopposed(maps: _DepthMaps, row: int, first: FirstSurface) -> np.ndarray:
-    """(H, W) bool: as high as the surroundings, nothing known behind it, and no neighbour looks through it:
+    """(H, W) bool: as high as the surroundings, nothing known behind it, and no neighbor looks through it:
     what only one view sees.
     """
     return maps.usual(row) & (maps.blocks(row) == 0) & ~np.isfinite(first.range)
 
 
 def _plausible(maps: _DepthMaps, row: int, first: FirstSurface) -> np.ndarray:
-    """(H, W) bool: some neighbour agrees, or at most one looks through it; crowns in the wind, but also
+    """(H, W) bool: some neighbor agrees, or at most one looks through it; crowns in the wind, but also
     floaters.
     """
     return (maps.counts(row, LOOSE) >= 1) | (maps.blocks(row) <= 1)
@@ -242,7 +242,7 @@ class _Relief:
 
 
 class _DepthMaps:
-    """Depth of every view, kept on disk, and what the neighbours say of it."""
+    """Depth of every view, kept on disk, and what the neighbors say of it."""
 
     def __init__(self, folder: Path, data: DepthViews) -> None:
         self.folder, self.data = folder, data
@@ -263,17 +263,17 @@ class _DepthMaps:
         return torch.from_numpy(np.load(self.folder / f"{row}{kind}.npy"))
 
     def counts(self, row: int, tolerance: float) -> np.ndarray:
-        """(H, W) number of neighbours that see a pixel's surface within `tolerance` px of where this view has
+        """(H, W) number of neighbors that see a pixel's surface within `tolerance` px of where this view has
         it.
         """
         others = [
-            (self.read(other), self.data.views[other]) for other in self.data.neighbours[row][:NUM_NEIGHBOURS]
+            (self.read(other), self.data.views[other]) for other in self.data.neighbors[row][:NUM_NEIGHBORS]
         ]
         return consistent(self.read(row), self.data.views[row], others, tolerance).numpy()
 
     def confirmed(self, row: int, min_views: int) -> np.ndarray:
-        """(H, W) float32 depth that enough neighbours confirm, else 0."""
-        enough = self.counts(row, 1.0) >= min(min_views, len(self.data.neighbours[row]))
+        """(H, W) float32 depth that enough neighbors confirm, else 0."""
+        enough = self.counts(row, 1.0) >= min(min_views, len(self.data.neighbors[row]))
         return np.where(enough, self.read(row).numpy(), 0).astype(np.float32)
 
     def trust(self, mesh: o3d.t.geometry.TriangleMesh) -> None:
@@ -302,19 +302,19 @@ class _DepthMaps:
         ).reshape(depth.shape)
 
     def blocks(self, row: int) -> np.ndarray:
-        """(H, W) number of neighbours that are sure of a surface behind a pixel's point, so that it would be
+        """(H, W) number of neighbors that are sure of a surface behind a pixel's point, so that it would be
         in their way; after `trust`.
         """
         sure = [
             (self.read(other, "-sure"), self.data.views[other])
-            for other in self.data.neighbours[row][:NUM_NEIGHBOURS]
+            for other in self.data.neighbors[row][:NUM_NEIGHBORS]
         ]
         return blocking(self.read(row), self.data.views[row], sure, MARGIN).numpy()
 
 
-def centre_cloud(gaussians: Gaussians, centres: np.ndarray, min_opacity: float) -> o3d.t.geometry.PointCloud:
-    """The Gaussians' centres as a cloud: positions, colours, normals (smallest axis, towards the nearest of
-    the (M, 3) camera centres).
+def center_cloud(gaussians: Gaussians, centers: np.ndarray, min_opacity: float) -> o3d.t.geometry.PointCloud:
+    """The Gaussians' centers as a cloud: positions, colors, normals (smallest axis, towards the nearest of
+    the (M, 3) camera centers).
     """
     chosen = gaussians[gaussians.opacities >= min_opacity].detached()
     if not len(chosen):
@@ -324,7 +324,7 @@ def centre_cloud(gaussians: Gaussians, centres: np.ndarray, min_opacity: float) 
     colors = np.clip(0.5 + 0.28209479177387814 * chosen.sh[:, 0].numpy(), 0, 1)
     cloud.point.colors = o3d.core.Tensor(np.round(colors * 255).astype(np.uint8))
     cloud.point.normals = o3d.core.Tensor(
-        orient_normals(points, chosen.normals.numpy(), centres).astype(np.float32)
+        orient_normals(points, chosen.normals.numpy(), centers).astype(np.float32)
     )
     return cloud
 

@@ -207,7 +207,7 @@ def _georeference(
             settings.altitude_offset,
             {"control_points": figures},
         )
-    fit = place(flight, _centres(model), _points(model)) if flight else None
+    fit = place(flight, _centers(model), _points(model)) if flight else None
     if fit is None:
         if flight:
             logger.warning(
@@ -215,19 +215,19 @@ def _georeference(
             )
         _level(model)
         return None
-    moved = dict(zip(_centres(model), fit.apply(np.array(list(_centres(model).values())))))
+    moved = dict(zip(_centers(model), fit.apply(np.array(list(_centers(model).values())))))
     if (
         flight.shape == "line"
-        or residuals(flight, _centres(model))["rms"] > LOOSE * residuals(flight, moved)["rms"]
+        or residuals(flight, _centers(model))["rms"] > LOOSE * residuals(flight, moved)["rms"]
     ):
         transform(model, fit)
     return from_origin(
-        flight.origin, settings.epsg, settings.altitude_offset, {"gps": residuals(flight, _centres(model))}
+        flight.origin, settings.epsg, settings.altitude_offset, {"gps": residuals(flight, _centers(model))}
     )
 
 
-def _centres(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
-    """Camera centre (3,) by photo name."""
+def _centers(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    """Camera center (3,) by photo name."""
     images = sorted(
         (model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name
     )
@@ -241,7 +241,7 @@ def _points(model: pycolmap.Reconstruction) -> np.ndarray:
 def _level(model: pycolmap.Reconstruction) -> None:
     """Without GPS: z up = normal of the main plane of the sparse points, towards the cameras; unit = unknown."""
     axes, middle = main_plane(_points(model))
-    if axes[2] @ (np.mean(list(_centres(model).values()), axis=0) - middle) < 0:
+    if axes[2] @ (np.mean(list(_centers(model).values()), axis=0) - middle) < 0:
         axes = axes * [[1], [-1], [-1]]
     transform(model, Similarity(1.0, axes, -axes @ middle))
 
@@ -278,7 +278,7 @@ def _heights(
     heights = {
         "height_above_points_m": round(
             float(
-                np.mean([centre[2] for centre in _centres(model).values()]) - np.median(_points(model)[:, 2])
+                np.mean([center[2] for center in _centers(model).values()]) - np.median(_points(model)[:, 2])
             ),
             1,
         )

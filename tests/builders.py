@@ -36,17 +36,17 @@ def views() -> list[View]:
     camera = pycolmap.Camera(
         model="SIMPLE_RADIAL", width=SIZE[0], height=SIZE[1], params=[150.0, 80.0, 60.0, -0.05], camera_id=1
     )
-    centres = [[-1, -1, 9], [1, -1, 9], [1, 1, 9], [-1, 1, 9], [0, 0, 10]]
+    centers = [[-1, -1, 9], [1, -1, 9], [1, 1, 9], [-1, 1, 9], [0, 0, 10]]
     return [
-        View(f"photo_{row}.jpg", camera, look_at(ORIGIN + centre, ORIGIN))
-        for row, centre in enumerate(centres)
+        View(f"photo_{row}.jpg", camera, look_at(ORIGIN + center, ORIGIN))
+        for row, center in enumerate(centers)
     ]
 
 
 def truth_mask(view: View) -> np.ndarray:
     """Exact labels: road where x < 0, grass elsewhere, 0 outside the ground."""
     directions, _ = rays(view)
-    hits = view.centre + directions * (-(view.centre[2] - ORIGIN[2]) / directions[:, 2])[:, None] - ORIGIN
+    hits = view.center + directions * (-(view.center[2] - ORIGIN[2]) / directions[:, 2])[:, None] - ORIGIN
     label = np.where(hits[:, 0] < 0, 1, 3)
     label[np.abs(hits[:, :2]).max(axis=1) > 3.9] = 0
     return label.reshape(view.height, view.width).astype(np.uint8)
@@ -120,7 +120,7 @@ def write_scene(
 
 def labelled_scene(path: Path) -> Scene:
     """Road and grass in UTM coordinates with labels, confidences, states and votes, masks, and photos of
-    different greys, the first 128.
+    different grays, the first 128.
     """
     write_bare_scene(path)
     points = ground()

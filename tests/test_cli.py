@@ -110,9 +110,9 @@ class TestBadInput:
         Image.fromarray(np.full((120, 160), 2, np.uint8)).save(scene / "masks" / "photo_1.png")
         self.check(capsys, scene, ["photo_1.png", "class id 2"], "label", scene)
 
-    def test_mask_with_colours(self, capsys, scene):
+    def test_mask_with_colors(self, capsys, scene):
         Image.fromarray(np.full((120, 160, 3), 2, np.uint8)).save(scene / "masks" / "photo_1.png")
-        self.check(capsys, scene, ["photo_1.png", "colours"], "label", scene)
+        self.check(capsys, scene, ["photo_1.png", "colors"], "label", scene)
 
     def test_missing_cameras(self, capsys, scene):
         for file in (scene / "sparse" / "0").iterdir():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sc3d.errors import Sc3dError
-from sc3d.extraction import DepthViews, centre_cloud, extract_surface, wanted_coverage
+from sc3d.extraction import DepthViews, center_cloud, extract_surface, wanted_coverage
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.settings.reconstruction import Extract
 from sc3d.splatting.gaussians import Gaussians
@@ -30,18 +30,18 @@ def flat_square(half: float, height: float) -> Gaussians:
 
 
 def views() -> list:
-    centres = [[-2, -2, 12], [2, -2, 12], [2, 2, 12], [-2, 2, 12], [0, 0, 13]]
+    centers = [[-2, -2, 12], [2, -2, 12], [2, 2, 12], [-2, 2, 12], [0, 0, 13]]
     return [
         pinhole_view(
-            f"{row}.jpg", (160, 120), (150, 150, 78, 62), look_at(np.array(centre, float), np.zeros(3))
+            f"{row}.jpg", (160, 120), (150, 150, 78, 62), look_at(np.array(center, float), np.zeros(3))
         )
-        for row, centre in enumerate(centres)
+        for row, center in enumerate(centers)
     ]
 
 
 def data() -> DepthViews:
-    neighbours = [np.array([other for other in range(5) if other != row]) for row in range(5)]
-    return DepthViews(views(), lambda row: np.full((120, 160, 3), 90, np.uint8), neighbours, (1.0, 30.0))
+    neighbors = [np.array([other for other in range(5) if other != row]) for row in range(5)]
+    return DepthViews(views(), lambda row: np.full((120, 160, 3), 90, np.uint8), neighbors, (1.0, 30.0))
 
 
 def test_plane_comes_out_flat_closed_and_upwards():
@@ -58,7 +58,7 @@ def test_plane_comes_out_flat_closed_and_upwards():
 
 def test_completion_covers_what_only_one_view_sees():
     lonely = replace(
-        data(), neighbours=[np.array([4]), np.array([4]), np.array([4]), np.array([4]), np.array([0])]
+        data(), neighbors=[np.array([4]), np.array([4]), np.array([4]), np.array([4]), np.array([0])]
     )
     without = extract_surface(flat_square(8.0, 0.0), lonely, Extract(voxel_size=0.15, coverage=0.0))
     completed = extract_surface(flat_square(8.0, 0.0), lonely, Extract(voxel_size=0.15, coverage=1.0))
@@ -71,14 +71,14 @@ def test_nothing_to_see_is_said():
         extract_surface(flat_square(1.0, 50.0), data(), Extract())
 
 
-def test_centres_with_colours_and_normals_towards_the_cameras():
+def test_centers_with_colors_and_normals_towards_the_cameras():
     gaussians = flat_square(2.0, 0.0)
-    cloud = centre_cloud(gaussians, np.array([view.centre for view in views()]), 0.3)
+    cloud = center_cloud(gaussians, np.array([view.center for view in views()]), 0.3)
     assert len(cloud.point.positions) == len(gaussians)
     assert (cloud.point.normals.numpy()[:, 2] > 0.99).all()
     assert np.abs(cloud.point.colors.numpy().astype(int) - [200, 120, 40]).max() <= 1
     with pytest.raises(Sc3dError, match="min-opacity"):
-        centre_cloud(gaussians, np.zeros((1, 3)), 0.99)
+        center_cloud(gaussians, np.zeros((1, 3)), 0.99)
 
 
 def test_a_point_before_a_surface_that_others_see_is_blocked():
@@ -88,7 +88,7 @@ def test_a_point_before_a_surface_that_others_see_is_blocked():
     flat = [
         torch.from_numpy(
             (
-                other.centre[2]
+                other.center[2]
                 / -(
                     np.linalg.inv(other.matrix)
                     @ np.concatenate(
@@ -117,8 +117,8 @@ def test_a_point_before_a_surface_that_others_see_is_blocked():
 def test_only_flights_that_look_one_way_are_filled_without_limit():
     ahead, aside = np.array([0.0, 0.0, 12.0]), np.array([9.0, 0.0, 12.0])
     down = [
-        pinhole_view(f"{row}.jpg", (160, 120), (150, 150, 80, 60), look_at(centre, centre * [1, 1, 0]))
-        for row, centre in enumerate((ahead, aside))
+        pinhole_view(f"{row}.jpg", (160, 120), (150, 150, 80, 60), look_at(center, center * [1, 1, 0]))
+        for row, center in enumerate((ahead, aside))
     ]
     oblique = pinhole_view("o.jpg", (160, 120), (150, 150, 80, 60), look_at(aside, np.zeros(3)))
     assert wanted_coverage(down) == 1 and wanted_coverage([*down, oblique]) < 1

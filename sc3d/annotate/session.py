@@ -135,7 +135,7 @@ class Session:
     def try_out(self, stem: str) -> bytes:
         """Learn from all strokes of the scene, if they have changed, and segment a photo.
 
-        returns: RGBA PNG in the colours of the classes, transparent where there is no label; no larger than
+        returns: RGBA PNG in the colors of the classes, transparent where there is no label; no larger than
             needed
         Raises BusyError while another request does the same.
         """

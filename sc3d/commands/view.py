@@ -126,12 +126,12 @@ def _show_page(command: View, scene: Scene, views: list[Camera]) -> None:
     splats_first = command.splats or not has_cloud
     splats = _splats_of_scene(scene) if splats_first else None
     inspector = _inspector(
-        scene, _read_cloud(command, scene, votes=True) if has_cloud else splats.centres(), views
+        scene, _read_cloud(command, scene, votes=True) if has_cloud else splats.centers(), views
     )
     by = command.by
     if splats_first and not can_color(inspector.cloud, by):
         by = "photo"
-        logger.info("there are no labels yet, the colours are those of the photos")
+        logger.info("there are no labels yet, the colors are those of the photos")
     color_points(inspector.cloud, by, inspector.class_table)
     load_splats = (
         None if splats is None and not scene.gaussians.exists() else lambda: splats or _splats_of_scene(scene)
@@ -223,7 +223,7 @@ def _splats(command: View, scene: Scene) -> ShownSplats:
 
 
 def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: the splats from the air, or beside a photo; in class colours or by confidence
+    """(H, W, 3) uint8 RGB: the splats from the air, or beside a photo; in class colors or by confidence
     where they have labels.
     """
     from sc3d.geometry.cameras import resample

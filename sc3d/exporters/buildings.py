@@ -68,7 +68,7 @@ def split_buildings(covered: np.ndarray, heights: np.ndarray, grid: Grid, min_ar
     """(H, W) int32 number of the building in each cell from 1, 0 = none: connected cells without a step
     between them.
 
-    covered: (H, W) bool; heights: (H, W) m; min_area: smaller pieces go to the neighbour that they touch, or
+    covered: (H, W) bool; heights: (H, W) m; min_area: smaller pieces go to the neighbor that they touch, or
         vanish, m2
     """
     blocks, _ = ndimage.label(covered)

@@ -86,5 +86,5 @@ def _write_place(scene: Scene, folder: Path) -> None:
 def _frame(view: View, lens: dict) -> dict[str, object]:
     matrix = np.eye(4)
     matrix[:3, :3] = view.cam_from_world[:3, :3].T * OPENGL
-    matrix[:3, 3] = view.centre
+    matrix[:3, 3] = view.center
     return {"file_path": f"../../images/{view.name}", **lens, "transform_matrix": matrix.tolist()}

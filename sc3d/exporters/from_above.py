@@ -67,7 +67,7 @@ class FromAbove:
         """A strip of the grid.
 
         returns: (num_rows, W) float64 height, CRS, NaN = nothing there; (num_rows, W) int64 row of the point
-            that tells colour and class, -1 = none near
+            that tells color and class, -1 = none near
         """
         rows = self.highest[first_row : first_row + num_rows].copy()
         heights = np.where(rows >= 0, self.points[rows, 2], np.nan)
@@ -75,19 +75,19 @@ class FromAbove:
             return heights, rows
         below = self._cast(first_row, num_rows)
         hit = np.isfinite(below).reshape(rows.shape)
-        centres = np.concatenate([self.grid.centres(first_row, num_rows), below[:, None]], axis=1)[
+        centers = np.concatenate([self.grid.centers(first_row, num_rows), below[:, None]], axis=1)[
             hit.ravel()
         ]
-        if len(centres):
-            nearest, distance = self.index.nearest(centres, 1)
+        if len(centers):
+            nearest, distance = self.index.nearest(centers, 1)
             rows[hit] = np.where(distance[:, 0] <= self.reach, nearest[:, 0], -1)
-            heights[hit] = centres[:, 2]
+            heights[hit] = centers[:, 2]
         return heights, rows
 
     def _cast(self, first_row: int, num_rows: int) -> np.ndarray:
-        """(num_rows * W,) float64 z of the mesh under the cell centres, CRS; NaN where rays hit nothing."""
+        """(num_rows * W,) float64 z of the mesh under the cell centers, CRS; NaN where rays hit nothing."""
         rays = np.zeros((num_rows * self.grid.width, 6), np.float32)
-        rays[:, :2] = self.grid.centres(first_row, num_rows) - self.surface.origin[:2]
+        rays[:, :2] = self.grid.centers(first_row, num_rows) - self.surface.origin[:2]
         rays[:, 2], rays[:, 5] = self.start - self.surface.origin[2], -1.0
         distance = self.surface.scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy().astype(np.float64)
         return np.where(

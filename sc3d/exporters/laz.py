@@ -1,4 +1,4 @@
-"""The labelled cloud as LAZ 1.4: ASPRS class codes, colours, CRS as WKT, and what sc3d knows of each point as
+"""The labelled cloud as LAZ 1.4: ASPRS class codes, colors, CRS as WKT, and what sc3d knows of each point as
 extra dimensions.
 """
 
@@ -19,7 +19,7 @@ from sc3d.settings.outputs import Export
 
 CHUNK = 1_000_000  # points written at a time
 SCALE = 0.001  # of the stored whole numbers, units of the CRS
-OFFSET_STEP = 1000.0  # offsets are multiples of this, so that neighbouring files share theirs
+OFFSET_STEP = 1000.0  # offsets are multiples of this, so that neighboring files share theirs
 UNASSIGNED = 1  # ASPRS code of points without a label
 COLORS, PLAIN = 7, 6  # point formats
 DIMENSIONS = (
@@ -35,7 +35,7 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
-    """`export/labelled.laz`: point format 7 (6 without colours); positions to 1 mm in the CRS, or in the
+    """`export/labelled.laz`: point format 7 (6 without colors); positions to 1 mm in the CRS, or in the
     scene's frame without one.
     """
     ids, codes = sorted(chosen_classes(scene, settings)), asprs_codes(scene.class_table())
@@ -73,7 +73,7 @@ def asprs_codes(table: ClassTable) -> np.ndarray:
 
 def make_header(low: np.ndarray, high: np.ndarray, placed: PlacedCloud) -> laspy.LasHeader:
     """LAS 1.4 header of points between low and high (3,), CRS; InputError if they span more than whole
-    millimetres in 32 bits can hold.
+    millimeters in 32 bits can hold.
 
     placed: some of them, for what all have
     """

@@ -65,7 +65,7 @@ def find_objects(placed: PlacedCloud, table: ClassTable, settings: Export) -> di
     them from the ground.
     """
     kinds = split_kinds(placed.labels.label, table)
-    points = placed.points * placed.placement.unit  # all lengths below are metres
+    points = placed.points * placed.placement.unit  # all lengths below are meters
     pixel = max(CELL * spacing_of_all(points), MIN_CELL)
     grid = Grid.around(points, pixel)
     ground = ground_height(points, kinds.ground, grid)
@@ -139,7 +139,7 @@ def _describe(
     members: np.ndarray,
     cloud: tuple[PlacedCloud, ClassTable],
 ) -> list[MapObject]:
-    """Objects of numbered outlines in metres; members: (N,) int number of the object that each point belongs
+    """Objects of numbered outlines in meters; members: (N,) int number of the object that each point belongs
     to, 0 = none.
     """
     placed, table = cloud

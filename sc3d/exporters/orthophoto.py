@@ -1,4 +1,4 @@
-"""Maps from straight above as GeoTIFF: colours, classes with their palette, heights of the surface."""
+"""Maps from straight above as GeoTIFF: colors, classes with their palette, heights of the surface."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def _fill(above: FromAbove, placed: PlacedCloud, table: ClassTable, files: tuple
 
 
 def _colors(placed: PlacedCloud, rows: np.ndarray) -> np.ndarray:
-    """(4, h, w) uint8 red, green, blue, alpha of point rows (h, w); grey for clouds without colours."""
+    """(4, h, w) uint8 red, green, blue, alpha of point rows (h, w); gray for clouds without colors."""
     image = np.full((4, *rows.shape), 128, np.uint8)
     if placed.colors is not None:
         image[:3] = placed.colors[rows].transpose(2, 0, 1)

@@ -110,7 +110,7 @@ def _sides(ring: shapely.LinearRing, turn: float, shortest: float) -> list[Side]
 
 
 def _alternate(corners: np.ndarray) -> list[Side]:
-    """Sides of a ring (K, 2), neighbours of one axis joined; [] if it has fewer than four."""
+    """Sides of a ring (K, 2), neighbors of one axis joined; [] if it has fewer than four."""
     steps = np.roll(corners, -1, axis=0) - corners
     middles = corners + 0.5 * steps
     axes = (np.abs(steps[:, 0]) >= np.abs(steps[:, 1])).astype(int)  # along x: y is constant
@@ -133,7 +133,7 @@ def _joined(first: Side, second: Side) -> Side:
 
 
 def _without(sides: list[Side], row: int) -> list[Side]:
-    """The side is dropped and its two neighbours, which lie along the same axis, become one."""
+    """The side is dropped and its two neighbors, which lie along the same axis, become one."""
     rolled = sides[row:] + sides[:row]
     return [_joined(rolled[-1], rolled[1]), *rolled[2:-1]]
 

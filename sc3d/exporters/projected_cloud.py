@@ -48,7 +48,7 @@ class Placement:
 
     @cached_property
     def unit(self) -> float:
-        """Metres per unit of the exported coordinates, all three of them."""
+        """Meters per unit of the exported coordinates, all three of them."""
         return float(self.crs.axis_info[0].unit_conversion_factor) if self.crs else 1.0
 
     def points(self, points: np.ndarray) -> np.ndarray:
@@ -127,7 +127,7 @@ class PlacedCloud:
 
     @property
     def colors(self) -> np.ndarray | None:
-        """(N, 3) uint8 RGB; None if the cloud has no colours."""
+        """(N, 3) uint8 RGB; None if the cloud has no colors."""
         if "colors" not in self.cloud.point:
             return None
         colors = self.cloud.point.colors.numpy()

@@ -7,7 +7,7 @@ from scipy import sparse
 
 
 def connected_cells(groups: np.ndarray, heights: np.ndarray, step: float) -> np.ndarray:
-    """(H, W) int32 component from 1 of the cells of one group (from 1, 0 = no cell) whose neighbours (4)
+    """(H, W) int32 component from 1 of the cells of one group (from 1, 0 = no cell) whose neighbors (4)
     differ by less than `step`; 0 = no cell.
     """
     index = np.arange(groups.size).reshape(groups.shape)
@@ -41,7 +41,7 @@ def renumbered(parts: np.ndarray) -> np.ndarray:
 
 
 def neighbors() -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
-    """The cells and their right, then lower neighbours."""
+    """The cells and their right, then lower neighbors."""
     everything, first, last = slice(None), slice(None, -1), slice(1, None)
     return [((everything, first), (everything, last)), ((first, everything), (last, everything))]
 

@@ -15,7 +15,7 @@ SUPPORT = 0.25  # blocks with less than this share of the usual number of ground
 
 
 def ground_height(points: np.ndarray, is_ground: np.ndarray, grid: Grid) -> np.ndarray:
-    """(H, W) float64 height of the ground at the cell centres of `grid`, m: block medians, interpolated
+    """(H, W) float64 height of the ground at the cell centers of `grid`, m: block medians, interpolated
     across gaps.
 
     points: (N, 3) CRS in m; is_ground: (N,) bool, at least one True
@@ -28,8 +28,8 @@ def ground_height(points: np.ndarray, is_ground: np.ndarray, grid: Grid) -> np.n
     known = count >= SUPPORT * np.median(count[count > 0])
     known &= ~_stands_out(medians, known)
     smooth = interpolate(medians, known)
-    centres = grid.centres()
-    coordinates = [(blocks.top - centres[:, 1]) / CELL - 0.5, (centres[:, 0] - blocks.left) / CELL - 0.5]
+    centers = grid.centers()
+    coordinates = [(blocks.top - centers[:, 1]) / CELL - 0.5, (centers[:, 0] - blocks.left) / CELL - 0.5]
     return ndimage.map_coordinates(smooth, coordinates, order=1, mode="nearest").reshape(grid.shape)
 
 

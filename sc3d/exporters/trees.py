@@ -48,7 +48,7 @@ def smoothed(heights: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray
 def climb(heights: np.ndarray, tall: np.ndarray, pixel: float) -> np.ndarray:
     """(H, W) int32 number from 1 of the top that each tall cell climbs to, 0 = not tall.
 
-    A cell steps to the highest of its neighbours; from a local maximum on to the highest cell within half the
+    A cell steps to the highest of its neighbors; from a local maximum on to the highest cell within half the
     usual width of a crown of that height;
     where there is none, it is a top. heights: (H, W) m; equal heights are decided by place.
     """

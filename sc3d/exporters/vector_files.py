@@ -1,4 +1,4 @@
-"""Counted objects as map features: GeoJSON in WGS 84, or in the scene's own metres, and GeoPackage in the CRS
+"""Counted objects as map features: GeoJSON in WGS 84, or in the scene's own meters, and GeoPackage in the CRS
 where pyogrio is installed.
 """
 
@@ -18,7 +18,7 @@ from sc3d.io.atomic import atomic_path
 
 shapely = load("shapely")
 
-DEGREES, METRES = 9, 3  # decimals of coordinates: 0.1 mm and 1 mm
+DEGREES, METERS = 9, 3  # decimals of coordinates: 0.1 mm and 1 mm
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,11 @@ def has_geopackage() -> bool:
 
 def write_geojson(path: Path, objects: list[MapObject], placement: Placement) -> None:
     """RFC 7946: longitude and latitude, WGS 84, outer rings counter-clockwise; without a CRS the scene's
-    metres, which a member of the file says.
+    meters, which a member of the file says.
     """
     collection: dict[str, object] = {"type": "FeatureCollection", "name": path.stem}
     if placement.crs is None:
-        collection["coordinates"] = "metres in the scene's own frame, not on Earth"
+        collection["coordinates"] = "meters in the scene's own frame, not on Earth"
     collection["features"] = [
         {
             "type": "Feature",
@@ -108,7 +108,7 @@ def write_geopackage(path: Path, layers: dict[str, list[MapObject]], placement: 
 
 def _rings(item: MapObject, placement: Placement) -> list[list[list[float]]]:
     polygon = shapely.geometry.polygon.orient(item.polygon)
-    decimals, forward = METRES, None
+    decimals, forward = METERS, None
     if placement.crs is not None:
         import pyproj
 

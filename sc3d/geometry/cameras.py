@@ -1,7 +1,7 @@
 """Views: a COLMAP camera of any model plus a pose; rays, projection, undistortion.
 
-Camera frame: x right, y down, z forward. Pixel coordinates: the centre of the top-left pixel is (0.5, 0.5).
-Poses and rays are float64, so positions of UTM size keep their millimetres.
+Camera frame: x right, y down, z forward. Pixel coordinates: the center of the top-left pixel is (0.5, 0.5).
+Poses and rays are float64, so positions of UTM size keep their millimeters.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class View:
         return np.asarray(self.camera.calibration_matrix(), dtype=np.float64)
 
     @cached_property
-    def centre(self) -> np.ndarray:
-        """(3,) camera centre, world."""
+    def center(self) -> np.ndarray:
+        """(3,) camera center, world."""
         rotation, translation = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
         return -rotation.T @ translation
 
@@ -62,7 +62,7 @@ class View:
 
     @cached_property
     def frustum(self) -> np.ndarray:
-        """(4, 3) unit normals, camera frame, of planes through the centre; everything in the image lies on
+        """(4, 3) unit normals, camera frame, of planes through the center; everything in the image lies on
         their negative side.
 
         All zero where the field of view is too wide for planes.
@@ -119,10 +119,10 @@ def pinhole_view(
 
 
 def look_at(
-    centre: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    center: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)
 ) -> np.ndarray:
-    """(4, 4) cam_from_world of a camera at `centre` (3,) that looks at `target` (3,), image top towards `up`."""
-    forward = np.asarray(target, np.float64) - centre
+    """(4, 4) cam_from_world of a camera at `center` (3,) that looks at `target` (3,), image top towards `up`."""
+    forward = np.asarray(target, np.float64) - center
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, up)
     if np.linalg.norm(right) < 1e-9:  # straight up or down: image top towards +y
@@ -131,12 +131,12 @@ def look_at(
     rotation = np.stack([right, np.cross(forward, right), forward])
     transform = np.eye(4)
     transform[:3, :3] = rotation
-    transform[:3, 3] = -rotation @ np.asarray(centre, np.float64)
+    transform[:3, 3] = -rotation @ np.asarray(center, np.float64)
     return transform
 
 
-def pixel_centres(width: int, height: int) -> np.ndarray:
-    """(height * width, 2) float64 pixel coordinates of all pixel centres, row by row."""
+def pixel_centers(width: int, height: int) -> np.ndarray:
+    """(height * width, 2) float64 pixel coordinates of all pixel centers, row by row."""
     columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([columns.ravel(), rows.ravel()], axis=1)
 
@@ -144,17 +144,17 @@ def pixel_centres(width: int, height: int) -> np.ndarray:
 def rays(view: View, pixels: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Viewing rays of pixels.
 
-    pixels: (N, 2) px; None = all pixel centres row by row
+    pixels: (N, 2) px; None = all pixel centers row by row
     returns: (N, 3) unit directions, world; (N,) z component of each in the camera frame, so that depth =
         range * z. NaN where the model has no ray.
     """
-    pixels = pixel_centres(view.width, view.height) if pixels is None else np.asarray(pixels, np.float64)
+    pixels = pixel_centers(view.width, view.height) if pixels is None else np.asarray(pixels, np.float64)
     directions_cam = _unit_rays(view.camera, pixels)
     return directions_cam @ view.cam_from_world[:3, :3], directions_cam[:, 2]
 
 
 def camera_rays(camera: pycolmap.Camera) -> np.ndarray:
-    """(height * width, 3) float32 unit directions of all pixel centres row by row, camera frame; NaN where
+    """(height * width, 3) float32 unit directions of all pixel centers row by row, camera frame; NaN where
     the model has no ray.
 
     Kept for the last few cameras, because photos share cameras and differ by their pose only. Read-only.
@@ -234,12 +234,12 @@ def resample(image: np.ndarray, view: View, target: View, labels: bool = False) 
         mixed.
     """
     height, width = image.shape[:2]
-    directions_cam = _unit_rays(target.camera, pixel_centres(target.width, target.height))
+    directions_cam = _unit_rays(target.camera, pixel_centers(target.width, target.height))
     pixels = view.camera.img_from_cam(directions_cam, check_cheirality=False) * [
         width / view.width,
         height / view.height,
     ]
-    # cv2: pixel centre = integer
+    # cv2: pixel center = integer
     maps = (pixels - 0.5).astype(np.float32).reshape(target.height, target.width, 2)
     shrink = width / target.width
     if labels:
@@ -251,7 +251,7 @@ def resample(image: np.ndarray, view: View, target: View, labels: bool = False) 
 
 def local_origin(views: list[View]) -> np.ndarray:
     """(3,) whole-number world position near the cameras; subtract it before float32 work."""
-    return np.round(np.median([view.centre for view in views], axis=0))
+    return np.round(np.median([view.center for view in views], axis=0))
 
 
 @lru_cache(maxsize=2)
@@ -260,7 +260,7 @@ def _camera_rays(model: str, width: int, height: int, params: tuple[float, ...])
     directions = np.empty((height, width, 3), np.float32)
     step = max(1, 500_000 // width)  # pixels in float64 at a time
     for row in range(0, height, step):
-        pixels = pixel_centres(width, min(step, height - row)) + [0, row]
+        pixels = pixel_centers(width, min(step, height - row)) + [0, row]
         directions[row : row + step] = _unit_rays(camera, pixels).reshape(-1, width, 3)
     directions.setflags(write=False)
     return directions.reshape(-1, 3)

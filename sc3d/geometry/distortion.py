@@ -1,10 +1,10 @@
 """Lens models of other programs as COLMAP cameras, exactly; where COLMAP has no such model, within a
 tolerance or not at all.
 
-All models here share one form: normalised image coordinates (perspective x / z, or the angle from the axis
+All models here share one form: normalized image coordinates (perspective x / z, or the angle from the axis
 for fisheyes) times a radial polynomial,
 plus tangential terms, then focal lengths, skew and principal point. Pixel coordinates are COLMAP's: the
-centre of the first pixel is (0.5, 0.5).
+center of the first pixel is (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Lens:
     """A lens model.
 
     width, height: px; focal: (fx, fy) px; principal: (cx, cy) px; skew: px per unit of y
-    radial: coefficients of r^2, r^4, ... (r: normalised radius, or the angle for a fisheye)
+    radial: coefficients of r^2, r^4, ... (r: normalized radius, or the angle for a fisheye)
     tangential: (p1, p2) as in OpenCV: dx = 2 p1 xy + p2 (r^2 + 2 x^2), dy = 2 p2 xy + p1 (r^2 + 2 y^2)
     prism: thin prism (x, y): dx = s r^2
     """
@@ -42,7 +42,7 @@ class Lens:
 
     @property
     def reach(self) -> float:
-        """Largest distorted radius in the image, normalised."""
+        """Largest distorted radius in the image, normalized."""
         x = max(self.principal[0], self.width - self.principal[0]) / self.focal[0]
         y = max(self.principal[1], self.height - self.principal[1]) / self.focal[1]
         return float(np.hypot(x, y))
@@ -91,7 +91,7 @@ def to_camera(lens: Lens, tolerance: float, where: str) -> pycolmap.Camera:
     if lost > tolerance:
         raise InputError(
             f"{where}: pixels that are not rectangular (skew {lens.skew:.3g} px) have no COLMAP model; leaving that out costs up to {lost:.2g} px: "
-            f"optimise the cameras without it, export undistorted photos, or allow it with --tolerance {_ceiling(lost)}"
+            f"optimize the cameras without it, export undistorted photos, or allow it with --tolerance {_ceiling(lost)}"
         )
     model, params = (_fisheye if lens.fisheye else _perspective)(lens, tolerance, where)
     return pycolmap.Camera(
@@ -130,7 +130,7 @@ def _rational(lens: Lens, tolerance: float, where: str) -> tuple[list[float], li
     if not lost <= tolerance:
         raise InputError(
             f"{where}: a radial polynomial up to r^{2 * len(lens.radial)} has no COLMAP model, and the nearest one is up to {lost:.2g} px off: "
-            f"optimise the cameras without k4, export undistorted photos, or allow it with --tolerance {_ceiling(lost)}"
+            f"optimize the cameras without k4, export undistorted photos, or allow it with --tolerance {_ceiling(lost)}"
         )
     return list(found[:2]), list(found[2:])
 

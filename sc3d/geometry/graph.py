@@ -1,8 +1,8 @@
-"""Neighbour graph of a cloud with the joint similarity of eq. 7 as edge weights, in a canonical order of the
+"""Neighbor graph of a cloud with the joint similarity of eq. 7 as edge weights, in a canonical order of the
 points.
 
-The points are sorted along a Morton curve first: neighbours are then near in memory, and everything computed
-on the graph (nearest neighbours of
+The points are sorted along a Morton curve first: neighbors are then near in memory, and everything computed
+on the graph (nearest neighbors of
 equal distance, sums of floats) is the same whatever the order in which the points came.
 """
 
@@ -18,10 +18,10 @@ from sc3d.geometry.neighbors import NeighborIndex, estimate_normals
 
 ALPHA, BETA, GAMMA = 0.6, 0.4, 1.0  # eq. 7
 RADIUS = 3.0  # edges reach this many local point spacings
-SPACING_NEIGHBOR = 4  # the local spacing is the distance to this neighbour
-COLOR_WIDTH = 0.1  # standard deviation of colours on one surface, of 1
+SPACING_NEIGHBOR = 4  # the local spacing is the distance to this neighbor
+COLOR_WIDTH = 0.1  # standard deviation of colors on one surface, of 1
 MORTON_BITS = 10
-CHUNK = 200_000  # points whose neighbours are held twice at a time
+CHUNK = 200_000  # points whose neighbors are held twice at a time
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Graph:
         there twice
     spacings: (N,) float32 local point spacing, world units
     normals: (N, 3) float32 unit
-    curvature: (N,) float32 of eq. 6; roughness: (N,) float32 mean distance of the neighbours from the tangent
+    curvature: (N,) float32 of eq. 6; roughness: (N,) float32 mean distance of the neighbors from the tangent
         plane, over that to the farthest
     """
 
@@ -66,7 +66,7 @@ def build_graph(
     ties: tuple[np.ndarray, ...] = (),
     box: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Graph:
-    """Neighbour graph with the joint similarity of eq. 7, times that of colours where given.
+    """Neighbor graph with the joint similarity of eq. 7, times that of colors where given.
 
     points: (N, 3) world; normals: (N, 3) unit, oriented, or None = estimated and compared up to sign; colors:
         (N, 3) uint8 or None
@@ -74,10 +74,10 @@ def build_graph(
     box: lowest and highest corner (3,) of the cloud that the points are a part of, None = of the points:
         parts of a cloud then have the edges of the whole
     Edges join points closer than RADIUS x the local spacing; a wider gap has no edge. Curvature is over the
-    same neighbours.
+    same neighbors.
     """
     low, high = (points.min(axis=0), points.max(axis=0)) if box is None else box
-    local, scale = normalised(points, low, high), float((high - low).max()) or 1.0
+    local, scale = normalized(points, low, high), float((high - low).max()) or 1.0
     order = canonical_order(local, ties)
     local, oriented = local[order], normals is not None
     neighbors, distances = _others(local, num_neighbors)
@@ -111,7 +111,7 @@ def build_graph(
     )
 
 
-def normalised(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def normalized(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """(N, 3) float32 positions in the unit cube over the box from low to high (3,): the same for a world in
     other units or with an offset.
     """
@@ -222,7 +222,7 @@ def _similarities(normals, bend, rows, columns, oriented):
 
 @numba.njit(cache=True, parallel=True)
 def _cut(neighbors, distances, reach):
-    """Neighbours out of reach become -1."""
+    """Neighbors out of reach become -1."""
     for i in numba.prange(len(neighbors)):
         for k in range(neighbors.shape[1]):
             if distances[i, k] > reach[i]:

@@ -1,4 +1,4 @@
-"""Neighbourhoods of points: batched KD-tree queries, normals (eq. 5), curvature (eq. 6), spacing.
+"""Neighborhoods of points: batched KD-tree queries, normals (eq. 5), curvature (eq. 6), spacing.
 
 Batches go through `open3d.core.nns.NearestNeighborSearch`, the tensor form of `KDTreeFlann`.
 """
@@ -22,7 +22,7 @@ class NeighborIndex:
     def __init__(self, points: np.ndarray, origin: np.ndarray | None = None) -> None:
         points = np.asarray(points, np.float64)
         if len(points) == 0:
-            raise ValueError("an empty cloud has no neighbours")
+            raise ValueError("an empty cloud has no neighbors")
         self.num_points = len(points)
         self._origin = np.array(points[0] if origin is None else origin, np.float64)
         self._search = o3d.core.nns.NearestNeighborSearch(
@@ -50,7 +50,7 @@ class NeighborIndex:
 
 def point_spacing(distances: np.ndarray) -> float:
     """Sampling distance of a surface cloud: the side of the area per point, from the median distance to the
-    farthest of K neighbours.
+    farthest of K neighbors.
 
     distances: (N, K + 1) of points to themselves, column 0 = self; K = 8 or so makes grids and random samples
         agree
@@ -61,7 +61,7 @@ def point_spacing(distances: np.ndarray) -> float:
 
 
 def estimate_normals(points: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
-    """Unit normals: eigenvector of the smallest eigenvalue of the neighbourhood covariance (eq. 5); the sign
+    """Unit normals: eigenvector of the smallest eigenvalue of the neighborhood covariance (eq. 5); the sign
     is arbitrary.
 
     points: (N, 3) world; neighbors: (N, K) rows, K >= 3
@@ -78,26 +78,26 @@ def estimate_normals(points: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
 
 
 def orient_normals(
-    points: np.ndarray, normals: np.ndarray, centres: np.ndarray, visible_from: np.ndarray | None = None
+    points: np.ndarray, normals: np.ndarray, centers: np.ndarray, visible_from: np.ndarray | None = None
 ) -> np.ndarray:
     """Flip normals towards the cameras.
 
-    points, normals: (N, 3); centres: (M, 3) camera centres, world
+    points, normals: (N, 3); centers: (M, 3) camera centers, world
     visible_from: (N,) row of a camera that sees the point, -1 = none known; None or -1: the nearest camera
-        centre
+        center
     """
-    origin = centres[0]
-    nearest = NeighborIndex(centres).nearest(points, 1)[0][:, 0]
+    origin = centers[0]
+    nearest = NeighborIndex(centers).nearest(points, 1)[0][:, 0]
     chosen = nearest if visible_from is None else np.where(visible_from >= 0, visible_from, nearest)
-    towards = (centres - origin)[chosen] - (points - origin)
+    towards = (centers - origin)[chosen] - (points - origin)
     away = np.einsum("ij,ij->i", normals, towards.astype(np.float32)) < 0
     return np.where(away[:, None], -normals, normals)
 
 
 def curvature(normals: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
-    """Dispersion of a normal against its neighbours: |n_i - mean_j n_j| (eq. 6).
+    """Dispersion of a normal against its neighbors: |n_i - mean_j n_j| (eq. 6).
 
-    Each neighbour normal is sign-aligned with n_i, so that unoriented normals give the same value as oriented
+    Each neighbor normal is sign-aligned with n_i, so that unoriented normals give the same value as oriented
     ones of a smooth surface.
 
     normals: (N, 3) unit; neighbors: (N, K) rows

@@ -33,7 +33,7 @@ class Grid:
     @classmethod
     def around(cls, points: np.ndarray, pixel: float) -> Grid:
         """The smallest grid that holds the (N, >= 2) points, CRS; edges are multiples of `pixel`, so that
-        grids of neighbouring scenes align.
+        grids of neighboring scenes align.
 
         Raises InputError for more than MAX_CELLS cells: a stray point, or a wrong unit.
         """
@@ -71,8 +71,8 @@ class Grid:
         rows, columns = self.cells(points)
         return rows * self.width + columns
 
-    def centres(self, first_row: int = 0, num_rows: int | None = None) -> np.ndarray:
-        """(num_rows * width, 2) float64 positions of the cell centres, CRS, row by row."""
+    def centers(self, first_row: int = 0, num_rows: int | None = None) -> np.ndarray:
+        """(num_rows * width, 2) float64 positions of the cell centers, CRS, row by row."""
         num_rows = self.height - first_row if num_rows is None else num_rows
         x = self.left + (np.arange(self.width) + 0.5) * self.pixel
         y = self.top - (np.arange(first_row, first_row + num_rows) + 0.5) * self.pixel

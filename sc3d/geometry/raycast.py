@@ -1,7 +1,7 @@
 """First surfaces and visibility with Open3D's `RaycastingScene`, from a mesh or from the surfels of a bare
 cloud.
 
-Distances along rays are ranges (from the camera centre); depth = range * z component of the unit ray.
+Distances along rays are ranges (from the camera center); depth = range * z component of the unit ray.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, point_spaci
 
 RAYS = 1 << 19  # cast at a time: bounds memory, not results
 SURFEL_NEIGHBORS = 8
-FLAT, SCATTERED = 0.8, 0.38  # half width of a surfel, in distances to the farthest neighbour
+FLAT, SCATTERED = 0.8, 0.38  # half width of a surfel, in distances to the farthest neighbor
 # depth tolerance: share of the range, and the cosine of incidence below which it grows no more
 RANGE_TOLERANCE, MIN_COSINE = 0.005, 0.2
-MAX_ROUGHNESS = 0.12  # mean distance of flat neighbours from the tangent plane, in the same unit
+MAX_ROUGHNESS = 0.12  # mean distance of flat neighbors from the tangent plane, in the same unit
 MIN_SUPPORT = 4  # points around a surfel, itself not counted; fewer: a floater, which blocks nothing
 
 
@@ -29,7 +29,7 @@ class RayTarget(Protocol):
     """What rays can hit: `Surface` here, `traversal.VoxelSurface`."""
 
     def cast(self, view: View, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rays from the centre of `view` along (K, 3) float32 unit directions in its camera frame, NaN = no
+        """Rays from the center of `view` along (K, 3) float32 unit directions in its camera frame, NaN = no
         ray.
 
         returns: (K,) float32 range, world units, inf = nothing hit; (K,) float32 |cosine| between ray and
@@ -56,7 +56,7 @@ class Surface:
 
     @classmethod
     def from_cloud(cls, points: np.ndarray, normals: np.ndarray | None, origin: np.ndarray) -> Surface:
-        """Squares in the tangent planes of the points, large enough to touch their neighbours (a surfel
+        """Squares in the tangent planes of the points, large enough to touch their neighbors (a surfel
         cloud).
 
         points: (N, 3) world; normals: (N, 3) or None = estimated. Lone points (floaters) get no surfel.
@@ -68,7 +68,7 @@ class Surface:
         """As `RayTarget.cast`."""
         count = len(directions)
         distance, incidence = np.empty(count, np.float32), np.empty(count, np.float32)
-        start = (view.centre - self.origin).astype(np.float32)
+        start = (view.center - self.origin).astype(np.float32)
         bundle = np.empty((min(count, RAYS), 6), np.float32)
         for first in range(0, count, RAYS):
             part = slice(first, min(first + RAYS, count))
@@ -89,7 +89,7 @@ class Surface:
 class FirstSurface:
     """The first surface of a view, one value per pixel.
 
-    range: (H, W) float32 from the camera centre, world units; inf = nothing hit
+    range: (H, W) float32 from the camera center, world units; inf = nothing hit
     incidence: (H, W) float32 |cosine| between ray and surface normal
     ray_z: (H, W) float32, depth = range * ray_z
     """
@@ -100,7 +100,7 @@ class FirstSurface:
 
 
 def first_surface(surface: RayTarget, view: View) -> FirstSurface:
-    """Cast the rays of all pixel centres of `view`, by the camera's own model."""
+    """Cast the rays of all pixel centers of `view`, by the camera's own model."""
     directions, shape = camera_rays(view.camera), (view.height, view.width)
     distance, incidence = surface.cast(view, directions)
     return FirstSurface(distance.reshape(shape), incidence.reshape(shape), directions[:, 2].reshape(shape))
@@ -136,7 +136,7 @@ def _measure(directions, bundle, t_hit, normals, distance, incidence):
 def surface_points(first: FirstSurface, view: View, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """(K, 3) float64 world positions of the first surface at K pixels that hit something."""
     directions, _ = rays(view, np.stack([columns + 0.5, rows + 0.5], axis=1))
-    return view.centre + directions * first.range[rows, columns, None]
+    return view.center + directions * first.range[rows, columns, None]
 
 
 def nearest_points(
@@ -192,7 +192,7 @@ def see_points(
     pixels, depth = project(view, points)
     inside = np.flatnonzero(in_image(view, pixels))
     columns, rows = pixels[inside, 0].astype(np.int32), pixels[inside, 1].astype(np.int32)
-    towards = view.centre - points[inside]
+    towards = view.center - points[inside]
     distance = np.linalg.norm(towards, axis=1)
     cosine = (
         np.ones(len(inside))
@@ -230,9 +230,9 @@ def surfels(
         None = their own; wanted: (N,) bool, None = all
     returns: (4 K, 3) vertices and (2 K, 3) triangles of the K <= N points that have support
 
-    Half width: FLAT times the distance to the 8th neighbour, which leaves a hole at about 1 of 700 places of
+    Half width: FLAT times the distance to the 8th neighbor, which leaves a hole at about 1 of 700 places of
     a randomly sampled surface;
-    SCATTERED times it where the neighbours do not lie in a plane (leaves), so that crowns do not swell and
+    SCATTERED times it where the neighbors do not lie in a plane (leaves), so that crowns do not swell and
     their gaps stay open.
     """
     neighbors, distances = NeighborIndex(points, np.zeros(3)).nearest(points, SURFEL_NEIGHBORS + 1)
@@ -248,14 +248,14 @@ def surfels(
     away = np.abs(np.einsum("nki,ni->nk", points[neighbors[:, 1:]] - points[:, None], normals)).mean(axis=1)
     share = np.where(away > MAX_ROUGHNESS * distances[:, -1], SCATTERED, FLAT)
     half = (share * np.clip(distances[:, -1], spacing, 4 * spacing))[supported, None]
-    centre, normal = points[supported], normals[supported]
+    center, normal = points[supported], normals[supported]
     helper = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     first_axis = np.cross(normal, helper)
     first_axis /= np.linalg.norm(first_axis, axis=1, keepdims=True)
     second_axis = np.cross(normal, first_axis)
     corners = [
-        centre + half * (u * first_axis + v * second_axis) for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        center + half * (u * first_axis + v * second_axis) for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))
     ]
     vertices = np.stack(corners, axis=1).reshape(-1, 3)
-    base = 4 * np.arange(len(centre))[:, None]
+    base = 4 * np.arange(len(center))[:, None]
     return vertices, np.concatenate([base + [[0, 1, 2]], base + [[0, 2, 3]]], axis=1).reshape(-1, 3)

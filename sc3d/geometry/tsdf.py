@@ -44,7 +44,7 @@ class DepthFusion:
         if not ((depth > 0) & (depth < depth_max)).any():
             return
         matrix = view.matrix.copy()
-        matrix[:2, 2] -= 0.5  # Open3D counts pixel centres as whole numbers
+        matrix[:2, 2] -= 0.5  # Open3D counts pixel centers as whole numbers
         intrinsic, extrinsic = o3d.core.Tensor(matrix), o3d.core.Tensor(view.cam_from_world)
         depth_image = o3d.t.geometry.Image(
             o3d.core.Tensor(np.ascontiguousarray(depth, np.float32)[..., None])
@@ -120,15 +120,15 @@ def pixel_squares(view: View, depth: np.ndarray, color: np.ndarray, wanted: np.n
     hide things from other views.
 
     view: pinhole; depth: (H, W) z, world units, 0 = none; color: (H, W, 3) uint8; wanted: (H, W) bool
-    returns: mesh with vertex colours and normals, and cloud of the squares' centres with colors uint8 and
+    returns: mesh with vertex colors and normals, and cloud of the squares' centers with colors uint8 and
         normals; both may be empty
     """
     rows, columns = np.nonzero(wanted & (depth > 0))
     z = depth[rows, columns].astype(np.float64)
     right, down, forward = view.cam_from_world[:3, :3]
     directions, ray_z = rays(view, np.stack([columns + 0.5, rows + 0.5], axis=1))
-    points = view.centre + directions * (z / ray_z)[:, None]
-    # more than half a pixel: neighbours overlap, seen from elsewhere too
+    points = view.center + directions * (z / ray_z)[:, None]
+    # more than half a pixel: neighbors overlap, seen from elsewhere too
     half = (0.75 * z / view.focal)[:, None]
     corners = [points + half * (u * right + v * down) for u, v in ((-1, -1), (-1, 1), (1, 1), (1, -1))]
     base = 4 * np.arange(len(points))[:, None]

@@ -7,24 +7,24 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 
-def neighbour_views(
+def neighbor_views(
     tracks: list[np.ndarray] | None,
     points: np.ndarray,
-    centres: np.ndarray,
+    centers: np.ndarray,
     count: int = 8,
     angles: tuple[float, float] = (5.0, 30.0),
 ) -> list[np.ndarray]:
-    """Neighbours of every view, best first.
+    """Neighbors of every view, best first.
 
     tracks: per view (T,) row indices into `points` of the sparse points it sees; None = unknown
-    points: (N, 3) sparse points; centres: (V, 3) camera centres, the same frame
+    points: (N, 3) sparse points; centers: (V, 3) camera centers, the same frame
     count: how many to keep; angles: median triangulation angle allowed, degrees
     returns: per view (<= count,) int64 indices of other views. Ranked by the number of shared points among
         those whose median angle is in
         `angles`; a view with fewer than `count` of them is filled up by `nearest_views`.
     """
-    centres = np.asarray(centres, np.float64)
-    near = nearest_views(centres, count)
+    centers = np.asarray(centers, np.float64)
+    near = nearest_views(centers, count)
     if tracks is None:
         return near
     shared = _shared_counts(tracks, len(points))
@@ -35,7 +35,7 @@ def neighbour_views(
         kept = [
             other
             for other in candidates
-            if angles[0] <= _median_angle(tracks, points, centres, view, other) <= angles[1]
+            if angles[0] <= _median_angle(tracks, points, centers, view, other) <= angles[1]
         ][:count]
         # A fallback view must share something where tracks are known, otherwise it may look the other way.
         extra = [
@@ -48,23 +48,23 @@ def neighbour_views(
 
 
 def nearest_views(
-    centres: np.ndarray, count: int = 8, distances: tuple[float, float] = (0.5, 6.0)
+    centers: np.ndarray, count: int = 8, distances: tuple[float, float] = (0.5, 6.0)
 ) -> list[np.ndarray]:
-    """Neighbours by camera distance alone, nearest first, for poses without tracks.
+    """Neighbors by camera distance alone, nearest first, for poses without tracks.
 
-    centres: (V, 3); distances: allowed range in units of the median distance of a camera to the nearest one,
+    centers: (V, 3); distances: allowed range in units of the median distance of a camera to the nearest one,
         so that scene units do not matter
     returns: per view (<= count,) int64; if none is in range, the nearest ones at another place
     """
-    centres = np.asarray(centres, np.float64)
-    if len(centres) < 2:
-        return [np.zeros(0, np.int64) for _ in centres]
-    reach = min(len(centres), 4 * count + 1)
-    gaps, order = cKDTree(centres).query(centres, k=reach)
+    centers = np.asarray(centers, np.float64)
+    if len(centers) < 2:
+        return [np.zeros(0, np.int64) for _ in centers]
+    reach = min(len(centers), 4 * count + 1)
+    gaps, order = cKDTree(centers).query(centers, k=reach)
     apart = gaps[:, 1][gaps[:, 1] > 0]
     spacing = np.median(apart) if len(apart) else 1.0
     result = []
-    for view in range(len(centres)):
+    for view in range(len(centers)):
         others = order[view] != view
         in_range = others & (gaps[view] >= distances[0] * spacing) & (gaps[view] <= distances[1] * spacing)
         chosen = in_range if in_range.any() else others & (gaps[view] > 0)
@@ -84,11 +84,11 @@ def _shared_counts(tracks: list[np.ndarray], num_points: int) -> np.ndarray:
 
 
 def _median_angle(
-    tracks: list[np.ndarray], points: np.ndarray, centres: np.ndarray, view: int, other: int
+    tracks: list[np.ndarray], points: np.ndarray, centers: np.ndarray, view: int, other: int
 ) -> float:
     """Median angle at the shared points between the directions to both cameras, degrees."""
     common = points[np.intersect1d(tracks[view], tracks[other])]
-    to_view, to_other = centres[view] - common, centres[other] - common
+    to_view, to_other = centers[view] - common, centers[other] - common
     cosine = (to_view * to_other).sum(1) / np.maximum(
         np.linalg.norm(to_view, axis=1) * np.linalg.norm(to_other, axis=1), 1e-12
     )

@@ -22,7 +22,7 @@ SAME = 0.7  # cosine between normals of one surface
 COHERENT = 0.85  # length of the mean normal around a gap
 GAP_VOXELS = 3  # voxels around a gap that agree on its plane
 # their points' mean is at most this far from the gap, in voxels along the plane: nothing grows beyond an edge
-GAP_CENTRE = 0.75
+GAP_CENTER = 0.75
 
 
 class Matter(NamedTuple):
@@ -102,7 +102,7 @@ def close_gaps(matter, lookup, keys, closed, shapes):
         offset, normal = shape[:3].astype(np.float64) - 0.5, shape[3:6].astype(np.float64)
         away = (offset * normal).sum()
         closed[row] = (
-            abs(away) <= 0.5 * np.abs(normal).sum() and _length(offset - away * normal) <= GAP_CENTRE
+            abs(away) <= 0.5 * np.abs(normal).sum() and _length(offset - away * normal) <= GAP_CENTER
         )
         shape[6:9], shape[9:] = -SLACK, 1 + SLACK
 

@@ -47,7 +47,7 @@ class VoxelSurface:
     def cast(self, view: View, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `raycast.RayTarget.cast`."""
         found, result = self.patches, np.empty((2, len(directions)), np.float32)
-        start = (view.centre - found.origin) / found.voxel_size
+        start = (view.center - found.origin) / found.voxel_size
         cast_rays(
             directions,
             view.cam_from_world,

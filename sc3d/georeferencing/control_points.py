@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 # of the distance to the cameras; a point that misses the fit of the others by more was mistaken for another,
 # or mistyped
 MAX_ERROR = 0.02
-PIXEL_CENTRE = 0.5  # ODM and OpenSfM call the centre of the first pixel (0, 0)
+PIXEL_CENTER = 0.5  # ODM and OpenSfM call the center of the first pixel (0, 0)
 MIN_POINTS = 3
 
 
@@ -77,7 +77,7 @@ def read_control_points(path: Path, photos: list[str]) -> ControlPoints:
             continue
         if positions.setdefault(name, position) != position:
             raise InputError(f"{path}, line {number}: the point {name!r} has another position further up")
-        observations.setdefault(name, {})[known[photo]] = np.array(pixel) + PIXEL_CENTRE
+        observations.setdefault(name, {})[known[photo]] = np.array(pixel) + PIXEL_CENTER
     if unknown:
         logger.warning(
             "%s names %d photos that are not there: %s", path, len(unknown), ", ".join(sorted(unknown))
@@ -231,8 +231,8 @@ def _distance(model: pycolmap.Reconstruction, source: np.ndarray, target: np.nda
     size = np.median(np.linalg.norm(target - np.median(target, axis=0), axis=1)) / np.median(
         np.linalg.norm(source - np.median(source, axis=0), axis=1)
     )
-    centres = np.array([model.image(image_id).projection_center() for image_id in model.reg_image_ids()])
-    return float(size * np.median([np.linalg.norm(centres - point, axis=1).min() for point in source]))
+    centers = np.array([model.image(image_id).projection_center() for image_id in model.reg_image_ids()])
+    return float(size * np.median([np.linalg.norm(centers - point, axis=1).min() for point in source]))
 
 
 def _adjust(

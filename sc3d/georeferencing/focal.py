@@ -144,8 +144,8 @@ def _stretch(model: pycolmap.Reconstruction, factor: float) -> None:
 def _depth_below(model: pycolmap.Reconstruction, direction: np.ndarray) -> np.ndarray:
     """(N,) distance of each camera from the middle of the points, along a direction."""
     points = np.array([point.xyz for point in model.points3D.values()])
-    centres = np.array([model.image(image_id).projection_center() for image_id in model.reg_image_ids()])
-    return np.median(points @ direction) - centres @ direction
+    centers = np.array([model.image(image_id).projection_center() for image_id in model.reg_image_ids()])
+    return np.median(points @ direction) - centers @ direction
 
 
 def _number(value: object) -> float:

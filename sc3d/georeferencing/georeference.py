@@ -2,7 +2,7 @@
 by point.
 
 The world of a georeferenced scene is one of two things:
-- local ENU: metres east, north and up of `origin` on the plane that touches the WGS 84 ellipsoid there. This
+- local ENU: meters east, north and up of `origin` on the plane that touches the WGS 84 ellipsoid there. This
     is not a map projection: a UTM grid
   turns against it (convergence) and stretches it (scale, curvature), so every point goes through geocentric
   coordinates;
@@ -69,7 +69,7 @@ class Georeference:
 
     @cached_property
     def unit(self) -> float:
-        """Metres per unit of the CRS; heights have the same unit as eastings."""
+        """Meters per unit of the CRS; heights have the same unit as eastings."""
         return float(self.crs.axis_info[0].unit_conversion_factor)
 
     @property
@@ -223,7 +223,7 @@ def utm_epsg(latitude: float, longitude: float) -> int:
 
 
 def enu_to_geodetic(enu: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
-    """(N, 3) metres east, north, up of `origin` to (N, 3) latitude, longitude (degrees), ellipsoidal height
+    """(N, 3) meters east, north, up of `origin` to (N, 3) latitude, longitude (degrees), ellipsoidal height
     (m), WGS 84.
     """
     longitude, latitude, height = _topocentric(origin).transform(*np.asarray(enu, np.float64).T)

@@ -28,9 +28,9 @@ from sc3d.georeferencing.geotags import Geotag, enu_positions, read_geotags
 logger = logging.getLogger(__name__)
 
 MIN_GPS = 3  # a similarity needs three positions
-# standard deviations, and not less than OUTLIER_METRES: a position this far off takes no part in the fit
+# standard deviations, and not less than OUTLIER_METERS: a position this far off takes no part in the fit
 OUTLIER = 5.0
-OUTLIER_METRES = 10.0
+OUTLIER_METERS = 10.0
 # relative, radians: a model within these of ENU is ENU, its rest is the noise of GPS
 SAME_SCALE, SAME_ANGLE = 1e-3, 1e-3
 
@@ -84,22 +84,22 @@ def read_flight(folder: Path, names: list[str]) -> Flight | None:
     return Flight(tags, shape, origin)
 
 
-def place(flight: Flight, centres: dict[str, np.ndarray], points: np.ndarray) -> Similarity | None:
+def place(flight: Flight, centers: dict[str, np.ndarray], points: np.ndarray) -> Similarity | None:
     """Similarity from a model's frame to the flight's ENU.
 
-    centres: camera centre (3,) by photo name, photos without GPS included; points: (P, 3) of the model, for
+    centers: camera center (3,) by photo name, photos without GPS included; points: (P, 3) of the model, for
         the level of a flight along a line
     returns: None if fewer than three cameras have GPS or fit it
     """
-    names = [name for name in flight.tags if name in centres]
+    names = [name for name in flight.tags if name in centers]
     if len(names) < MIN_GPS:
         return None
     source, target = (
-        np.array([centres[name] for name in names]),
+        np.array([centers[name] for name in names]),
         np.array([flight.positions[name] for name in names]),
     )
     sigma = np.median([flight.tags[name].sigma for name in names])
-    fit, kept = fit_similarity_robust(source, target, max(OUTLIER * sigma, OUTLIER_METRES))
+    fit, kept = fit_similarity_robust(source, target, max(OUTLIER * sigma, OUTLIER_METERS))
     if kept.sum() < MIN_GPS:
         return None
     if not kept.all():
@@ -120,48 +120,48 @@ def _rolled(fit: Similarity, positions: np.ndarray, points: np.ndarray) -> Simil
     return Similarity(fit.scale, turn @ fit.rotation, turn @ (fit.translation - pivot) + pivot)
 
 
-def residuals(flight: Flight, centres: dict[str, np.ndarray]) -> dict[str, float]:
-    """How far camera centres (ENU) lie from their GPS: root mean squares in m, and the count; empty without
+def residuals(flight: Flight, centers: dict[str, np.ndarray]) -> dict[str, float]:
+    """How far camera centers (ENU) lie from their GPS: root mean squares in m, and the count; empty without
     any.
     """
     offsets = np.array(
-        [centres[name] - flight.positions[name] for name in flight.tags if name in centres]
+        [centers[name] - flight.positions[name] for name in flight.tags if name in centers]
     ).reshape(-1, 3)
     if not len(offsets):
         return {}
     squares = (offsets**2).mean(axis=0)
     return {
         "photos": len(offsets),
-        "rms": _metres(np.sqrt(squares.sum())),
-        "rms_horizontal": _metres(np.sqrt(squares[:2].sum())),
-        "rms_vertical": _metres(np.sqrt(squares[2])),
+        "rms": _meters(np.sqrt(squares.sum())),
+        "rms_horizontal": _meters(np.sqrt(squares[:2].sum())),
+        "rms_vertical": _meters(np.sqrt(squares[2])),
         "rtk_photos": sum(tag.rtk for tag in flight.tags.values()),
     }
 
 
 def find_georeference(
-    flight: Flight, centres: dict[str, np.ndarray], points: np.ndarray, epsg: int | None
+    flight: Flight, centers: dict[str, np.ndarray], points: np.ndarray, epsg: int | None
 ) -> Georeference | None:
     """Georeference of a model whose photos have GPS, whatever frame it is in; the model stays as it is.
 
-    A model in local ENU (as `reconstruct` makes it) or in a CRS is recognised; any other gets a similarity in
+    A model in local ENU (as `reconstruct` makes it) or in a CRS is recognized; any other gets a similarity in
     front. None if GPS and cameras do not fit.
     """
-    crs = _in_crs(flight, centres, epsg)
+    crs = _in_crs(flight, centers, epsg)
     if crs is not None:
         return crs
-    fit = place(flight, centres, points)
+    fit = place(flight, centers, points)
     if fit is None:
         return None
     if abs(fit.scale - 1) < SAME_SCALE and fit.angle < SAME_ANGLE:
         origin = tuple(
             float(value) for value in enu_to_geodetic(fit.apply(np.zeros((1, 3))), flight.origin)[0]
         )
-        return from_origin(origin, epsg, figures={"gps": residuals(replace(flight, origin=origin), centres)})
+        return from_origin(origin, epsg, figures={"gps": residuals(replace(flight, origin=origin), centers)})
     found = from_origin(
         flight.origin,
         epsg,
-        figures={"gps": residuals(flight, dict(zip(centres, fit.apply(np.array(list(centres.values()))))))},
+        figures={"gps": residuals(flight, dict(zip(centers, fit.apply(np.array(list(centers.values()))))))},
     )
     return Georeference(
         found.epsg,
@@ -172,17 +172,17 @@ def find_georeference(
     )
 
 
-def _in_crs(flight: Flight, centres: dict[str, np.ndarray], epsg: int | None) -> Georeference | None:
+def _in_crs(flight: Flight, centers: dict[str, np.ndarray], epsg: int | None) -> Georeference | None:
     """The georeference of a model whose world is a CRS (`epsg`, or the UTM zone), within what GPS may err;
     None for any other.
     """
     georeference = Georeference(epsg or utm_epsg(*flight.origin[:2]), (0.0, 0.0, 0.0))
-    names = [name for name in flight.tags if name in centres]
-    found = crs_to_geodetic(np.array([centres[name] for name in names]), georeference.crs)
+    names = [name for name in flight.tags if name in centers]
+    found = crs_to_geodetic(np.array([centers[name] for name in names]), georeference.crs)
     stated = np.array([flight.tags[name].geodetic for name in names])
-    metres = np.abs(found[:, :2] - stated[:, :2]) * [111_320.0, 111_320.0 * np.cos(np.radians(stated[0, 0]))]
-    return georeference if np.isfinite(metres).all() and np.median(metres) < 2 * OUTLIER_METRES else None
+    meters = np.abs(found[:, :2] - stated[:, :2]) * [111_320.0, 111_320.0 * np.cos(np.radians(stated[0, 0]))]
+    return georeference if np.isfinite(meters).all() and np.median(meters) < 2 * OUTLIER_METERS else None
 
 
-def _metres(value: float) -> float:
+def _meters(value: float) -> float:
     return round(float(value), 3)

@@ -1,4 +1,4 @@
-"""Clouds (PLY, LAS, LAZ, PCD, XYZ) and meshes (PLY, OBJ) of other programs: float64 positions, colours,
+"""Clouds (PLY, LAS, LAZ, PCD, XYZ) and meshes (PLY, OBJ) of other programs: float64 positions, colors,
 classes and whatever else they hold.
 """
 
@@ -77,7 +77,7 @@ def to_open3d(geometry: Geometry) -> o3d.t.geometry.PointCloud | o3d.t.geometry.
         )
         table = made.vertex
     if geometry.colors is not None:
-        # Open3D writes the colours of a mesh right only as floats
+        # Open3D writes the colors of a mesh right only as floats
         table.colors = tensor(
             np.ascontiguousarray(
                 geometry.colors if geometry.triangles is None else geometry.colors.astype(np.float32) / 255
@@ -169,7 +169,7 @@ def _read_ply_mesh(path: Path) -> Geometry:
 
 
 def _read_obj(path: Path) -> Geometry:
-    """Vertices (with colours behind the position, if there) and faces as triangles; texture is not used.
+    """Vertices (with colors behind the position, if there) and faces as triangles; texture is not used.
     Open3D's reader would round to float32.
     """
     vertices, faces = [], []
@@ -200,7 +200,7 @@ def _read_obj(path: Path) -> Geometry:
 
 
 def _read_text(path: Path) -> Geometry:
-    """x y z per line, then colours (three whole numbers up to 255) or normals; separated by blanks, commas,
+    """x y z per line, then colors (three whole numbers up to 255) or normals; separated by blanks, commas,
     semicolons or tabs; a header is skipped.
     """
     rows = []
@@ -222,7 +222,7 @@ def _read_text(path: Path) -> Geometry:
     if width < 3 or any(len(row) != width for row in rows):
         raise InputError(f"{path}: x y z [r g b] with as many numbers in every line are expected")
     table = np.array(rows)
-    # PTS has the intensity in front of the colours
+    # PTS has the intensity in front of the colors
     offset = 4 if path.suffix.lower() == ".pts" and width == 7 else 3
     rest = table[:, offset : offset + 3]
     colored = (

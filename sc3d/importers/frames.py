@@ -16,7 +16,7 @@ from sc3d.importers.project import Project
 
 logger = logging.getLogger(__name__)
 
-LARGE = 1e5  # coordinates beyond this belong to a CRS and lose millimetres in float32
+LARGE = 1e5  # coordinates beyond this belong to a CRS and lose millimeters in float32
 FAR = 20.0  # times the extent of the cameras: a cloud farther away than this is in another frame
 
 
@@ -24,8 +24,8 @@ def near_origin(project: Project, epsg: int | None) -> Project:
     """A project with large coordinates moved near the origin, world = CRS - offset; any other unchanged.
     `epsg`: the CRS of the coordinates.
     """
-    centres = np.array([view.centre for view in project.views])
-    if project.georeference is not None or np.abs(np.median(centres, axis=0)).max() < LARGE:
+    centers = np.array([view.center for view in project.views])
+    if project.georeference is not None or np.abs(np.median(centers, axis=0)).max() < LARGE:
         return project
     if epsg is None:
         logger.warning(
@@ -33,7 +33,7 @@ def near_origin(project: Project, epsg: int | None) -> Project:
         )
         return project
     projected_crs(epsg)
-    offset = whole_offset(centres)
+    offset = whole_offset(centers)
     return replace(
         project,
         views=[view.shifted(offset) for view in project.views],
@@ -62,12 +62,12 @@ def to_world(
                 f"{name} is in EPSG:{epsg}, but nothing says where the scene's cameras are: run `sc3d georeference` on the scene first"
             )
         return georeference.from_crs(_reproject(positions, epsg, georeference)), f"EPSG:{epsg}"
-    centres = np.array([view.centre for view in views]).reshape(-1, 3)
-    if georeference is not None and len(centres) and _far(positions, centres):
+    centers = np.array([view.center for view in views]).reshape(-1, 3)
+    if georeference is not None and len(centers) and _far(positions, centers):
         moved = georeference.from_crs(positions)
-        if not _far(moved, centres):
+        if not _far(moved, centers):
             return moved, f"EPSG:{georeference.epsg}"
-    if len(centres) and _far(positions, centres):
+    if len(centers) and _far(positions, centers):
         logger.warning(
             "%s lies far from the cameras: it seems to be in another frame (--epsg says which CRS it is in)",
             name,
@@ -76,7 +76,7 @@ def to_world(
 
 
 def _reproject(positions: np.ndarray, epsg: int, georeference: Georeference) -> np.ndarray:
-    """From one projected CRS to that of the georeference; heights keep their value in metres."""
+    """From one projected CRS to that of the georeference; heights keep their value in meters."""
     if epsg == georeference.epsg:
         return positions
     import pyproj
@@ -93,7 +93,7 @@ def _reproject(positions: np.ndarray, epsg: int, georeference: Georeference) -> 
     )
 
 
-def _far(positions: np.ndarray, centres: np.ndarray) -> bool:
-    middle = np.median(centres, axis=0)
-    extent = max(float(np.linalg.norm(np.ptp(centres, axis=0))), 1.0)
+def _far(positions: np.ndarray, centers: np.ndarray) -> bool:
+    middle = np.median(centers, axis=0)
+    extent = max(float(np.linalg.norm(np.ptp(centers, axis=0))), 1.0)
     return float(np.linalg.norm(np.median(positions, axis=0) - middle)) > FAR * extent

@@ -39,7 +39,7 @@ PARAMETERS = {
     "skew",
     *(f"{letter}{number}" for letter in "kpb" for number in "1234"),
 }
-GEOCENTRIC = 1e6  # m: nearer to its centre than this nothing is on Earth
+GEOCENTRIC = 1e6  # m: nearer to its center than this nothing is on Earth
 
 
 class _Builder(ElementTree.TreeBuilder):
@@ -135,7 +135,7 @@ def _lens(sensor: ElementTree.Element, path: Path) -> Lens:
         raise InputError(f"{where}: its calibration lacks size or focal length") from None
     if values.get("p3", 0) or values.get("p4", 0):
         raise InputError(
-            f"{where}: p3 and p4 have no COLMAP model: optimise the cameras without them, or export undistorted photos"
+            f"{where}: p3 and p4 have no COLMAP model: optimize the cameras without them, or export undistorted photos"
         )
     stretch = values["fx"] - focal if "fx" in values else values.get("b1", 0)
     # PhotoScan 1.0: absolute
@@ -201,10 +201,10 @@ def _similarity(transform: ElementTree.Element, path: Path) -> Similarity:
 def _pose(camera: ElementTree.Element, world_from_chunk: Similarity, path: Path) -> np.ndarray:
     """(4, 4) cam_from_world."""
     chunk_from_cam = _numbers(camera.find("transform"), 16, path).reshape(4, 4)
-    centre = world_from_chunk.apply(chunk_from_cam[None, :3, 3])[0]
+    center = world_from_chunk.apply(chunk_from_cam[None, :3, 3])[0]
     return rigid(
         (world_from_chunk.rotation @ chunk_from_cam[:3, :3]).T,
-        centre,
+        center,
         f"{path}, camera {camera.get('label')!r}",
     )
 
@@ -226,7 +226,7 @@ def _to_local(
     crs = _crs(chunk, path)
     if not views or crs is None:
         return views, None
-    middle = np.median([view.centre for view in views], axis=0)
+    middle = np.median([view.center for view in views], axis=0)
     if np.linalg.norm(middle) < GEOCENTRIC:
         logger.warning(
             "%s names a CRS, but its cameras are not in geocentric coordinates: the place stays unknown", path
@@ -237,10 +237,10 @@ def _to_local(
     geodetic = _geodetic(frame, crs)
     origin = tuple(round(float(value), digits) for value, digits in zip(geodetic[0], (6, 6, 0)))
     enu = fit_similarity(frame - middle, geodetic_to_enu(geodetic, origin))
-    centres = enu.apply(np.array([view.centre for view in views]) - middle)
+    centers = enu.apply(np.array([view.center for view in views]) - middle)
     moved = [
-        View(view.name, view.camera, rigid(view.cam_from_world[:3, :3] @ enu.rotation.T, centre, str(path)))
-        for view, centre in zip(views, centres)
+        View(view.name, view.camera, rigid(view.cam_from_world[:3, :3] @ enu.rotation.T, center, str(path)))
+        for view, center in zip(views, centers)
     ]
     return moved, from_origin(origin, crs.to_epsg() if crs.is_projected else None)
 

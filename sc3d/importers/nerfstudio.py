@@ -49,11 +49,11 @@ def read(path: Path, settings: Import) -> Project:
             raise InputError(f"{where} has no file_path")
         matrix = _matrix(frame.get("transform_matrix"), where)
         world_from_cam = original[:3, :3] @ matrix[:3, :3] * OPENGL
-        centre = original[:3, :3] @ (matrix[:3, 3] / scale) + original[:3, 3]
+        center = original[:3, :3] @ (matrix[:3, 3] / scale) + original[:3, 3]
         lens = _lens(content, frame, file.parent / name, where)
         camera = cameras.setdefault(lens, None) or to_camera(lens, settings.tolerance, where)
         cameras[lens] = camera
-        views.append(View(_tidy(name), camera, rigid(world_from_cam.T, centre, where)))
+        views.append(View(_tidy(name), camera, rigid(world_from_cam.T, center, where)))
     points, colors = _points(file.parent, content, original, scale)
     return Project(
         "nerfstudio",
@@ -128,7 +128,7 @@ def _matrix(rows: object, where: str) -> np.ndarray:
 
 
 def _points(folder: Path, content: dict, original: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 3) points of `ply_file_path` in the original frame, (P, 3) colours; none without such a file."""
+    """(P, 3) points of `ply_file_path` in the original frame, (P, 3) colors; none without such a file."""
     file = folder / str(content.get("ply_file_path") or "")
     if not file.is_file():
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)

@@ -177,7 +177,7 @@ def _view(name: str, shot: dict, cameras: dict[str, pycolmap.Camera], where: str
 
 
 def _points(points: dict, file: Path) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
-    """(P, 3) positions, (P, 3) colours, and the row of each track."""
+    """(P, 3) positions, (P, 3) colors, and the row of each track."""
     try:
         positions = np.array([point["coordinates"] for point in points.values()], np.float64).reshape(-1, 3)
         colors = np.array(
@@ -233,7 +233,7 @@ def _is_topocentric(part: dict, views: list[View]) -> bool:
     reconstruction is in.
     """
     offsets = [
-        np.subtract(shot["gps_position"], view.centre)
+        np.subtract(shot["gps_position"], view.center)
         for shot, view in zip(part["shots"].values(), views)
         if len(shot.get("gps_position") or []) == 3
     ]

@@ -57,10 +57,10 @@ def read(path: Path, settings: Import) -> Project:
     cameras: dict[Lens, object] = {}
     views = []
     for start in range(0, len(body), LINES):
-        name, lens, rotation, centre = _block(body[start : start + LINES], file)
+        name, lens, rotation, center = _block(body[start : start + LINES], file)
         if lens not in cameras:
             cameras[lens] = to_camera(lens, settings.tolerance, f"{file}, {name}")
-        views.append(View(name, cameras[lens], rigid(rotation, centre, f"{file}, {name}")))
+        views.append(View(name, cameras[lens], rigid(rotation, center, f"{file}, {name}")))
     return Project("pix4d", views, georeference=_georeference(file), notes={"read": file.name})
 
 
@@ -89,19 +89,19 @@ def _header_length(lines: list[tuple[int, str]], file: Path) -> int:
 
 
 def _block(lines: list[tuple[int, str]], file: Path) -> tuple[str, Lens, np.ndarray, np.ndarray]:
-    """Name, lens, rotation (3, 3) and centre (3,) of a photo."""
+    """Name, lens, rotation (3, 3) and center (3,) of a photo."""
     name, *size = lines[0][1].rsplit(maxsplit=2)
     try:
         width, height = (int(word) for word in size)
         rows = [np.array(line.split(), np.float64) for _, line in lines[1:]]
-        matrix, radial, tangential, centre, rotation = (
+        matrix, radial, tangential, center, rotation = (
             np.stack(rows[:3]),
             rows[3],
             rows[4],
             rows[5],
             np.stack(rows[6:]),
         )
-        if (matrix.shape, radial.shape, tangential.shape, centre.shape, rotation.shape) != (
+        if (matrix.shape, radial.shape, tangential.shape, center.shape, rotation.shape) != (
             (3, 3),
             (3,),
             (2,),
@@ -123,7 +123,7 @@ def _block(lines: list[tuple[int, str]], file: Path) -> tuple[str, Lens, np.ndar
         tuple(tangential.tolist()),
         skew=float(matrix[0, 1]),
     )
-    return name, lens, rotation, centre
+    return name, lens, rotation, center
 
 
 def _place_files(file: Path) -> tuple[Path, Path]:

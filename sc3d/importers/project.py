@@ -99,11 +99,11 @@ def find_importer(path: Path, source: str) -> ModuleType:
     raise InputError(f"{path} is no {source} project: {modules[0].EXPECTED}")
 
 
-def rigid(rotation: np.ndarray, centre: np.ndarray, where: str) -> np.ndarray:
-    """(4, 4) cam_from_world of a camera at `centre` (3,); `rotation` (3, 3) cam from world up to rounding.
+def rigid(rotation: np.ndarray, center: np.ndarray, where: str) -> np.ndarray:
+    """(4, 4) cam_from_world of a camera at `center` (3,); `rotation` (3, 3) cam from world up to rounding.
     InputError if it is none.
     """
-    if not np.isfinite(rotation).all() or not (np.abs(centre) < FARTHEST).all():
+    if not np.isfinite(rotation).all() or not (np.abs(center) < FARTHEST).all():
         raise InputError(
             f"{where}: orientation or position is not made of finite numbers, or is more than {FARTHEST:g} from the origin"
         )
@@ -112,5 +112,5 @@ def rigid(rotation: np.ndarray, centre: np.ndarray, where: str) -> np.ndarray:
         raise InputError(f"{where}: the orientation is no rotation")
     matrix = np.eye(4)
     matrix[:3, :3] = left @ right
-    matrix[:3, 3] = -matrix[:3, :3] @ centre
+    matrix[:3, 3] = -matrix[:3, :3] @ center
     return matrix

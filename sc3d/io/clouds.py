@@ -37,7 +37,7 @@ def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
     if "positions" not in mesh.vertex or "indices" not in mesh.triangle or not len(mesh.triangle.indices):
         raise InputError(f"{path} holds no triangles")
     exact = read_positions(path, read_header(path))
-    if exact is not None:  # Open3D reads float32, which has steps of half a metre at UTM size
+    if exact is not None:  # Open3D reads float32, which has steps of half a meter at UTM size
         import open3d as o3d
 
         mesh.vertex.positions = o3d.core.Tensor(exact)

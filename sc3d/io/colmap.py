@@ -23,7 +23,7 @@ from sc3d.io.limits import FARTHEST, MAX_PIXELS, MAX_SIDE
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")  # rigs and frames only in newer models
 LARGEST = 1 << 62  # count of a list: bounded by the size of the file alone
-# id, position, colour, error; track of photo and keypoint
+# id, position, color, error; track of photo and keypoint
 POINT = np.array([[0, 43, 0, 0, 0], [8, 8, 0, LARGEST, 0]])
 # id, rig, rotation, translation; sensor and photo
 FRAME = np.array([[0, 64, 0, 0, 0], [4, 16, 0, LARGEST, 0]])

@@ -72,7 +72,7 @@ def _pillow() -> ModuleType:
 
 
 def check_end(path: Path) -> None:
-    """InputError for a JPEG that stops within its picture: decoders fill the rest with grey and say nothing."""
+    """InputError for a JPEG that stops within its picture: decoders fill the rest with gray and say nothing."""
     with path.open("rb") as file:
         if file.read(2) != b"\xff\xd8":
             return
@@ -163,13 +163,13 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_index_image(path: Path) -> np.ndarray:
-    """(H, W) uint8 of a grey or palette PNG (labels or confidence)."""
+    """(H, W) uint8 of a gray or palette PNG (labels or confidence)."""
     with open_image(path, "mask") as image:
         if image.mode.startswith("I"):
             raise InputError(f"{path} has 16 bits per pixel: an 8-bit PNG with one id per pixel is expected")
         if image.mode not in ("L", "P", "1"):
             raise InputError(
-                f"{path} has colours ({image.mode}): an 8-bit PNG with one id per pixel is expected"
+                f"{path} has colors ({image.mode}): an 8-bit PNG with one id per pixel is expected"
             )
         return np.array(image.convert("L") if image.mode == "1" else image, dtype=np.uint8)
 

@@ -2,7 +2,7 @@
 
 Open3D reads them with RPly, which writes beyond its buffer for long names, runs for ever over elements
 without properties, follows vertex numbers that
-do not exist, and leaves what it could not read uninitialised without an error. So everything is checked
+do not exist, and leaves what it could not read uninitialized without an error. So everything is checked
 before.
 """
 

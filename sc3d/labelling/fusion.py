@@ -151,7 +151,7 @@ def middle_of(counts: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarr
 
 def _rules(middle: np.ndarray, views: list[View], settings: Label) -> Rules:
     reference_depth = (
-        float(np.median([np.linalg.norm(view.centre - middle) for view in views])) if views else 1.0
+        float(np.median([np.linalg.norm(view.center - middle) for view in views])) if views else 1.0
     )
     equal = settings.method in ("direct", "majority")
     return Rules(

@@ -95,7 +95,7 @@ def voxel_size_for(spacing: float, sample: np.ndarray, masks: Masks) -> float:
     footprints = []
     for view in masks.views:
         focal = view.focal * image_size(masks.files[view.name])[0] / view.width
-        footprints.append(np.median(np.linalg.norm(sample - view.centre, axis=1)) / focal)
+        footprints.append(np.median(np.linalg.norm(sample - view.center, axis=1)) / focal)
     return max(2 * spacing, 1.5 * float(np.median(footprints)))
 
 

@@ -100,15 +100,15 @@ def open_ballot(
     order, cells, field_cells, facing = _cells(sorting, normals, field)
     blocks = np.flatnonzero(np.diff(field_cells // (VOXELS * SIDES), prepend=-1))
     blocks = np.append(blocks, len(field_cells))
-    centres, radii = np.empty((len(blocks) - 1, 3)), np.empty(len(blocks) - 1)
+    centers, radii = np.empty((len(blocks) - 1, 3)), np.empty(len(blocks) - 1)
     ordered = np.ascontiguousarray(points[order], np.float64)
-    _bound(ordered, cells, blocks, centres, radii)
+    _bound(ordered, cells, blocks, centers, radii)
     turned = (
         np.empty((0, 3), np.float32) if normals is None else np.ascontiguousarray(normals[order], np.float32)
     )
     votes = np.zeros((len(field_cells), num_ids), np.int32)
     weights = np.empty(0, np.uint16) if density is None else voxel_shares(density, sorting)[order]
-    cloud = SortedCloud(ordered, turned, weights, cells, blocks, facing, centres, radii)
+    cloud = SortedCloud(ordered, turned, weights, cells, blocks, facing, centers, radii)
     return Ballot(
         cloud,
         order,
@@ -134,7 +134,7 @@ def lens_of(view: View, points: np.ndarray) -> Lens:
         )
     return Lens(
         view.cam_from_world,
-        view.centre,
+        view.center,
         view.cone_cosine,
         view.frustum,
         view.width,
@@ -178,7 +178,7 @@ def _partition(order, starts, sides, result, counts):
 
 
 @numba.njit(parallel=True, cache=True)
-def _bound(points, cells, blocks, centres, radii):
+def _bound(points, cells, blocks, centers, radii):
     """Arrays as in SortedCloud."""
     for block in numba.prange(len(blocks) - 1):
         first, last = cells[blocks[block]], cells[blocks[block + 1]]
@@ -187,6 +187,6 @@ def _bound(points, cells, blocks, centres, radii):
             low = high = points[first, axis]
             for k in range(first, last):
                 low, high = min(low, points[k, axis]), max(high, points[k, axis])
-            centres[block, axis] = (low + high) / 2
+            centers[block, axis] = (low + high) / 2
             squared += (high - low) ** 2 / 4
         radii[block] = np.sqrt(squared) * (1 + 1e-9)

@@ -27,7 +27,7 @@ class SortedCloud(NamedTuple):
     density: (N,) uint16 weight of each point among those of its cell, or (0,) if all weigh the same
     cells: (K + 1,) int64 first point of each cell; blocks: (B + 1,) int64 first cell of each block
     facing: (K,) bool, points of the cell must face the camera to be seen
-    centres: (B, 3), radii: (B,) float64 spheres around the blocks' points, world
+    centers: (B, 3), radii: (B,) float64 spheres around the blocks' points, world
     """
 
     points: np.ndarray
@@ -36,20 +36,20 @@ class SortedCloud(NamedTuple):
     cells: np.ndarray
     blocks: np.ndarray
     facing: np.ndarray
-    centres: np.ndarray
+    centers: np.ndarray
     radii: np.ndarray
 
 
 class Lens(NamedTuple):
     """A view for kernels.
 
-    cam_from_world: (4, 4); centre: (3,) world; cone, frustum: as in `View`; width, height: px
+    cam_from_world: (4, 4); center: (3,) world; cone, frustum: as in `View`; width, height: px
     parameters: (8,) as in `opencv_parameters`; unused if pixels: (N, 2) float64 holds the projections of all
         points, else (0, 2)
     """
 
     cam_from_world: np.ndarray
-    centre: np.ndarray
+    center: np.ndarray
     cone: float
     frustum: np.ndarray
     width: int
@@ -110,9 +110,9 @@ def to_pixel(parameters, x, y, z):
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _in_frustum(lens, centre, radius):
+def _in_frustum(lens, center, radius):
     """Whether a sphere may reach into the pyramid that holds the image."""
-    x, y, z = to_camera(lens, centre[0], centre[1], centre[2])
+    x, y, z = to_camera(lens, center[0], center[1], center[2])
     inside = True
     for side in range(4):
         inside &= lens.frustum[side, 0] * x + lens.frustum[side, 1] * y + lens.frustum[
@@ -134,7 +134,7 @@ def _see(cloud, lens, picture, rules, cell, point):
     if cloud.normals.shape[0]:
         nx, ny, nz = cloud.normals[point, 0], cloud.normals[point, 1], cloud.normals[point, 2]
         cosine = (
-            nx * (lens.centre[0] - x) + ny * (lens.centre[1] - y) + nz * (lens.centre[2] - z)
+            nx * (lens.center[0] - x) + ny * (lens.center[1] - y) + nz * (lens.center[2] - z)
         ) / distance
         if occluding and cosine <= 0 and cloud.facing[cell]:
             return nothing
@@ -171,7 +171,7 @@ def cast_votes(cloud, lens, picture, rules, votes, strict, overlay, said_labels,
     """Arrays as in Ballot."""
     num_ids = votes.shape[1]
     for block in numba.prange(len(cloud.blocks) - 1):
-        if not _in_frustum(lens, cloud.centres[block], cloud.radii[block]):
+        if not _in_frustum(lens, cloud.centers[block], cloud.radii[block]):
             continue
         sums = np.zeros((2, num_ids), np.int64)  # row 1: strict sightings only
         for cell in range(cloud.blocks[block], cloud.blocks[block + 1]):

@@ -1,5 +1,5 @@
 """Complete the labels along the geometry (paper section 3.4): KNN voting, eq. 7-9 as a front, Potts by mean
-field with colour and relief.
+field with color and relief.
 """
 
 from sc3d.geometry.graph import Graph, build_graph, similarity

@@ -1,7 +1,7 @@
-"""Colour and relief as two more raters (METHOD section 6): what agreed points of each class look like, as
+"""Color and relief as two more raters (METHOD section 6): what agreed points of each class look like, as
 joint histograms.
 
-The masks' errors are shared between views, so no voting removes them. Colour and relief (height above the
+The masks' errors are shared between views, so no voting removes them. Color and relief (height above the
 ground around, roughness, slope) err
 otherwise. Each rater alone is poor; their product is good, because the two hardly depend on one another once
 the class is known, and because
@@ -107,7 +107,7 @@ class Raters:
         return tuple(group.count(label, examples, num_classes) for group in self.groups)
 
     def rate(self, lesson: Lesson, label: np.ndarray) -> np.ndarray | None:
-        """(N, C) float32 log-probability of the classes as colour and relief see them; None where there is
+        """(N, C) float32 log-probability of the classes as color and relief see them; None where there is
         too little to learn from.
 
         label: (N,) uint8. Points of a class without enough examples get zeros: the raters do not contradict
@@ -144,7 +144,7 @@ class Raters:
 
 
 def feature_counts(relief: np.ndarray, colors: np.ndarray | None) -> list[Counts]:
-    """Counts of each feature: of relief (N, 4), then of colours (N, 3), if there are any."""
+    """Counts of each feature: of relief (N, 4), then of colors (N, 3), if there are any."""
     return [Counts.of(column) for table in (relief, colors) if table is not None for column in table.T]
 
 

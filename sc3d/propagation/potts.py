@@ -1,4 +1,4 @@
-"""Potts energy on a neighbour graph, minimised by mean field (METHOD 0.1): one fused pass over the edges per
+"""Potts energy on a neighbor graph, minimized by mean field (METHOD 0.1): one fused pass over the edges per
 step.
 """
 
@@ -19,7 +19,7 @@ def mean_field(
     start: np.ndarray | None = None,
     steps: int = STEPS,
 ) -> np.ndarray:
-    """Minimise sum_i -log p_i(l_i) + smoothness sum_(i,j) w_ij [l_i != l_j], all points at once in each step.
+    """Minimize sum_i -log p_i(l_i) + smoothness sum_(i,j) w_ij [l_i != l_j], all points at once in each step.
 
     log_likelihood: (N, C) float32, column c = class id c + 1; -inf = class not offered
     start: (N, C) first belief; None = as the likelihood says
@@ -63,7 +63,7 @@ def potts_energy(graph: Graph, log_likelihood: np.ndarray, label: np.ndarray, sm
 
 
 def free_energy(graph: Graph, log_likelihood: np.ndarray, belief: np.ndarray, smoothness: float) -> float:
-    """Expected energy minus entropy of independent beliefs (N, C): what mean field minimises."""
+    """Expected energy minus entropy of independent beliefs (N, C): what mean field minimizes."""
     belief = belief.astype(np.float64)
     cost = -(np.where(belief > 0, log_likelihood, 0) * belief).sum()
     entropy = -(belief * np.log(np.maximum(belief, 1e-300))).sum()

@@ -24,7 +24,7 @@ TRUST = 0.5  # weight of the votes beside the raters, which see what the views' 
 AGREED_VIEWS, AGREED_SHARE = 3, 0.9  # seeds to learn from: seen by so many views, this share of their votes
 SURE = 0.95  # later rounds learn from points of this probability
 IMPLAUSIBLE = np.log(0.5)  # a seed whose class the raters give less is a conflict
-# confidence: weight of the evidence and of the neighbours; full weights would be sure everywhere
+# confidence: weight of the evidence and of the neighbors; full weights would be sure everywhere
 CAUTION, SUPPORT = 0.5, 0.1
 
 
@@ -115,7 +115,7 @@ def tie_breakers(evidence: Evidence, normals: np.ndarray | None) -> tuple[np.nda
 
 
 def complete(evidence: Evidence, normals: np.ndarray | None, settings: Propagate) -> Labels:
-    """Label the points that have none, on their own neighbour graph. normals: (N, 3) unit, oriented, or None
+    """Label the points that have none, on their own neighbor graph. normals: (N, 3) unit, oriented, or None
     = estimated.
     """
     colors = evidence.colors if settings.color else None
@@ -182,7 +182,7 @@ def final_labels(
 
 
 def _learned(graph: Graph, known: Evidence) -> tuple[Raters, Lesson] | None:
-    """Colour and relief as raters, and what the agreed points teach, if that does well on agreed points that
+    """Color and relief as raters, and what the agreed points teach, if that does well on agreed points that
     it has not seen.
     """
     raters, start, examples = (
@@ -206,7 +206,7 @@ def is_skilled(wrong: list[int | None], lesson: Lesson) -> bool:
     """Whether the raters do well enough; wrong: their errors on each fold held out."""
     skill = skill_of(wrong, lesson[0].sum(axis=0))
     logger.info(
-        "colour and relief avoid %.0f%% of errors on held-out agreed points%s",
+        "color and relief avoid %.0f%% of errors on held-out agreed points%s",
         100 * skill,
         "" if skill >= MIN_SKILL else ": not used",
     )

@@ -31,7 +31,7 @@ def grow(graph: Graph, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         confidence[pending[reached]] = share[reached]
         pending = pending[~reached]
     changing = np.flatnonzero((label == 0) & (result > 0))
-    # neighbours that the front reached later have their say; bounded, because parallel steps may oscillate
+    # neighbors that the front reached later have their say; bounded, because parallel steps may oscillate
     for _ in range(MAX_SWEEPS):
         best, share = vote_rows(graph, changing, result, num_ids)
         moved = best != result[changing]
@@ -44,7 +44,7 @@ def grow(graph: Graph, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def vote_rows(
     graph: Graph, rows: np.ndarray, label: np.ndarray, num_ids: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(R,) uint8 label with the largest sum of weights among the neighbours of each row (0 = none labelled;
+    """(R,) uint8 label with the largest sum of weights among the neighbors of each row (0 = none labelled;
     ties: smallest id), (R,) its share.
     """
     best, share = np.zeros(len(rows), np.uint8), np.zeros(len(rows), np.float32)

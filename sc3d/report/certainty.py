@@ -29,7 +29,7 @@ def certainty_section(material: Material) -> str:
             for name, color, share in rows
         )
         parts.append(
-            f'<div><h3>Origin of the labels</h3><p class="note">Seeds come from the photos, propagated labels from their neighbours; '
+            f'<div><h3>Origin of the labels</h3><p class="note">Seeds come from the photos, propagated labels from their neighbors; '
             f'locked points were contradictory.</p>{stacked_bar(rows)}<ul class="legend">{items}</ul></div>'
         )
     return f'<div class="columns">{"".join(parts)}</div>' if parts else ""

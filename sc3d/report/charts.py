@@ -13,7 +13,7 @@ Color = tuple[int, int, int]
 
 
 def css_color(color: Sequence[int]) -> str:
-    """`#rrggbb` of an RGB colour."""
+    """`#rrggbb` of an RGB color."""
     return "#" + "".join(f"{int(value):02x}" for value in color)
 
 
@@ -31,9 +31,9 @@ def formatted(value: float | None, pattern: str) -> str:
 
 
 def paired_bars(rows: Sequence[tuple[str, Color, float | None, float | None]]) -> str:
-    """Two bars per row, on the scale 0 to 1: the upper in the row's colour, the lower grey.
+    """Two bars per row, on the scale 0 to 1: the upper in the row's color, the lower gray.
 
-    rows: name, colour, upper value, lower value; None = no such value
+    rows: name, color, upper value, lower value; None = no such value
     """
     step, parts = 46, []
     for number, (name, color, upper, lower) in enumerate(rows):
@@ -57,7 +57,7 @@ def paired_bars(rows: Sequence[tuple[str, Color, float | None, float | None]]) -
 
 
 def histogram(values: np.ndarray, colors: np.ndarray) -> str:
-    """Distribution of values from 0 to 1 in as many bins as there are colours.
+    """Distribution of values from 0 to 1 in as many bins as there are colors.
 
     values: (N,); colors: (B, 3) uint8 RGB
     """
@@ -122,7 +122,7 @@ def reliability_curve(bins: Sequence[tuple[float | None, float | None, float | N
 
 
 def stacked_bar(rows: Sequence[tuple[str, Color, float]]) -> str:
-    """One bar divided by shares. rows: name, colour, share from 0 to 1."""
+    """One bar divided by shares. rows: name, color, share from 0 to 1."""
     parts, start = [], 0.0
     for name, color, share in rows:
         parts.append(
@@ -134,19 +134,19 @@ def stacked_bar(rows: Sequence[tuple[str, Color, float]]) -> str:
 
 
 def flight_map(
-    centres: np.ndarray,
+    centers: np.ndarray,
     headings: np.ndarray,
     names: Sequence[str],
     ground: tuple[str, tuple[float, float, float, float]] | None,
 ) -> str:
     """Camera positions seen from above, north (+y) up, with a scale bar.
 
-    centres: (M, 2) x and y, world units; headings: (M, 2) horizontal part of the viewing direction
+    centers: (M, 2) x and y, world units; headings: (M, 2) horizontal part of the viewing direction
     ground: data URI of a picture from above and its (x minimum, y minimum, x maximum, y maximum)
     """
     boxes = [np.array(ground[1])] if ground else []
-    low = np.min([centres.min(axis=0), *(box[:2] for box in boxes)], axis=0)
-    high = np.max([centres.max(axis=0), *(box[2:] for box in boxes)], axis=0)
+    low = np.min([centers.min(axis=0), *(box[:2] for box in boxes)], axis=0)
+    high = np.max([centers.max(axis=0), *(box[2:] for box in boxes)], axis=0)
     span = max(float((high - low).max()), 1e-6)
     low, high = low - 0.05 * span, high + 0.05 * span
     scale = 600 / max(float((high - low).max()), 1e-6)
@@ -158,7 +158,7 @@ def flight_map(
             f'<image href="{ground[0]}" x="{(x_low - low[0]) * scale:.1f}" y="{(high[1] - y_high) * scale:.1f}" '
             f'width="{(x_high - x_low) * scale:.1f}" height="{(y_high - y_low) * scale:.1f}" preserveAspectRatio="none"/>'
         )
-    for (x, y), (east, north), name in zip((centres - low) * scale, headings, names, strict=True):
+    for (x, y), (east, north), name in zip((centers - low) * scale, headings, names, strict=True):
         y = height - y
         parts.append(
             f'<g class="camera"><line x1="{x:.1f}" y1="{y:.1f}" x2="{x + 36 * east:.1f}" y2="{y - 36 * north:.1f}"/>'

@@ -17,7 +17,7 @@ from sc3d.io.images import read_image, read_index_image
 from sc3d.report.data import Material
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.view import screenshot
-from sc3d.view.colors import COLOURINGS, color_points
+from sc3d.view.colors import COLORINGS, color_points
 from sc3d.view.screenshot import Style, draw_points
 
 logger = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ _MAX_POINTS = 1_500_000
 
 
 def cloud_pictures(material: Material) -> dict[tuple[str, str], tuple[str, float]]:
-    """Data URIs and width/height by (colouring or "mesh", "oblique" or "above"), of what the cloud has; empty
+    """Data URIs and width/height by (coloring or "mesh", "oblique" or "above"), of what the cloud has; empty
     where no renderer works.
     """
     pictures = {}
@@ -51,9 +51,9 @@ def cloud_pictures(material: Material) -> dict[tuple[str, str], tuple[str, float
 
 
 def _colorings(material: Material) -> dict[str, np.ndarray]:
-    """(N, 3) uint8 RGB by colouring, for the attributes that the cloud has."""
+    """(N, 3) uint8 RGB by coloring, for the attributes that the cloud has."""
     found = {}
-    for by in COLOURINGS:
+    for by in COLORINGS:
         with suppress(InputError):
             found[by] = color_points(material.cloud, by, material.class_table)
     return found
@@ -131,7 +131,7 @@ def jpeg(image: np.ndarray, quality: int = 85) -> str:
 
 
 def png(image: np.ndarray) -> str:
-    """Data URI of (H, W, 3) uint8 RGB with few colours."""
+    """Data URI of (H, W, 3) uint8 RGB with few colors."""
     return _png_uri(image[..., ::-1])
 
 

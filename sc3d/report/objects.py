@@ -72,7 +72,7 @@ def _class_table(material: Material) -> str:
         + (["IoU"] if iou else [])
     )
     return (
-        '<p class="note">Areas as seen straight from above; square metres if the model is metric.</p>'
+        '<p class="note">Areas as seen straight from above; square meters if the model is metric.</p>'
         + _table(heads, rows)
     )
 

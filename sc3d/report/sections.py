@@ -19,9 +19,9 @@ from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.view.colors import color_points, confidence_colors, legend_entries
 
 _NUM_PHOTOS = 4
-_COLOURING_NAMES = {
+_COLORING_NAMES = {
     "label": "Classes",
-    "photo": "Photo colours",
+    "photo": "Photo colors",
     "confidence": "Confidence",
     "state": "Origin of the label",
     "mesh": "Mesh",
@@ -89,12 +89,12 @@ def headline(material: Material) -> str:
 
 
 def cloud_section(material: Material) -> str:
-    """Pictures of the cloud: one tab per colouring, from the south and from above."""
+    """Pictures of the cloud: one tab per coloring, from the south and from above."""
     pictures = cloud_pictures(material)
-    names = [name for name in _COLOURING_NAMES if (name, "oblique") in pictures]
+    names = [name for name in _COLORING_NAMES if (name, "oblique") in pictures]
     tabs, panels = [], []
     for position, name in enumerate(names):
-        title, selected = _COLOURING_NAMES[name], str(position == 0).lower()
+        title, selected = _COLORING_NAMES[name], str(position == 0).lower()
         tabs.append(
             f'<button type="button" role="tab" aria-selected="{selected}" data-panel="cloud-{name}">{title}</button>'
         )
@@ -124,7 +124,7 @@ def quality_section(material: Material) -> str:
         (name, colors.get(name, (128, 128, 128)), value, masks.get(name)) for name, value in labels.items()
     ]
     note = "Intersection over union per class against the truth masks. Wide bar: fused labels" + (
-        "; grey bar: the given masks." if masks else "."
+        "; gray bar: the given masks." if masks else "."
     )
     near, elsewhere = (
         number(material.figures(f"labels_{where}").get("oa")) for where in ("near_edges", "elsewhere")
@@ -157,14 +157,14 @@ def flight_section(material: Material) -> str:
     """Camera positions over the ground."""
     if not material.views:
         return ""
-    centres = np.array([view.centre for view in material.views])
+    centers = np.array([view.center for view in material.views])
     headings = np.array([view.cam_from_world[2, :2] for view in material.views])
     ground = None
     if "colors" in (material.cloud.point if material.cloud is not None else {}):
         ground = ground_picture(material.points, color_points(material.cloud, "photo"))
-    lowest, highest = centres[:, 2].min(), centres[:, 2].max()
-    note = f"{_count(len(centres), 'camera')} at heights (z) of {lowest:,.1f} to {highest:,.1f} m. The line shows where each looks."
-    return f'<p class="note">{note}</p>{flight_map(centres[:, :2], headings, [view.name for view in material.views], ground)}'
+    lowest, highest = centers[:, 2].min(), centers[:, 2].max()
+    note = f"{_count(len(centers), 'camera')} at heights (z) of {lowest:,.1f} to {highest:,.1f} m. The line shows where each looks."
+    return f'<p class="note">{note}</p>{flight_map(centers[:, :2], headings, [view.name for view in material.views], ground)}'
 
 
 def training_section(material: Material) -> str:
@@ -209,7 +209,7 @@ def _photo_figures(material: Material, name: str) -> str:
 
 
 def _legend(material: Material, by: str, everything: bool = False) -> str:
-    """What the colours mean; of classes and states only those that the cloud has, unless `everything`."""
+    """What the colors mean; of classes and states only those that the cloud has, unless `everything`."""
     if by == "confidence":
         stops = ", ".join(css_color(color) for color in confidence_colors(np.linspace(0, 1, 9)))
         return f'<p class="legend">confidence 0 <i class="ramp" style="background:linear-gradient(90deg, {stops})"></i> 1</p>'

@@ -49,7 +49,7 @@ class ClassTable:
 
     @property
     def palette(self) -> np.ndarray:
-        """(256, 3) uint8 RGB per id; unlabelled is dark grey."""
+        """(256, 3) uint8 RGB per id; unlabelled is dark gray."""
         palette = np.zeros((256, 3), np.uint8)
         palette[0] = 60
         for entry in self.classes:

@@ -25,23 +25,23 @@ REACH = 4.0
 VOTES = "votes_"  # + class id; PLY has scalar properties only
 
 
-def point_arrays(cloud: o3d.t.geometry.PointCloud, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def point_arrays(cloud: o3d.t.geometry.PointCloud, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions (N, 3) float64 and unit normals (N, 3) float32 of a cloud.
 
-    Missing normals are estimated (eq. 5) and turned towards the nearest of the camera centres (M, 3).
+    Missing normals are estimated (eq. 5) and turned towards the nearest of the camera centers (M, 3).
     """
     points = cloud.point.positions.numpy().astype(np.float64)
     given = cloud.point.normals.numpy() if "normals" in cloud.point else None
-    return points, unit_normals(given, points, centres, points.min(axis=0))
+    return points, unit_normals(given, points, centers, points.min(axis=0))
 
 
 def unit_normals(
-    given: np.ndarray | None, points: np.ndarray, centres: np.ndarray, origin: np.ndarray
+    given: np.ndarray | None, points: np.ndarray, centers: np.ndarray, origin: np.ndarray
 ) -> np.ndarray:
     """(N, 3) float32 unit normals of points (N, 3) world: those given (N, 3), if they are all usable, else
     estimated.
 
-    centres: (M, 3) camera centres, to the nearest of which estimated normals are turned; origin: as in
+    centers: (M, 3) camera centers, to the nearest of which estimated normals are turned; origin: as in
         `NeighborIndex`
     """
     if given is not None:
@@ -52,7 +52,7 @@ def unit_normals(
     neighbors, _ = NeighborIndex(points, origin).nearest(points, NORMAL_NEIGHBORS)
     if neighbors.shape[1] < 3:
         raise InputError(f"the cloud has {len(points)} points: normals need at least 3")
-    return orient_normals(points, estimate_normals(points, neighbors), centres)
+    return orient_normals(points, estimate_normals(points, neighbors), centers)
 
 
 def read_surface(
@@ -190,7 +190,7 @@ class LabelledSurface:
         """
         if "label" not in cloud.point:
             raise InputError("the cloud has no labels: run `sc3d label SCENE` and `sc3d propagate SCENE`")
-        points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
+        points, normals = point_arrays(cloud, np.array([view.center for view in views]))
         surface = read_surface(mesh, points, normals, local_origin(views))
         return cls(
             surface,

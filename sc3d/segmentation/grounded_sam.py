@@ -153,9 +153,9 @@ class GroundedSam:
         numbers, scores = match_prompts(
             token_scores, caption, self._settings.box_threshold, self._settings.text_threshold
         )
-        centres, sizes = output.pred_boxes[0].float().cpu().numpy().reshape(-1, 2, 2).transpose(1, 0, 2)
+        centers, sizes = output.pred_boxes[0].float().cpu().numpy().reshape(-1, 2, 2).transpose(1, 0, 2)
         found = numbers >= 0
-        boxes = np.concatenate([centres - sizes / 2, centres + sizes / 2], axis=1)[found]
+        boxes = np.concatenate([centers - sizes / 2, centers + sizes / 2], axis=1)[found]
         return Detections(boxes, [caption.prompts[number] for number in numbers[found]], scores[found])
 
     def _outline(self, image: np.ndarray, found: Detections) -> list[Instance]:

@@ -67,7 +67,7 @@ class Material:
 def material_of(scene: Scene, masks: Masks) -> Material:
     """What refinement needs of a scene, with the default settings of `label` and `propagate`."""
     cloud = read_given_cloud(scene, None)
-    points, normals = point_arrays(cloud, np.array([view.centre for view in masks.views]))
+    points, normals = point_arrays(cloud, np.array([view.center for view in masks.views]))
     surface = read_surface(scene.mesh, points, normals, local_origin(masks.views))
     seen = LabelledSurface(
         surface,

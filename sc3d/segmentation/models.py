@@ -144,7 +144,7 @@ def load_tokenizer(path: Path, name: str):
 
 def to_pixels(image: np.ndarray, size: tuple[int, int], statistics: tuple, device: str) -> torch.Tensor:
     """(1, 3, height, width) float32 of an (H, W, 3) uint8 photo, resized with antialiasing to `size` (width,
-    height) and normalised.
+    height) and normalized.
 
     Done here rather than by the models' own processors: those of SAM 2 and 3 need torchvision, and results
     would differ with and without it.
@@ -166,7 +166,7 @@ class Patch(NamedTuple):
 
 
 def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> Patch:
-    """Enlarge a map to the size of the photo, bilinearly (pixel centres at +0.5), but only where the result
+    """Enlarge a map to the size of the photo, bilinearly (pixel centers at +0.5), but only where the result
     may exceed a threshold.
 
     values: (h, w) float32

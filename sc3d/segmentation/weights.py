@@ -12,9 +12,9 @@ from sc3d.io.json_files import read_json
 _FILES = ["*.json", "*.txt", "*.safetensors"]
 _FREE, _GATED = (
     "Apache-2.0",
-    "SAM licence, gated: accept it on the model's page on the hub and log in with `hf auth login`",
+    "SAM license, gated: accept it on the model's page on the hub and log in with `hf auth login`",
 )
-_KNOWN = {  # download size in MB, licence
+_KNOWN = {  # download size in MB, license
     "IDEA-Research/grounding-dino-tiny": (690, _FREE),
     "IDEA-Research/grounding-dino-base": (930, _FREE),
     "facebook/sam2.1-hiera-tiny": (160, _FREE),
@@ -96,7 +96,7 @@ def _missing_message(name: str, model_dir: Path | None) -> str:
     size = (
         "about {} MB, {}".format(*_KNOWN[name])
         if name in _KNOWN
-        else "size and licence: see its page on the hub"
+        else "size and license: see its page on the hub"
     )
     return f"the weights of {name} ({size}) are not on this machine: {own}, and in the hub cache {HF_HUB_CACHE}; {_advice(name)}"
 

@@ -24,17 +24,17 @@ class Segment:
     CVAT XML (files).
     """
     format: Literal["auto", "index", "color", "labelme", "coco", "cvat"] = "auto"
-    """Format of --masks (files): index = PNG with one id per pixel, color = PNG in the colours of the class
+    """Format of --masks (files): index = PNG with one id per pixel, color = PNG in the colors of the class
     table; auto looks at the files.
     """
     mapping: Path | None = None
-    """JSON object of the ids, names or colours in --masks and the classes that they stand for, such as
+    """JSON object of the ids, names or colors in --masks and the classes that they stand for, such as
     {"wall": "building", "7": "road"} (files).
     """
     confidence: Path | None = None
     """Folder of confidence maps <photo stem>.png (files); optional."""
     strokes: Path | None = None
-    """Folder of strokes and polygons per class, LabelMe JSON or PNG in the colours of the class table;
+    """Folder of strokes and polygons per class, LabelMe JSON or PNG in the colors of the class table;
     SCENE/strokes otherwise (strokes).
     """
     prompts: tuple[str, ...] = ()
@@ -126,15 +126,15 @@ class Propagate(Resources):
     map: Potts energy over all points.
     """
     num_neighbors: int = 16
-    """Neighbours per point in the graph."""
+    """Neighbors per point in the graph."""
     fill: bool = False
     """Label also the points that no edge connects to a seed, from the nearest labelled point."""
     smoothness: float = 3.0
     """Weight of the pairwise term (map)."""
     color: bool = True
-    """Edges between unlike colours weigh less (geometry, map); not in the paper."""
+    """Edges between unlike colors weigh less (geometry, map); not in the paper."""
     appearance: bool = True
-    """Learn colour and relief of the classes from agreed points, and let them vote too: the only cure for
+    """Learn color and relief of the classes from agreed points, and let them vote too: the only cure for
     errors that all views share (map).
     """
     rounds: int = 2

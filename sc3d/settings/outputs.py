@@ -25,7 +25,7 @@ class Export:
     ] = ("laz",)
     """What to write. masks: the fused labels as each photo sees them; laz: LAZ 1.4 with ASPRS classes;
     clouds: one PLY per class; splats, spz: Gaussians
-    with labels; orthophoto: GeoTIFFs of colour, class and height; objects: footprints of buildings and crowns
+    with labels; orthophoto: GeoTIFFs of color, class and height; objects: footprints of buildings and crowns
     of trees as GeoJSON;
     transforms: cameras and sparse points as nerfstudio's transforms.json; colmap-text: the same as COLMAP's
         text files."""
@@ -67,7 +67,7 @@ class View:
 
     scene: Annotated[Positional[Path], arg(help="Scene folder.")]
     by: Literal["photo", "label", "confidence", "state", "disagreement"] = "label"
-    """What the colours show; disagreement: share of the votes that the winning class did not get."""
+    """What the colors show; disagreement: share of the votes that the winning class did not get."""
     classes: tuple[str, ...] = ()
     """Names of the classes to show; all otherwise."""
     file: Path | None = None

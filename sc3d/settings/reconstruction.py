@@ -14,7 +14,7 @@ class Reconstruct:
     """Photos to cameras and sparse points (pycolmap)."""
 
     matching: Literal["exhaustive", "sequential", "spatial"] = "exhaustive"
-    """Which photo pairs to match: all, neighbours in name order, or neighbours by GPS (hundreds of photos and
+    """Which photo pairs to match: all, neighbors in name order, or neighbors by GPS (hundreds of photos and
     more).
     """
     camera_model: str = "SIMPLE_RADIAL"
@@ -63,8 +63,8 @@ class Georeference:
 class Extract:
     """Gaussians to mesh and cloud."""
 
-    method: Annotated[Literal["tsdf", "centres"], arg(name="from")] = "tsdf"
-    """Fuse rendered depth into a truncated signed distance field, or take the Gaussians' centres as the
+    method: Annotated[Literal["tsdf", "centers"], arg(name="from")] = "tsdf"
+    """Fuse rendered depth into a truncated signed distance field, or take the Gaussians' centers as the
     cloud.
     """
     max_size: int = 800
@@ -72,14 +72,14 @@ class Extract:
     voxel_size: float = 0.0
     """TSDF voxel, world units; 0 = 1.5 times the median ground sampling distance, at least box / 2048."""
     min_views: int = 1
-    """Neighbour views that must confirm a depth (within 1 px)."""
+    """Neighbor views that must confirm a depth (within 1 px)."""
     coverage: float | None = None
     """Holes of the confirmed surface are filled with the depth of single views, the surer first, until this
     share of all pixels hits a surface: labels
     need one. 0 = leave holes; None = 1 where all photos look the same way (straight down), 0.97 otherwise, as
     oblique photos see the floaters that it costs."""
     min_opacity: float = 0.3
-    """Smallest opacity of a Gaussian whose centre becomes a point (centres)."""
+    """Smallest opacity of a Gaussian whose center becomes a point (centers)."""
 
 
 @dataclass(frozen=True)

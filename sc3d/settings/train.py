@@ -28,7 +28,7 @@ class TrainSettings:
     are both
     """
     sh_degree: int = 2
-    """degree of the view-dependent colour, 0 to 3; 0 = the same from everywhere"""
+    """degree of the view-dependent color, 0 to 3; 0 = the same from everywhere"""
     seed: int = 0
     """the same seed gives the same result"""
     plain: bool = False
@@ -47,13 +47,13 @@ class TrainSettings:
     normal_weight: float = 0.05
     """weight of the agreement between rendered normals and those of the rendered depth"""
     geometric_weight: float = 0.03
-    """weight of the depth agreement between neighbouring views"""
+    """weight of the depth agreement between neighboring views"""
     photometric_weight: float = 0.15
-    """weight of the patch similarity (NCC) between neighbouring views"""
+    """weight of the patch similarity (NCC) between neighboring views"""
     surface_from: float = 0.25
     """when normal and multi-view terms begin, fraction of the run"""
-    num_neighbours: int = 8
-    """neighbouring views to choose from"""
+    num_neighbors: int = 8
+    """neighboring views to choose from"""
     num_patches: int = 8192
     """7x7 patches compared per step"""
 
@@ -62,7 +62,7 @@ class TrainSettings:
     interpolated one
     """
     random_background: bool = True
-    """render before a random colour, so that dark surfaces become opaque; False = black"""
+    """render before a random color, so that dark surfaces become opaque; False = black"""
     coarse_until: float = 0.25
     """train on images of half size until this fraction of the run"""
     densify_from: float = 0.02

@@ -126,7 +126,7 @@ def share_settings(
 
 
 def merge(parts: list[Gaussians], blocks: list[Block]) -> Gaussians:
-    """The Gaussians of every part whose centres lie in the core of its block, in the order of the blocks."""
+    """The Gaussians of every part whose centers lie in the core of its block, in the order of the blocks."""
     cores = [
         part[torch.from_numpy(block.holds(part.means.numpy()))]
         for part, block in zip(parts, blocks, strict=True)

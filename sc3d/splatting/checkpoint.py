@@ -24,10 +24,10 @@ def check_state(state: dict, parameters: dict[str, torch.Tensor], views: list[Vi
     shapes = {name: (size, *tensor.shape[1:]) for name, tensor in parameters.items()}
     _check_tensors(state["parameters"], shapes)
     Gaussians(**state["parameters"]).check(path)
-    _check_adam(state["optimiser"], shapes)
+    _check_adam(state["optimizer"], shapes)
     exposure = {"exposure": (len(views), 2)}
     _check_tensors({"exposure": state["exposure"]}, exposure)
-    _check_adam(state["exposure_optimiser"], exposure)
+    _check_adam(state["exposure_optimizer"], exposure)
     _check_tensors(state["statistics"], {field.name: (size,) for field in fields(Statistics)})
     _check_tensors(
         state["depths"], {index: (views[index].height, views[index].width) for index in state["depths"]}
@@ -35,8 +35,8 @@ def check_state(state: dict, parameters: dict[str, torch.Tensor], views: list[Vi
     torch.Generator().set_state(state["generator"])  # RuntimeError for a state that cannot be
     numbers = [
         state["iteration"],
-        state["optimiser"]["count"],
-        state["exposure_optimiser"]["count"],
+        state["optimizer"]["count"],
+        state["exposure_optimizer"]["count"],
         *state["queue"],
         *state["depths"],
     ]

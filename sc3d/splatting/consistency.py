@@ -16,7 +16,7 @@ def pinhole(view: View) -> tuple[float, float, float, float]:
 
 
 def pixel_rays(view: View, device: torch.device | str = "cpu") -> torch.Tensor:
-    """(H, W, 3) rays ((u - cx) / fx, (v - cy) / fy, 1) of the pixel centres, camera frame: a pixel's point is
+    """(H, W, 3) rays ((u - cx) / fx, (v - cy) / fy, 1) of the pixel centers, camera frame: a pixel's point is
     depth * ray.
     """
     fx, fy, cx, cy = pinhole(view)

@@ -1,4 +1,4 @@
-"""The Gaussians themselves: parameters, initialisation from sparse points, the 3DGS PLY."""
+"""The Gaussians themselves: parameters, initialization from sparse points, the 3DGS PLY."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ LARGEST_VALUE = 1e6  # of quaternions and harmonics
 class Gaussians:
     """N Gaussians as raw (unconstrained) parameters, float32.
 
-    means: (N, 3) centres, local world frame
+    means: (N, 3) centers, local world frame
     log_scales: (N, 3) natural log of the standard deviations, world units
-    quats: (N, 4) wxyz rotations world_from_gaussian, not necessarily normalised
+    quats: (N, 4) wxyz rotations world_from_gaussian, not necessarily normalized
     opacity_logits: (N,)
-    sh: (N, K, 3) spherical harmonics, K = 1, 4, 9, 16; colour = 0.5 + sum_k Y_k(direction) sh_k; direction
+    sh: (N, K, 3) spherical harmonics, K = 1, 4, 9, 16; color = 0.5 + sum_k Y_k(direction) sh_k; direction
         from the camera to the mean
     """
 
@@ -46,7 +46,7 @@ class Gaussians:
     def from_points(
         cls, points: np.ndarray, colors: np.ndarray, sh_degree: int = 0, opacity: float = 0.1
     ) -> Gaussians:
-        """One isotropic Gaussian per sparse point; its scale is the rms distance to the 3 nearest neighbours.
+        """One isotropic Gaussian per sparse point; its scale is the rms distance to the 3 nearest neighbors.
 
         Its first axis is the normal of the plane through the 12 nearest points: the axis along which training
         flattens it first.
@@ -127,7 +127,7 @@ class Gaussians:
         """Write the PLY that 3DGS viewers read (binary, float32; positions stay in the local frame, so say
         its offset in a comment).
 
-        nx ny nz hold `normals`; f_rest is ordered by colour channel first.
+        nx ny nz hold `normals`; f_rest is ordered by color channel first.
         """
         with torch.no_grad():
             rest = self.sh[:, 1:].transpose(1, 2).reshape(len(self), -1)
@@ -236,8 +236,8 @@ def rotations_from_quats(quats: torch.Tensor) -> torch.Tensor:
 
 def _plane_normals(groups: np.ndarray) -> np.ndarray:
     """(N, 3) unit normals of the planes through (N, K, 3) points; arbitrary sign."""
-    centred = groups - groups.mean(1, keepdims=True)
-    return np.linalg.eigh(centred.transpose(0, 2, 1) @ centred)[1][:, :, 0]
+    centered = groups - groups.mean(1, keepdims=True)
+    return np.linalg.eigh(centered.transpose(0, 2, 1) @ centered)[1][:, :, 0]
 
 
 def _first_axis_along(directions: np.ndarray) -> torch.Tensor:

@@ -2,14 +2,14 @@
 1.5.3).
 
 The rules are those of the CPU kernels: near plane 0.01, +0.3 px^2, Jacobian clamp at 1.3 tan(fov / 2) around
-the real principal point, pixel centres
+the real principal point, pixel centers
 at +0.5, fragments from alpha 1/255 on. gsplat bins boxes of min(3.33, sqrt(2 ln(255 opacity))) standard
 deviations, rounded up to whole pixels;
 alpha is below 1/255 outside of them, so no fragment is lost. It differs in four ways:
 - alpha is limited to 0.999 instead of 0.99;
 - a pixel ends before the fragment that would bring its transmittance to 1e-4 instead of after it;
 - a Gaussian is visible (radius > 0) if that box touches the image, the CPU's if the box without rounding
-    holds a pixel centre;
+    holds a pixel center;
 - sums are float32 in the order of the GPU's atomic additions: gradients vary in their last digits from run to
     run.
 """
@@ -100,8 +100,8 @@ class _Screen:
         return (self.radii[0] > 0).all(1)
 
     @property
-    def rasterisation(self) -> tuple:
-        """The arguments that gsplat's rasterising functions end with."""
+    def rasterization(self) -> tuple:
+        """The arguments that gsplat's rasterizing functions end with."""
         return *self.size, TILE, self.offsets, self.ids
 
 
@@ -136,7 +136,7 @@ class GsplatStatistics(ViewStatistics):
         return self._in_ndc(getattr(self._screen.means2d, "absgrad", None))
 
     def _in_ndc(self, gradient: Tensor | None) -> Tensor:
-        """(N,) length of (1, N, 2) gradients by pixels, in normalised device units."""
+        """(N,) length of (1, N, 2) gradients by pixels, in normalized device units."""
         screen = self._screen
         if gradient is None:
             return torch.zeros_like(screen.opacities[0])
@@ -164,7 +164,7 @@ def render_gsplat(
         screen.conics,
         features[None],
         screen.opacities,
-        *screen.rasterisation,
+        *screen.rasterization,
         absgrad=screen.means2d.requires_grad,
     )
     image, alpha = image[0], alpha[0, ..., 0]
@@ -225,7 +225,7 @@ def contributions(screen: _Screen, functions: Functions) -> tuple[Tensor, Tensor
         band = means2d.new_zeros(1, height, width)
         band[:, top : top + rows] = 1
         ids, pixels, _ = functions.rasterize_to_indices_in_range(
-            0, _ALL, band, means2d, conics, opacities, *screen.rasterisation
+            0, _ALL, band, means2d, conics, opacities, *screen.rasterization
         )
         offsets = torch.stack([pixels % width, pixels // width], 1) + 0.5 - means2d[0, ids]
         alphas = (opacities[0, ids] * torch.exp(-0.5 * _squared_distance(offsets, conics[0, ids]))).clamp_max(
@@ -257,11 +257,11 @@ def _squared_distance(offsets: Tensor, conics: Tensor) -> Tensor:
 def _features(
     gaussians: Gaussians, view: View, sh_degree: int, geometry: bool, functions: Functions
 ) -> Tensor:
-    """(N, 7) what a fragment adds: colour, normal (camera frame, towards the camera), plane distance; (N, 3)
+    """(N, 7) what a fragment adds: color, normal (camera frame, towards the camera), plane distance; (N, 3)
     without geometry.
     """
     means = gaussians.means
-    directions = means - means.new_tensor(view.centre)
+    directions = means - means.new_tensor(view.center)
     colors = (functions.spherical_harmonics(sh_degree, directions, gaussians.sh) + 0.5).clamp_min(0)
     if not geometry:
         return colors

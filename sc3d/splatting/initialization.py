@@ -1,7 +1,7 @@
 """More starting points where the sparse points leave parts of the photos empty (trees, lawn, asphalt): a
 small plane-sweep stereo.
 
-Optimisation moves a Gaussian by little per step, so a tree crown that starts on the ground stays there:
+Optimization moves a Gaussian by little per step, so a tree crown that starts on the ground stays there:
 starting depth matters.
 """
 
@@ -20,7 +20,7 @@ from sc3d.splatting.dataset import TrainingData
 
 SWEEP_SIZE = 250  # px, longest side of the images compared: 7x7 patches must hold some texture
 NUM_DEPTHS = 64
-MAX_COST = 0.5  # mean 1 - NCC of the two best neighbours
+MAX_COST = 0.5  # mean 1 - NCC of the two best neighbors
 AROUND = 5  # grid points whose costs are averaged
 MIN_SPARSE = 8
 TALLEST = 0.4  # of the flying height: nothing stands higher, unless sparse points say so
@@ -57,26 +57,26 @@ class _Layer:
         up = -np.sum([view.cam_from_world[2, :3] for view in views], axis=0)
         up = up / np.maximum(np.linalg.norm(up), 1e-12)
         low, high = np.quantile(points @ up, [0.02, 0.995])
-        altitude = min(view.centre @ up for view in views) - low
+        altitude = min(view.center @ up for view in views) - low
         # crowns have few sparse points, so the highest of those is no limit
         high = max(high + 0.1 * (high - low), low + TALLEST * altitude)
         return cls(up, low - 0.02 * altitude, high) if high < low + 0.8 * altitude else None
 
     def plane(self, view: View, height: float) -> tuple[np.ndarray, float]:
         """Normal (camera frame, towards the camera) and distance of the horizontal plane at a height."""
-        return view.cam_from_world[:3, :3] @ self.up, float(view.centre @ self.up - height)
+        return view.cam_from_world[:3, :3] @ self.up, float(view.center @ self.up - height)
 
 
 def fill_points(
-    data: TrainingData, neighbours: list[np.ndarray], budget: int
+    data: TrainingData, neighbors: list[np.ndarray], budget: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points on a pixel grid of every photo, away from sparse points.
 
-    neighbours: per view indices of other views, best first; budget: number of grid points over all photos;
+    neighbors: per view indices of other views, best first; budget: number of grid points over all photos;
         fewer remain, as photos overlap
-    returns: (M, 3) float64 points, the views' world; (M, 3) uint8 colours. M = 0 where there is nothing to
+    returns: (M, 3) float64 points, the views' world; (M, 3) uint8 colors. M = 0 where there is nothing to
         fill.
-    Depth: where patches agree with the neighbours' (plane sweep); elsewhere interpolated from what the view
+    Depth: where patches agree with the neighbors' (plane sweep); elsewhere interpolated from what the view
         knows around the pixel.
     """
     masks = map(data.mask, range(len(data.views)))
@@ -85,7 +85,7 @@ def fill_points(
         for view, mask in zip(data.views, masks, strict=True)
     )
     step = max(4.0, np.sqrt(num_pixels / max(budget, 1)))
-    greys = [_small_grey(data, index) for index in range(len(data.views))]
+    grays = [_small_gray(data, index) for index in range(len(data.views))]
     layer = _Layer.of(np.asarray(data.points, np.float64), data.views)
     found, colors, sizes = [], [], []
     for index, view in enumerate(data.views):
@@ -94,7 +94,7 @@ def fill_points(
             continue
         planes = _planes(sight, view, layer)
         swept, cost = _sweep(
-            sight.grid, planes, greys[index], [greys[other] for other in neighbours[index]], view
+            sight.grid, planes, grays[index], [grays[other] for other in neighbors[index]], view
         )
         good = _settled(sight.grid, swept, cost < MAX_COST, step)
         known = np.concatenate([sight.pixels, sight.grid[good]]), np.concatenate([sight.depths, swept[good]])
@@ -115,12 +115,12 @@ def fill_points(
     return _thinned(np.concatenate(found), np.concatenate(colors), float(np.median(np.concatenate(sizes))))
 
 
-def _small_grey(data: TrainingData, index: int) -> tuple[torch.Tensor, View]:
+def _small_gray(data: TrainingData, index: int) -> tuple[torch.Tensor, View]:
     view = data.views[index]
     scale = min(1.0, SWEEP_SIZE / max(view.width, view.height))
     small = view.resized(max(8, round(view.width * scale)), max(8, round(view.height * scale)))
     image = cv2.resize(data.image(index), (small.width, small.height), interpolation=cv2.INTER_AREA)
-    return losses.to_grey(torch.from_numpy(image).float() / 255), small
+    return losses.to_gray(torch.from_numpy(image).float() / 255), small
 
 
 def _sight(data: TrainingData, index: int, step: float) -> _Sight | None:
@@ -152,7 +152,7 @@ def _planes(sight: _Sight, view: View, layer: _Layer | None) -> list[tuple[np.nd
             (np.array([0.0, 0.0, -1.0]), depth)
             for depth in 1 / np.linspace(1 / farthest, 1 / nearest, NUM_DEPTHS)
         ]
-    height = view.centre @ layer.up
+    height = view.center @ layer.up
     return [
         layer.plane(view, height - below)
         for below in 1 / np.linspace(1 / (height - layer.low), 1 / (height - layer.high), NUM_DEPTHS)

@@ -4,7 +4,7 @@ c] += alpha T s.
 A fragment's weight w = alpha T is its share of a pixel; summed over the pixels of class c of all views (times
 the mask's confidence s) it is
 the evidence that Gaussian i belongs to c. It equals the gradient of sum(image * mask) with respect to the
-Gaussian's colour.
+Gaussian's color.
 """
 
 from __future__ import annotations
@@ -100,12 +100,12 @@ def evidence_by_gradient(
     returns: (N, num_ids) float64
     """
     evidence = np.zeros((len(gaussians), num_ids))
-    # away from 0, where colours are cut
-    grey = painted(gaussians.detached(), np.full((len(gaussians), 3), 0.5))
+    # away from 0, where colors are cut
+    gray = painted(gaussians.detached(), np.full((len(gaussians), 3), 0.5))
     target, weight = torch.from_numpy(mask.astype(np.int64)), torch.from_numpy(weights)
     for first in range(1, num_ids, 3):
-        dc = grey.sh.clone().requires_grad_()
-        image = render(replace(grey, sh=dc), view, 0, geometry=False).color
+        dc = gray.sh.clone().requires_grad_()
+        image = render(replace(gray, sh=dc), view, 0, geometry=False).color
         shown = torch.stack([(target == label) * weight for label in range(first, first + 3)], dim=2)
         (image * shown.to(image)).sum().backward()
         part = dc.grad[:, 0].cpu().numpy().astype(np.float64) / SH_C0
@@ -129,7 +129,7 @@ def winners(evidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def painted(gaussians: Gaussians, colors: np.ndarray) -> Gaussians:
-    """The same Gaussians in one colour each from everywhere. colors: (N, 3) RGB, 0 to 1; float32"""
+    """The same Gaussians in one color each from everywhere. colors: (N, 3) RGB, 0 to 1; float32"""
     values = torch.from_numpy(np.ascontiguousarray(colors, np.float32)).to(gaussians.means)
     return Gaussians(
         gaussians.means,

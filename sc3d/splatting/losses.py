@@ -17,7 +17,7 @@ from sc3d.splatting.cpu import normal_loss as kernels_normals
 from sc3d.splatting.cpu import patch_ncc as kernels_patches
 
 PATCH_RADIUS = 3
-GREY = (0.299, 0.587, 0.114)
+GRAY = (0.299, 0.587, 0.114)
 
 
 def apply_exposure(image: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
@@ -52,8 +52,8 @@ def flatten_loss(log_scales: torch.Tensor, visible: torch.Tensor, extent: float)
 
 def image_edges(image: torch.Tensor) -> torch.Tensor:
     """(H, W) gradient magnitude of an (H, W, 3) image, divided by its maximum: 1 at the strongest edge."""
-    grey = to_grey(image)
-    padded = torch.nn.functional.pad(grey[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    gray = to_gray(image)
+    padded = torch.nn.functional.pad(gray[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     gradient = (
         (padded[1:-1, 2:] - padded[1:-1, :-2]).square() + (padded[2:, 1:-1] - padded[:-2, 1:-1]).square()
     ).sqrt()
@@ -62,7 +62,7 @@ def image_edges(image: torch.Tensor) -> torch.Tensor:
 
 def normals_from_depth(depth: torch.Tensor, view: View) -> torch.Tensor:
     """(H, W, 3) unit normals, camera frame, towards the camera: cross product of the differences between the
-    4 neighbours' points.
+    4 neighbors' points.
 
     depth: (H, W), 0 = none. Zero at the image border and where one of the four has no depth.
     """
@@ -124,7 +124,7 @@ def photometric_loss(
 
     planes: (M, 3) N and (M,) D of the pixels; pixels: (M, 2) int64 column, row; weights: (M,) exp(-phi), not
         differentiated
-    source, other: grey (H, W) images in [0, 1] with their views
+    source, other: gray (H, W) images in [0, 1] with their views
     returns: weighted mean of 1 - NCC over the patches with 1 - NCC < 0.9
     """
     dissimilarity, inside = patch_dissimilarity(planes, pixels, source, other)
@@ -161,22 +161,22 @@ def patch_dissimilarity_reference(
     other: tuple[torch.Tensor, View],
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """`patch_dissimilarity` in plain torch: for GPUs, and for tests of the kernel."""
-    (grey, view), (other_grey, other_view) = source, other
+    (gray, view), (other_gray, other_view) = source, other
     steps = torch.arange(-PATCH_RADIUS, PATCH_RADIUS + 1, device=pixels.device)
     offsets = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), 2).reshape(-1, 2)
     patch = pixels[:, None] + offsets
     limits = pixels.new_tensor([view.width - 1, view.height - 1])
     inside = ((patch >= 0) & (patch <= limits)).all(2).all(1)
     patch = patch.clamp_min(0).minimum(limits)
-    values = grey[patch[..., 1], patch[..., 0]]
+    values = gray[patch[..., 1], patch[..., 0]]
     warped = _warp(patch.float() + 0.5, planes, view, other_view)
     border = warped.new_tensor([other_view.width, other_view.height]) - 0.5
     inside = inside & ((warped >= 0.5) & (warped <= border)).all(2).all(1)
-    other_values = sample(other_grey, warped.reshape(-1, 2)).reshape(values.shape)
-    return 1 - normalised_correlation(values, other_values), inside
+    other_values = sample(other_gray, warped.reshape(-1, 2)).reshape(values.shape)
+    return 1 - normalized_correlation(values, other_values), inside
 
 
-def normalised_correlation(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+def normalized_correlation(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     """(M,) NCC of rows of two (M, P) arrays in [0, 1]. Variances below (1/255)^2 count as noise: they pull it
     to 0.
     """
@@ -187,9 +187,9 @@ def normalised_correlation(first: torch.Tensor, second: torch.Tensor) -> torch.T
     ).sqrt()
 
 
-def to_grey(image: torch.Tensor) -> torch.Tensor:
+def to_gray(image: torch.Tensor) -> torch.Tensor:
     """(H, W) luma of an (H, W, 3) image."""
-    return image @ image.new_tensor(GREY)
+    return image @ image.new_tensor(GRAY)
 
 
 def _warp(

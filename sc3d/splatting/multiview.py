@@ -16,11 +16,11 @@ PIXELS_PER_PATCH = 4
 
 
 @dataclass(frozen=True)
-class Neighbour:
-    """The other view of a pair. grey: (h, w) in [0, 1]; depth: (h, w), 0 = none, not differentiated."""
+class Neighbor:
+    """The other view of a pair. gray: (h, w) in [0, 1]; depth: (h, w), 0 = none, not differentiated."""
 
     view: View
-    grey: torch.Tensor
+    gray: torch.Tensor
     depth: torch.Tensor
 
 
@@ -40,12 +40,12 @@ def multi_view_losses(
     rendering: Rendering,
     depth: torch.Tensor,
     source: tuple[torch.Tensor, View],
-    neighbour: Neighbour,
+    neighbor: Neighbor,
     draw: tuple[int, torch.Generator],
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Geometric and photometric loss of random pixels.
 
-    depth: (H, W) unbiased depth of `rendering`; source: its (H, W) grey photo and view
+    depth: (H, W) unbiased depth of `rendering`; source: its (H, W) gray photo and view
     draw: number of patches, random generator
     """
     num_patches, generator = draw
@@ -56,7 +56,7 @@ def multi_view_losses(
     chosen = present[chosen.to(present.device)]
     view = source[1]
     points_cam = pixel_rays(view, depth.device).reshape(-1, 3)[chosen] * depth.reshape(-1)[chosen, None]
-    error, valid = reprojection_error(points_cam, view, neighbour.depth, neighbour.view)
+    error, valid = reprojection_error(points_cam, view, neighbor.depth, neighbor.view)
     near = torch.nonzero(valid & (error.detach() < 1))[:num_patches, 0]
     if not len(near):
         return depth.sum() * 0, depth.sum() * 0
@@ -64,6 +64,6 @@ def multi_view_losses(
     planes = rendering.normal.reshape(-1, 3)[picked], rendering.plane_distance.reshape(-1)[picked]
     pixels = torch.stack([picked % view.width, picked // view.width], 1)
     photometric = losses.photometric_loss(
-        planes, pixels, torch.exp(-error[near].detach()), source, (neighbour.grey, neighbour.view)
+        planes, pixels, torch.exp(-error[near].detach()), source, (neighbor.gray, neighbor.view)
     )
     return losses.geometric_loss(error, valid), photometric

@@ -1,4 +1,4 @@
-"""Differentiable rendering of planar Gaussians: colour, alpha, normal and plane distance of a pinhole view in
+"""Differentiable rendering of planar Gaussians: color, alpha, normal and plane distance of a pinhole view in
 one pass (eq. 1-3).
 """
 
@@ -33,7 +33,7 @@ class ViewStatistics:
     weight: (N,) float32 sum over pixels of w_i; after forward
     max_transmittance: (N,) float32 largest transmittance in front of any of its fragments, 0 = never hit;
         after forward
-    gradient: (N,) float32 |d loss / d mean2d| in normalised device units: pixel gradient times (W / 2, H /
+    gradient: (N,) float32 |d loss / d mean2d| in normalized device units: pixel gradient times (W / 2, H /
         2); zero until backward
     absolute_gradient: (N,) float32 the same from sums of absolute per-pixel gradients (AbsGS); zero until
         backward
@@ -97,9 +97,9 @@ def render(
     Gaussians on a GPU are rendered there by gsplat, with the differences that `gsplat_backend` lists; images
     and statistics stay on it.
 
-    view: pinhole, in the same local world as the Gaussians; its principal point is honoured
-    sh_degree: highest active degree, None = all that are stored; colours are clamped at 0 from below
-    background: (3,) colour seen through what is left of the transmittance, None = black; gets no gradient
+    view: pinhole, in the same local world as the Gaussians; its principal point is honored
+    sh_degree: highest active degree, None = all that are stored; colors are clamped at 0 from below
+    background: (3,) color seen through what is left of the transmittance, None = black; gets no gradient
     geometry: False leaves `normal` and `plane_distance` zero, which saves a few percent of the time
     raises ValueError for a view with distortion or parameters that are not float32, MissingPackageError on a
     GPU without gsplat
@@ -149,7 +149,7 @@ def unbiased_depth(rendering: Rendering, view: View) -> Tensor:
 
 
 def _ray_slopes(view: View) -> tuple[Tensor, Tensor]:
-    """(W,) and (H,) float32 x and y of the rays with z = 1 through the pixel centres."""
+    """(W,) and (H,) float32 x and y of the rays with z = 1 through the pixel centers."""
     matrix = view.matrix
     column = (np.arange(view.width) + 0.5 - matrix[0, 2]) / matrix[0, 0]
     row = (np.arange(view.height) + 0.5 - matrix[1, 2]) / matrix[1, 1]
@@ -163,7 +163,7 @@ def camera_array(view: View) -> np.ndarray:
     margin = _JACOBIAN_MARGIN * size / (2 * focal)
     limits = np.stack([-principal / focal - margin, (size - principal) / focal + margin], axis=1)
     return np.concatenate(
-        [pose[:3, :3].ravel(), pose[:3, 3], focal, principal, size, view.centre, limits.ravel()]
+        [pose[:3, :3].ravel(), pose[:3, 3], focal, principal, size, view.center, limits.ravel()]
     )
 
 
@@ -218,7 +218,7 @@ class _Render(torch.autograd.Function):
         visible, records, offsets, ranks, instances, starts = sort_into_tiles(camera, all_records, depths)
         image = np.empty((kernels_raster.CHANNELS, height, width), np.float32)
         contributions, order = np.zeros((len(ranks), 2), np.float32), interleaved(len(starts) - 1)
-        kernels_raster.rasterise(
+        kernels_raster.rasterize(
             records.reshape(-1), ranks, instances, starts, order, background, geometry, image, contributions
         )
         kernels_raster.collect_contributions(
@@ -259,7 +259,7 @@ class _Render(torch.autograd.Function):
             _plane_array(grad_alpha, size),
         ]
         gradients = np.zeros(len(frame.ranks) * kernels_project.RECORD, np.float32)
-        kernels_unraster.rasterise_backward(
+        kernels_unraster.rasterize_backward(
             frame.records,
             frame.ranks,
             frame.instances,

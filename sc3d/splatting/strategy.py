@@ -88,16 +88,16 @@ class DensifyLimits:
     """prune above; fraction of E"""
 
 
-def current(optimiser: RowAdam) -> Gaussians:
-    """The Gaussians whose tensors the optimiser holds."""
-    return Gaussians(**optimiser.parameters)
+def current(optimizer: RowAdam) -> Gaussians:
+    """The Gaussians whose tensors the optimizer holds."""
+    return Gaussians(**optimizer.parameters)
 
 
-def prune(optimiser: RowAdam, statistics: Statistics, removed: torch.Tensor) -> None:
+def prune(optimizer: RowAdam, statistics: Statistics, removed: torch.Tensor) -> None:
     """Take the Gaussians with `removed` (N,) bool away."""
     kept = torch.nonzero(~removed)[:, 0]
     if len(kept) < len(removed):
-        optimiser.take(kept, torch.zeros(len(kept), dtype=torch.bool))
+        optimizer.take(kept, torch.zeros(len(kept), dtype=torch.bool))
         statistics.take(kept)
 
 
@@ -140,7 +140,7 @@ def select(
 
 
 def clone_and_split(
-    optimiser: RowAdam,
+    optimizer: RowAdam,
     statistics: Statistics,
     clones: torch.Tensor,
     splits: torch.Tensor,
@@ -155,13 +155,13 @@ def clone_and_split(
     cloned, split = torch.nonzero(clones)[:, 0], torch.nonzero(splits)[:, 0]
     source = torch.cat([torch.nonzero(~splits)[:, 0], cloned, split, split])
     fresh = torch.arange(len(source)) >= size - len(split)
-    optimiser.take(source, fresh)
+    optimizer.take(source, fresh)
     statistics.take(source)
     first = size - len(split) + len(cloned)
     if not len(split):
         return
     with torch.no_grad():
-        gaussians = current(optimiser)
+        gaussians = current(optimizer)
         parts = gaussians[first:]
         offsets = parts.scales * torch.randn(len(parts), 3, generator=generator).to(parts.scales)
         gaussians.means[first:] += (parts.rotations @ offsets[..., None])[..., 0]
@@ -169,40 +169,40 @@ def clone_and_split(
 
 
 def densify(
-    optimiser: RowAdam, statistics: Statistics, limits: DensifyLimits, generator: torch.Generator
+    optimizer: RowAdam, statistics: Statistics, limits: DensifyLimits, generator: torch.Generator
 ) -> None:
     """One round: prune, then clone and split what the statistics ask for as far as the cap leaves room;
     statistics start again.
     """
-    prune(optimiser, statistics, useless(current(optimiser), limits))
-    gaussians = current(optimiser)
+    prune(optimizer, statistics, useless(current(optimizer), limits))
+    gaussians = current(optimizer)
     room = limits.max_gaussians - len(gaussians)
     if room < 0:
-        prune(optimiser, statistics, _faintest(gaussians.opacities, -room))
+        prune(optimizer, statistics, _faintest(gaussians.opacities, -room))
     elif room > 0:
         clones, splits = select(gaussians, statistics, limits, room)
-        clone_and_split(optimiser, statistics, clones, splits, generator)
+        clone_and_split(optimizer, statistics, clones, splits, generator)
     statistics.restart()
 
 
-def trim(optimiser: RowAdam, statistics: Statistics) -> None:
+def trim(optimizer: RowAdam, statistics: Statistics) -> None:
     """Drop Gaussians that no view, or one of more than two that could, saw unoccluded during the last pass:
     hidden or floating ones.
 
     What only one or two photos contain, at the border of a flight, stays.
     """
-    prune(optimiser, statistics, (statistics.seen == 0) | ((statistics.seen < 2) & (statistics.inside > 2)))
+    prune(optimizer, statistics, (statistics.seen == 0) | ((statistics.seen < 2) & (statistics.inside > 2)))
 
 
-def reset_opacity(optimiser: RowAdam, ceiling: float = 0.01) -> None:
+def reset_opacity(optimizer: RowAdam, ceiling: float = 0.01) -> None:
     """Lower all opacities to at most `ceiling` and forget their momentum: what no view needs does not come
     back.
     """
-    logits = optimiser.parameters["opacity_logits"]
+    logits = optimizer.parameters["opacity_logits"]
     with torch.no_grad():
         logits.clamp_(max=math.log(ceiling / (1 - ceiling)))
-    optimiser.means["opacity_logits"].zero_()
-    optimiser.squares["opacity_logits"].zero_()
+    optimizer.means["opacity_logits"].zero_()
+    optimizer.squares["opacity_logits"].zero_()
 
 
 def _faintest(opacities: torch.Tensor, count: int) -> torch.Tensor:

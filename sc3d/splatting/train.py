@@ -37,7 +37,7 @@ def train(
     checkpoint: Path | None = None,
     progress: bool = True,
 ) -> TrainResult:
-    """Optimise Gaussians until they look like the photos.
+    """Optimize Gaussians until they look like the photos.
 
     checkpoint: where `settings.checkpoint_every` saves; if it exists and belongs to the same settings, the
         run continues from it exactly

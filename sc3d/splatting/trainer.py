@@ -12,7 +12,7 @@ import torch
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.geometry.view_selection import neighbour_views
+from sc3d.geometry.view_selection import neighbor_views
 from sc3d.io.atomic import atomic_path
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses
@@ -24,7 +24,7 @@ from sc3d.splatting.device import pick_device
 from sc3d.splatting.evaluation import depth_map, held_out_scores, psnr
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.initialization import fill_points
-from sc3d.splatting.multiview import Neighbour, multi_view_losses, single_view_normal_loss
+from sc3d.splatting.multiview import Neighbor, multi_view_losses, single_view_normal_loss
 from sc3d.splatting.optimizer import RowAdam
 from sc3d.splatting.rendering import Rendering, render, unbiased_depth
 from sc3d.splatting.strategy import DensifyLimits, Statistics
@@ -56,15 +56,15 @@ class Trainer:
             settings.gradient_threshold,
             settings.absolute_gradient_threshold,
         )
-        centres = np.stack([view.centre for view in used.views])
-        neighbours = neighbour_views(
-            used.tracks, np.asarray(data.points, np.float64), centres, settings.num_neighbours
+        centers = np.stack([view.center for view in used.views])
+        neighbors = neighbor_views(
+            used.tracks, np.asarray(data.points, np.float64), centers, settings.num_neighbors
         )
-        self.neighbours = {
+        self.neighbors = {
             index: [self.train_views[other] for other in others]
-            for index, others in zip(self.train_views, neighbours, strict=True)
+            for index, others in zip(self.train_views, neighbors, strict=True)
         }
-        self.optimiser = RowAdam(*self._initial(used, neighbours))
+        self.optimizer = RowAdam(*self._initial(used, neighbors))
         self.exposure = RowAdam(
             {"exposure": torch.zeros(num_views, 2, requires_grad=True)}, {"exposure": 1e-3}
         )
@@ -78,7 +78,7 @@ class Trainer:
     @property
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are now; leaves of the autograd graph."""
-        return densify.current(self.optimiser)
+        return densify.current(self.optimizer)
 
     @property
     def exposures(self) -> np.ndarray:
@@ -92,7 +92,7 @@ class Trainer:
         index, iteration = self._next_view(), self.iteration
         view, target, mask = self._photo(index, self.settings.coarse(iteration))
         gaussians = self.gaussians
-        # A different colour behind the surface each time: holes never pay off.
+        # A different color behind the surface each time: holes never pay off.
         background = torch.rand(3, generator=self.generator) if self.settings.random_background else None
         rendering = render(
             gaussians,
@@ -135,10 +135,10 @@ class Trainer:
             **self._identity(),
             "iteration": self.iteration,
             "queue": self.queue,
-            "parameters": {name: tensor.detach() for name, tensor in self.optimiser.parameters.items()},
-            "optimiser": self.optimiser.state(),
+            "parameters": {name: tensor.detach() for name, tensor in self.optimizer.parameters.items()},
+            "optimizer": self.optimizer.state(),
             "exposure": self.exposure.parameters["exposure"].detach(),
-            "exposure_optimiser": self.exposure.state(),
+            "exposure_optimizer": self.exposure.state(),
             "statistics": vars(self.statistics),
             "depths": self.depths,
             "generator": self.generator.get_state(),
@@ -155,7 +155,7 @@ class Trainer:
             state = torch.load(path, map_location="cpu", weights_only=True)
             matches = all(state[name] == value for name, value in self._identity().items())
             if matches:
-                check_state(state, self.optimiser.parameters, self.data.views, str(path))
+                check_state(state, self.optimizer.parameters, self.data.views, str(path))
         except Exception as error:  # torch raises many types for broken files
             raise InputError(
                 f"{path} is not a readable checkpoint ({type(error).__name__}): delete it to start over"
@@ -163,12 +163,12 @@ class Trainer:
         if not matches:
             log.warning("%s was made with other settings or photos: starting over", path)
             return False
-        self.optimiser.parameters.update(
+        self.optimizer.parameters.update(
             {name: tensor.to(self.device).requires_grad_() for name, tensor in state["parameters"].items()}
         )
-        self.optimiser.restore(state["optimiser"])
+        self.optimizer.restore(state["optimizer"])
         self.exposure.parameters["exposure"] = state["exposure"].requires_grad_()
-        self.exposure.restore(state["exposure_optimiser"])
+        self.exposure.restore(state["exposure_optimizer"])
         self.statistics = Statistics(
             **{name: values.to(self.device) for name, values in state["statistics"].items()}
         )
@@ -189,11 +189,11 @@ class Trainer:
         }
 
     def _initial(
-        self, data: TrainingData, neighbours: list[np.ndarray]
+        self, data: TrainingData, neighbors: list[np.ndarray]
     ) -> tuple[dict[str, torch.Tensor], dict[str, float | np.ndarray]]:
         points, colors = np.asarray(data.points, np.float64), np.asarray(data.colors)
         if self.settings.fill:
-            more = fill_points(data, neighbours, self.settings.max_gaussians // 4)
+            more = fill_points(data, neighbors, self.settings.max_gaussians // 4)
             points, colors = np.concatenate([points, more[0]]), np.concatenate([colors, more[1]])
         if len(points) > self.settings.max_gaussians:
             chosen = (
@@ -224,10 +224,10 @@ class Trainer:
     def _surface_terms(
         self, index: int, target: torch.Tensor, rendering: Rendering, depth: torch.Tensor
     ) -> torch.Tensor:
-        """Normal and multi-view terms against one random neighbour, whose depth is the one it had when it was
+        """Normal and multi-view terms against one random neighbor, whose depth is the one it had when it was
         trained on last.
         """
-        settings, view, others = self.settings, self.data.views[index], self.neighbours[index]
+        settings, view, others = self.settings, self.data.views[index], self.neighbors[index]
         loss = settings.normal_weight * single_view_normal_loss(rendering, depth, view, target)
         self.depths[index] = torch.where(rendering.alpha > 0.5, depth, 0).detach()
         if others:
@@ -237,9 +237,9 @@ class Trainer:
                 self.depths[other] = torch.from_numpy(depth_map(self.gaussians, other_view)[0]).to(
                     self.device
                 )
-            neighbour = Neighbour(other_view, losses.to_grey(other_target), self.depths[other])
-            source, draw = (losses.to_grey(target), view), (settings.num_patches, self.generator)
-            geometric, photometric = multi_view_losses(rendering, depth, source, neighbour, draw)
+            neighbor = Neighbor(other_view, losses.to_gray(other_target), self.depths[other])
+            source, draw = (losses.to_gray(target), view), (settings.num_patches, self.generator)
+            geometric, photometric = multi_view_losses(rendering, depth, source, neighbor, draw)
             loss = loss + settings.geometric_weight * geometric + settings.photometric_weight * photometric
         return loss
 
@@ -249,8 +249,8 @@ class Trainer:
         self.statistics.add(
             statistics.gradient, statistics.absolute_gradient, rendering.radii, statistics.max_transmittance
         )
-        self.optimiser.rates["means"] = self.settings.position_rate(self.iteration, self.extent)
-        self.optimiser.step()
+        self.optimizer.rates["means"] = self.settings.position_rate(self.iteration, self.extent)
+        self.optimizer.step()
         if self.settings.exposure:
             rows = torch.zeros(len(self.data.views), dtype=torch.bool)
             rows[index] = True
@@ -260,15 +260,15 @@ class Trainer:
         settings, iteration, num_views = self.settings, self.iteration, len(self.train_views)
         if not self.queue:  # every view was seen once
             if settings.trims(iteration, num_views):
-                densify.trim(self.optimiser, self.statistics)
+                densify.trim(self.optimizer, self.statistics)
             self.statistics.start_pass()
         if settings.densifies(iteration, num_views):
             limits = replace(
                 self.limits, max_gaussians=settings.allowed_gaussians(iteration, self.num_initial)
             )
-            densify.densify(self.optimiser, self.statistics, limits, self.generator)
+            densify.densify(self.optimizer, self.statistics, limits, self.generator)
         if settings.resets_opacity(iteration):
-            densify.reset_opacity(self.optimiser)
+            densify.reset_opacity(self.optimizer)
 
     def _record(self, loss: float, quality: float) -> dict[str, float] | None:
         self._recent.append((loss, quality))
@@ -294,8 +294,8 @@ def scene_extent(views: list[View], points: np.ndarray) -> float:
     """E, world units: 1.1 x the largest distance of a camera from their mean, but at least half the median
     distance to the points.
     """
-    centres = np.stack([view.centre for view in views])
-    middle = centres.mean(0)
-    spread = np.linalg.norm(centres - middle, axis=1).max()
+    centers = np.stack([view.center for view in views])
+    middle = centers.mean(0)
+    spread = np.linalg.norm(centers - middle, axis=1).max()
     distance = np.median(np.linalg.norm(np.asarray(points, np.float64) - middle, axis=1))
     return float(max(1.1 * spread, 0.5 * distance))

@@ -8,9 +8,9 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.extraction import DepthViews, centre_cloud, extract_surface
+from sc3d.extraction import DepthViews, center_cloud, extract_surface
 from sc3d.geometry.cameras import project, resample, undistorted
-from sc3d.geometry.view_selection import neighbour_views
+from sc3d.geometry.view_selection import neighbor_views
 from sc3d.io.clouds import write_geometry
 from sc3d.io.images import read_image
 from sc3d.scene.scene import Scene, check_photos
@@ -29,9 +29,9 @@ def outputs(scene: Scene, settings: Extract) -> list[Path]:
 def run(scene: Scene, settings: Extract) -> dict[str, object]:
     gaussians, origin = load_gaussians(scene)
     model = scene.model
-    centres = np.array([view.centre for view in model.views])
-    if settings.method == "centres":
-        cloud = centre_cloud(gaussians, centres - origin, settings.min_opacity)
+    centers = np.array([view.center for view in model.views])
+    if settings.method == "centers":
+        cloud = center_cloud(gaussians, centers - origin, settings.min_opacity)
         write_geometry(scene.cloud, _placed(cloud, origin))
         return {"points": len(cloud.point.positions)}
     check_photos(scene, [view.name for view in model.views])
@@ -42,7 +42,7 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
             read_image(scene.photo(model.views[row].name)), model.views[row].shifted(origin), views[row]
         )
 
-    data = DepthViews(views, image, neighbour_views(model.tracks, model.points, centres), _depth_range(model))
+    data = DepthViews(views, image, neighbor_views(model.tracks, model.points, centers), _depth_range(model))
     surfaces = extract_surface(gaussians, data, settings)
     write_geometry(scene.mesh, _placed(surfaces.mesh, origin))
     write_geometry(scene.cloud, _placed(surfaces.cloud, origin))

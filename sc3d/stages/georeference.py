@@ -73,7 +73,7 @@ def _from_photos(scene: Scene, settings: Georeference) -> Found:
     flight = read_flight(scene.images, [view.name for view in views])
     found = (
         find_georeference(
-            flight, {view.name: view.centre for view in views}, scene.model.points, settings.epsg
+            flight, {view.name: view.center for view in views}, scene.model.points, settings.epsg
         )
         if flight
         else None

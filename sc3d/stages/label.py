@@ -49,7 +49,7 @@ def run(scene: Scene, settings: Label) -> dict[str, object]:
         read_given_cloud(scene, settings.cloud),
     )
     views = masks.views
-    points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
+    points, normals = point_arrays(cloud, np.array([view.center for view in views]))
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=default_voxel_size(points, masks))
     surface = (

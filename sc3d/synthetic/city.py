@@ -13,7 +13,7 @@ import numpy as np
 import open3d as o3d
 from tqdm import tqdm
 
-from sc3d.geometry.cameras import View, pixel_centres, rays
+from sc3d.geometry.cameras import View, pixel_centers, rays
 from sc3d.io.images import write_image
 from sc3d.io.json_files import write_json
 from sc3d.scene.scene import Scene
@@ -84,15 +84,15 @@ class City:
         return np.concatenate(parts).reshape(view.height, view.width)
 
     def _label_rows(self, view: View, first: int, last: int) -> np.ndarray:
-        directions, _ = rays(view, pixel_centres(view.width, last - first) + [0.0, first])
-        hits = self.scene.cast_rays(ray_tensor(np.broadcast_to(view.centre, directions.shape), directions))
+        directions, _ = rays(view, pixel_centers(view.width, last - first) + [0.0, first])
+        hits = self.scene.cast_rays(ray_tensor(np.broadcast_to(view.center, directions.shape), directions))
         distance, triangles, numbers = (
             hits[name].numpy() for name in ("t_hit", "primitive_ids", "geometry_ids")
         )
         label = np.full(len(directions), OTHER, np.uint8)
         for number in np.unique(numbers[np.isfinite(distance)]):
             rows = np.flatnonzero(numbers == number)
-            points = view.centre + directions[rows] * distance[rows, None]
+            points = view.center + directions[rows] * distance[rows, None]
             label[rows] = self.sites[number].labels(points, triangles[rows].astype(np.int64))
         return label
 

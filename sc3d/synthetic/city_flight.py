@@ -43,7 +43,7 @@ def _poses(
     """
     direction, tilt = look
     targets = _grid(num, size)
-    centres = (
+    centers = (
         targets
         + [0.0, 0.0, ALTITUDE]
         - ALTITUDE * np.tan(tilt) * direction
@@ -51,7 +51,7 @@ def _poses(
     )
     targets = targets + rng.normal(0, [3.0, 3.0, 0.3], (num, 3))
     return [
-        look_at(centre, target, tuple(direction)) for centre, target in zip(centres, targets, strict=True)
+        look_at(center, target, tuple(direction)) for center, target in zip(centers, targets, strict=True)
     ]
 
 

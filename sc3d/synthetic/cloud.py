@@ -65,7 +65,7 @@ def find_tracks(
         at, _ = project(view, points)
         inside = np.flatnonzero(in_image(view, at))
         clear = ~world.hidden(
-            np.broadcast_to(view.centre, (len(inside), 3)), points[inside] - view.centre, far=0.9998
+            np.broadcast_to(view.center, (len(inside), 3)), points[inside] - view.center, far=0.9998
         )
         seen.append(inside[clear])
         pixels.append(at[inside[clear]])

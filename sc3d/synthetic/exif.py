@@ -14,9 +14,9 @@ from sc3d.synthetic.flight import FOCAL_35MM
 REFERENCE = (-37.9042, 144.9886, 20.0)
 
 
-def geodetic(centres: np.ndarray) -> np.ndarray:
+def geodetic(centers: np.ndarray) -> np.ndarray:
     """Latitude, longitude (degrees) and ellipsoid height (m), (N, 3), of world positions (N, 3)."""
-    return np.asarray(pycolmap.GPSTransform().enu_to_ellipsoid(np.asarray(centres, np.float64), *REFERENCE))
+    return np.asarray(pycolmap.GPSTransform().enu_to_ellipsoid(np.asarray(centers, np.float64), *REFERENCE))
 
 
 def drone_exif(position: np.ndarray, number: int) -> Image.Exif:

@@ -17,8 +17,8 @@ def focal_length(width: int, height: int) -> float:
 
 
 def fly(settings: Synthesize) -> list[View]:
-    """True cameras, `settings.views` of them: names view_000.jpg ..., pinhole, world = site centre, z up,
-    metres.
+    """True cameras, `settings.views` of them: names view_000.jpg ..., pinhole, world = site center, z up,
+    meters.
     """
     rng = np.random.default_rng([settings.seed, 2])
     num_nadir = settings.views if settings.views < 8 else round(0.6 * settings.views)
@@ -48,12 +48,12 @@ def _nadir_poses(num: int, settings: Synthesize, rng: np.random.Generator) -> li
         heading = 1.0 if line % 2 == 0 else -1.0
         stations = np.linspace(-reach, reach, len(members)) * heading if len(members) > 1 else [0.0]
         for y in stations:
-            centre = np.array([x, y, settings.altitude]) + rng.normal(0, [0.4, 0.4, 0.3])
+            center = np.array([x, y, settings.altitude]) + rng.normal(0, [0.4, 0.4, 0.3])
             yaw, pitch, roll = rng.normal(0, np.radians([2.0, 1.5, 1.0]))
             top = np.array([np.sin(yaw), heading * np.cos(yaw), 0.0])
             side = np.array([top[1], -top[0], 0.0])
-            target = centre + [0, 0, -1.0] + np.tan(pitch) * top + np.tan(roll) * side
-            poses.append(look_at(centre, target, tuple(top)))
+            target = center + [0, 0, -1.0] + np.tan(pitch) * top + np.tan(roll) * side
+            poses.append(look_at(center, target, tuple(top)))
     return poses
 
 
@@ -68,8 +68,8 @@ def _ring_poses(
     for i in range(num):
         angle = 2 * np.pi * (i + phase) / num + rng.normal(0, 0.02)
         direction = np.array([np.cos(angle), np.sin(angle), 0.0])
-        centre = radius * direction + [0, 0, height] + rng.normal(0, 0.4, 3)
-        poses.append(look_at(centre, near * direction + [0, 0, 1.0] + rng.normal(0, [1.5, 1.5, 0.3])))
+        center = radius * direction + [0, 0, height] + rng.normal(0, 0.4, 3)
+        poses.append(look_at(center, near * direction + [0, 0, 1.0] + rng.normal(0, [1.5, 1.5, 0.3])))
     return poses
 
 

@@ -68,7 +68,7 @@ def synthesize(
     _clear(scene_path)
     report(0.0, "building the world")
     world, views = build_world(settings), fly(settings)
-    positions = geodetic(_measured_centres(views, settings))
+    positions = geodetic(_measured_centers(views, settings))
     started, right, labelled = time.perf_counter(), 0, 0
     for number, view in enumerate(views):
         report(0.05 + 0.85 * number / len(views), view.name)
@@ -115,11 +115,11 @@ def _clear(scene_path: Path) -> None:
         file.unlink()
 
 
-def _measured_centres(views: list[View], settings: Synthesize) -> np.ndarray:
-    """(N, 3) camera centres as the GPS gives them."""
-    centres = np.stack([view.centre for view in views])
+def _measured_centers(views: list[View], settings: Synthesize) -> np.ndarray:
+    """(N, 3) camera centers as the GPS gives them."""
+    centers = np.stack([view.center for view in views])
     return (
-        centres + np.random.default_rng([settings.seed, 6]).normal(0, 1, centres.shape) * settings.gps_noise
+        centers + np.random.default_rng([settings.seed, 6]).normal(0, 1, centers.shape) * settings.gps_noise
     )
 
 

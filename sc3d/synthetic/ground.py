@@ -10,10 +10,10 @@ from scipy.spatial import cKDTree
 
 from sc3d.synthetic.mesh import GRASS, GROUND, MeshBuilder
 
-HALF_ROAD = 3.0  # carriageway, m from the centre line
+HALF_ROAD = 3.0  # carriageway, m from the center line
 HALF_PAVED = 4.5  # including pavements
 RASTER_STEP = 0.5
-# m inside of level edges: the hills end over the first, whatever is left (pads, kerbs) over the second
+# m inside of level edges: the hills end over the first, whatever is left (pads, curbs) over the second
 RIM, EDGE = 15.0, 3.0
 DRIVEWAY, PARKING = 0, 1
 
@@ -22,8 +22,8 @@ DRIVEWAY, PARKING = 0, 1
 class Ground:
     """The ground surface as functions of x, y.
 
-    extent: side of the square site, centred on the origin, m
-    rasters: (2 * roads, n, n) float32: offset to the left of each centre line and length along it, m; [row =
+    extent: side of the square site, centered on the origin, m
+    rasters: (2 * roads, n, n) float32: offset to the left of each center line and length along it, m; [row =
         y, column = x]
     half: half the side of the rasters, m
     rects: (R, 7) float64 paved rectangles: x, y, cos yaw, sin yaw, half length, half width, DRIVEWAY or
@@ -35,15 +35,15 @@ class Ground:
     extent: float
     rasters: np.ndarray
     half: float
-    centre_lines: list[np.ndarray]
+    center_lines: list[np.ndarray]
     hills: np.ndarray
     rects: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
     pads: list[tuple[float, ...]] = field(default_factory=list)
     level_edges: bool = False
 
     def road_offsets(self, xy: np.ndarray) -> np.ndarray:
-        """(N, roads) signed distance of (N, 2) points to each centre line, m."""
-        return np.stack([self._sample(2 * i, xy)[0] for i in range(len(self.centre_lines))], 1)
+        """(N, roads) signed distance of (N, 2) points to each center line, m."""
+        return np.stack([self._sample(2 * i, xy)[0] for i in range(len(self.center_lines))], 1)
 
     def height(self, xy: np.ndarray) -> np.ndarray:
         """(N,) height of the ground at (N, 2) points, m: hills, levelled across roads and under buildings."""
@@ -66,9 +66,9 @@ class Ground:
 
     @cached_property
     def _profiles(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Lengths along each centre line and heights there."""
+        """Lengths along each center line and heights there."""
         profiles: list[tuple[np.ndarray, np.ndarray]] = []
-        for line in self.centre_lines:
+        for line in self.center_lines:
             profile = self._hill_height(line)
             # a later road takes the level of an earlier one where they cross
             for j, (lengths, level) in enumerate(profiles):
@@ -88,7 +88,7 @@ class Ground:
         return 1.0 - _fade(self.extent / 2 - np.abs(xy).max(1), 0.0, width) if self.level_edges else 1.0
 
     def _sample(self, layer: int, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Bilinear samples of two neighbouring raster layers."""
+        """Bilinear samples of two neighboring raster layers."""
         n = self.rasters.shape[1]
         cell = np.clip((xy + self.half) / RASTER_STEP, 0, n - 1.001)
         low = cell.astype(np.int64)
@@ -156,7 +156,7 @@ def rect_distance(xy: np.ndarray, rect: tuple[float, ...] | np.ndarray) -> np.nd
 
 
 def _road_coordinates(line: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Offset to the left of a densely sampled centre line and length along it."""
+    """Offset to the left of a densely sampled center line and length along it."""
     tangents = np.gradient(line, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     nearest = cKDTree(line).query(points)[1]

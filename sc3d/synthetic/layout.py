@@ -32,7 +32,7 @@ def place_buildings(ground: Ground, rng: np.random.Generator) -> list[Building]:
         # late comers fill the second row
         gap = 17.0 if hall else rng.uniform(4.0, 8.0) + (14.0 if attempt > 30 * wanted else 0.0)
         x, y, yaw = _beside_road(
-            ground, int(rng.integers(len(ground.centre_lines))), HALF_PAVED + gap + half[1], rng
+            ground, int(rng.integers(len(ground.center_lines))), HALF_PAVED + gap + half[1], rng
         )
         wing = None
         if not hall and rng.random() < 0.5:
@@ -60,7 +60,7 @@ def plant(builder: MeshBuilder, ground: Ground, buildings: list[Building], rng: 
             spots.append((*_beside_wall(building, rng.uniform(1.0, 2.2), rng), rng.uniform(2.2, 3.6)))
     for _ in range(round(26 * share)):
         x, y, _ = _beside_road(
-            ground, int(rng.integers(len(ground.centre_lines))), HALF_PAVED + rng.uniform(0.6, 1.4), rng
+            ground, int(rng.integers(len(ground.center_lines))), HALF_PAVED + rng.uniform(0.6, 1.4), rng
         )
         spots.append((x, y, rng.uniform(2.2, 3.4)))
     for _ in range(round(7 * share)):
@@ -90,7 +90,7 @@ def park_cars(builder: MeshBuilder, ground: Ground, rng: np.random.Generator) ->
     share = ground.extent / 120
     taken = np.zeros((0, 2))
     spots = [
-        _beside_road(ground, int(rng.integers(len(ground.centre_lines))), 1.55, rng)
+        _beside_road(ground, int(rng.integers(len(ground.center_lines))), 1.55, rng)
         for _ in range(round(14 * share))
     ]
     for x, y, cos, sin, half_length, half_width, kind in ground.rects:
@@ -134,10 +134,10 @@ def build_fences(
 def _beside_road(
     ground: Ground, road: int, offset: float, rng: np.random.Generator
 ) -> tuple[float, float, float]:
-    """A place at `offset` m from a centre line, on either side, and the yaw that turns a local -y towards the
+    """A place at `offset` m from a center line, on either side, and the yaw that turns a local -y towards the
     road.
     """
-    line = ground.centre_lines[road]
+    line = ground.center_lines[road]
     line = line[np.abs(line).max(1) < 0.5 * ground.extent]
     i = int(rng.integers(1, len(line) - 1))
     tangent = line[i + 1] - line[i - 1]
@@ -186,7 +186,7 @@ def _fits(building: Building, others: list[Building], ground: Ground, limit: flo
 
 def _pave(ground: Ground, building: Building, gap: float, kind: int, rng: np.random.Generator) -> None:
     """Pave from the house to the road: a driveway 3 m wide, or a car park as wide as the hall."""
-    reach = gap + 1.0  # up to the kerb
+    reach = gap + 1.0  # up to the curb
     if kind == DRIVEWAY and gap > 12:
         return
     width = 1.5 if kind == DRIVEWAY else building.half[0]

@@ -124,7 +124,7 @@ def _small_objects(label: np.ndarray, max_area: float) -> np.ndarray:
 
 
 def _warp(image: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Sample an integer image (H, W) at pixels moved by `field` (H, W, 2) px, nearest neighbour."""
+    """Sample an integer image (H, W) at pixels moved by `field` (H, W, 2) px, nearest neighbor."""
     height, width = image.shape
     columns = np.clip(np.round(np.arange(width) + field[..., 0]), 0, width - 1).astype(np.int64)
     rows = np.clip(np.round(np.arange(height)[:, None] + field[..., 1]), 0, height - 1).astype(np.int64)

@@ -20,7 +20,7 @@ NUM_COLUMNS = 17
 
 
 def linear(color: tuple[float, float, float] | np.ndarray) -> np.ndarray:
-    """Linear light of an RGB colour given as 0..255 display values; same shape, 0..1."""
+    """Linear light of an RGB color given as 0..255 display values; same shape, 0..1."""
     return (np.asarray(color, np.float64) / 255.0) ** 2.2
 
 

@@ -56,13 +56,13 @@ BASEMENT = 0.8  # walls go this far below the ground, so that no slope leaves a 
 
 @dataclass(frozen=True)
 class Building:
-    """A building's main box: centre and base height (world, m), yaw (rad), half sizes and wall height (m),
+    """A building's main box: center and base height (world, m), yaw (rad), half sizes and wall height (m),
     roof GABLE, HIP or FLAT.
 
     wing: (x, y, half length, half width) of a second, lower box in the building's frame, or None
     """
 
-    centre: tuple[float, float]
+    center: tuple[float, float]
     base: float
     yaw: float
     half: tuple[float, float]
@@ -73,7 +73,7 @@ class Building:
     @property
     def pose(self) -> np.ndarray:
         """(4, 4) world_from_building, origin on the ground."""
-        return upright_pose(np.array([*self.centre, self.base]), self.yaw)
+        return upright_pose(np.array([*self.center, self.base]), self.yaw)
 
     def boxes(self) -> list[tuple[float, float, float, float]]:
         """x, y, half length and half width of each box in the building's frame, m."""

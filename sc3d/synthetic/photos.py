@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sc3d.geometry.cameras import View, pixel_centres, rays
+from sc3d.geometry.cameras import View, pixel_centers, rays
 from sc3d.synthetic.shading import display
 from sc3d.synthetic.world import World
 
@@ -16,7 +16,7 @@ SAMPLES_PER_BAND = 2_000_000  # rows are rendered in bands: large photos must no
 
 @dataclass(frozen=True)
 class Photo:
-    """color (H, W, 3) uint8; depth (H, W) float32 z of the pixel centre's ray, m, 0 = nothing there; label
+    """color (H, W, 3) uint8; depth (H, W) float32 z of the pixel center's ray, m, 0 = nothing there; label
     (H, W) uint8 of the same ray.
     """
 
@@ -26,8 +26,8 @@ class Photo:
 
 
 def photograph(world: World, view: View) -> Photo:
-    """Render a view. Colours are means of 2 x 2 samples per pixel; depth and label belong to exactly the
-    pixel's centre.
+    """Render a view. Colors are means of 2 x 2 samples per pixel; depth and label belong to exactly the
+    pixel's center.
 
     Exposure and sensor noise are fixed by the world's seed and the view's name.
     """
@@ -47,24 +47,24 @@ def _render_rows(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Linear light (h, W, 3), depth and label (h, W) of the rows [first, last)."""
     shape = (last - first, view.width)
-    centres = pixel_centres(*shape[::-1]) + [0.0, first]
-    directions, cosines = rays(view, centres)
-    range_, triangles = world.cast(view.centre, directions)
+    centers = pixel_centers(*shape[::-1]) + [0.0, first]
+    directions, cosines = rays(view, centers)
+    range_, triangles = world.cast(view.center, directions)
     hit = triangles >= 0
     depth = np.where(hit, range_ * cosines, 0.0).astype(np.float32)
-    label = world.labels(_points(view.centre, directions, range_, hit), triangles)
-    light = np.zeros((len(centres), 3), np.float32)
+    label = world.labels(_points(view.center, directions, range_, hit), triangles)
+    light = np.zeros((len(centers), 3), np.float32)
     for offset in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
-        directions, cosines = rays(view, centres + offset)
-        range_, triangles = world.cast(view.centre, directions)
+        directions, cosines = rays(view, centers + offset)
+        range_, triangles = world.cast(view.center, directions)
         hit = triangles >= 0
         slope = np.abs((directions * world.floats[triangles, 9:12]).sum(1))
         footprints = (np.where(hit, range_, 1.0) * 0.5 / view.focal / np.sqrt(np.maximum(slope, 0.1))).astype(
             np.float32
         )
-        light += 0.25 * world.light(_points(view.centre, directions, range_, hit), triangles, footprints)
+        light += 0.25 * world.light(_points(view.center, directions, range_, hit), triangles, footprints)
     return light.reshape(*shape, 3), depth.reshape(shape), label.reshape(shape)
 
 
-def _points(centre: np.ndarray, directions: np.ndarray, range_: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    return (centre + directions * np.where(hit, range_, 0.0)[:, None]).astype(np.float32)
+def _points(center: np.ndarray, directions: np.ndarray, range_: np.ndarray, hit: np.ndarray) -> np.ndarray:
+    return (center + directions * np.where(hit, range_, 0.0)[:, None]).astype(np.float32)

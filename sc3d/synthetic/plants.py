@@ -28,15 +28,15 @@ def add_tree(builder: MeshBuilder, position: np.ndarray, radius: float, rng: np.
     num_leaves = int(330 * radius**2)
     lobe = rng.choice(num_lobes, num_leaves, p=sizes**2 / (sizes**2).sum())
     outward = _sphere(num_leaves, rng)
-    centres = lobes[lobe] + outward * (sizes[lobe] * rng.uniform(0.75, 1.08, num_leaves))[:, None] * [
+    centers = lobes[lobe] + outward * (sizes[lobe] * rng.uniform(0.75, 1.08, num_leaves))[:, None] * [
         1,
         1,
         0.8,
     ]
-    depth = np.linalg.norm((centres - crown) / [radius, radius, height], axis=1)
+    depth = np.linalg.norm((centers - crown) / [radius, radius, height], axis=1)
     tint = linear(LEAF_TINTS[rng.integers(len(LEAF_TINTS))]) * rng.uniform(0.88, 1.12, 3)
     shade = (0.45 + 0.6 * np.clip(depth, 0, 1.1)) * rng.uniform(0.8, 1.2, num_lobes)[lobe]
-    _add_leaves(builder, centres, outward, tint * shade[:, None], object_id, rng)
+    _add_leaves(builder, centers, outward, tint * shade[:, None], object_id, rng)
 
 
 def add_conifer(builder: MeshBuilder, position: np.ndarray, radius: float, rng: np.random.Generator) -> None:
@@ -50,12 +50,12 @@ def add_conifer(builder: MeshBuilder, position: np.ndarray, radius: float, rng: 
     angle = rng.uniform(0, 2 * np.pi, num_leaves)
     spikes = 0.78 + 0.22 * np.sin(7 * angle + 9 * level)
     reach = radius * (1 - level) * spikes * rng.uniform(0.3, 1.0, num_leaves) ** 0.4
-    centres = position + np.stack(
+    centers = position + np.stack(
         [reach * np.cos(angle), reach * np.sin(angle), 0.9 + level * (height - 0.9) - 0.25 * reach], 1
     )
     outward = np.stack([np.cos(angle), np.sin(angle), np.full(num_leaves, 0.6)], 1) / np.sqrt(1.36)
     shade = rng.uniform(0.7, 1.3, num_leaves) * (0.5 + 0.6 * reach / np.maximum(radius * (1 - level), 0.1))
-    _add_leaves(builder, centres, outward, linear(CONIFER_TINT) * shade[:, None], object_id, rng)
+    _add_leaves(builder, centers, outward, linear(CONIFER_TINT) * shade[:, None], object_id, rng)
 
 
 def add_bush(
@@ -75,41 +75,41 @@ def add_bush(
     outward[:, 2] = np.abs(outward[:, 2])
     boxed = outward / np.maximum((np.abs(outward) ** 3).sum(1, keepdims=True) ** (1 / 3), 1e-9)
     local = boxed * np.asarray(half) * rng.uniform(0.8, 1.08, (num_leaves, 1))
-    centres = position + [0, 0, 0.15] + (local * [1, 1, 1.7]) @ turn.T
+    centers = position + [0, 0, 0.15] + (local * [1, 1, 1.7]) @ turn.T
     tint = linear(LEAF_TINTS[rng.integers(len(LEAF_TINTS))]) * rng.uniform(0.8, 1.2)
     shade = rng.uniform(0.7, 1.2, num_leaves) * (0.6 + 0.45 * outward[:, 2])
-    _add_leaves(builder, centres, outward @ turn.T, tint * shade[:, None], object_id, rng)
+    _add_leaves(builder, centers, outward @ turn.T, tint * shade[:, None], object_id, rng)
 
 
 def _add_leaves(
     builder: MeshBuilder,
-    centres: np.ndarray,
+    centers: np.ndarray,
     outward: np.ndarray,
     tints: np.ndarray,
     object_id: int,
     rng: np.random.Generator,
 ) -> None:
-    """Leaf triangles at `centres` (N, 3), roughly facing `outward`; shaded as parts of the crown, which is
+    """Leaf triangles at `centers` (N, 3), roughly facing `outward`; shaded as parts of the crown, which is
     what they look like from above.
     """
-    facing = outward + 0.8 * _sphere(len(centres), rng)
+    facing = outward + 0.8 * _sphere(len(centers), rng)
     facing /= np.linalg.norm(facing, axis=1, keepdims=True)
-    side = np.cross(facing, _sphere(len(centres), rng))
+    side = np.cross(facing, _sphere(len(centers), rng))
     side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
     up = np.cross(facing, side)
-    size = LEAF_SIDE * rng.uniform(0.7, 1.3, (len(centres), 1))
+    size = LEAF_SIDE * rng.uniform(0.7, 1.3, (len(centers), 1))
     corners = np.stack(
         [
-            centres - 0.5 * size * side - 0.3 * size * up,
-            centres + 0.5 * size * side - 0.3 * size * up,
-            centres + 0.6 * size * up,
+            centers - 0.5 * size * side - 0.3 * size * up,
+            centers + 0.5 * size * side - 0.3 * size * up,
+            centers + 0.6 * size * up,
         ],
         1,
     )
     normals = 0.7 * outward + 0.3 * face_normals(corners) + [0, 0, 0.25]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     builder.add(
-        corners, (LEAF, TREE, object_id), tints * rng.uniform(0.75, 1.25, (len(centres), 1)), normals=normals
+        corners, (LEAF, TREE, object_id), tints * rng.uniform(0.75, 1.25, (len(centers), 1)), normals=normals
     )
 
 

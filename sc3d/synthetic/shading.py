@@ -1,4 +1,4 @@
-"""Sun and sky on the textured world: colour and label of surface points."""
+"""Sun and sky on the textured world: color and label of surface points."""
 
 from __future__ import annotations
 

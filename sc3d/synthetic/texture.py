@@ -1,7 +1,7 @@
 """Procedural textures: value noise and patterns in surface coordinates, a function of world position only.
 
 Compiled by numba: one call per sample, no shared state, so results do not depend on the number of threads.
-Colours are linear RGB.
+Colors are linear RGB.
 Octaves finer than the sample's footprint fade out, which keeps distant surfaces from flickering between
 views.
 """
@@ -155,7 +155,7 @@ def ground_color(
             1.0 + 0.25 * fractal_noise(x, y, 96, 0.4, 2, fp)
         )
         if kind == PAVEMENT and abs(offset) < HALF_ROAD + 0.2:
-            light *= 1.35  # kerb stone
+            light *= 1.35  # curb stone
         return light, 0.96 * light, 0.88 * light
     r, g, b = _asphalt_color(x, y, fp)
     if kind == LOT:
@@ -187,16 +187,16 @@ def wall_color(
         )
         r, g, b = r * light, g * light, b * light
     columns = np.floor((width - 0.8) / 2.4)
-    storey, column = np.floor(v / 2.8), np.floor((u - 0.5 * (width - 2.4 * columns)) / 2.4)
-    if column < 0 or column >= columns or storey < 0 or 2.8 * storey + 2.6 > height:
+    story, column = np.floor(v / 2.8), np.floor((u - 0.5 * (width - 2.4 * columns)) / 2.4)
+    if column < 0 or column >= columns or story < 0 or 2.8 * story + 2.6 > height:
         return r, g, b
-    du, dv = abs(u - 0.5 * (width - 2.4 * columns) - 2.4 * column - 1.2), v - 2.8 * storey
-    low = 0.0 if storey == 0 and random01(column, 1, seed) < 0.2 else 0.95
-    if random01(column, storey, seed + 5) < 0.12 or du > 0.62 or dv < low - 0.1 or dv > 2.35:
+    du, dv = abs(u - 0.5 * (width - 2.4 * columns) - 2.4 * column - 1.2), v - 2.8 * story
+    low = 0.0 if story == 0 and random01(column, 1, seed) < 0.2 else 0.95
+    if random01(column, story, seed + 5) < 0.12 or du > 0.62 or dv < low - 0.1 or dv > 2.35:
         return r, g, b
     if du > 0.52 or dv < low or dv > 2.25 or du < 0.03:
         return 0.62, 0.62, 0.6
-    shine = 0.02 + 0.16 * random01(column, storey, seed + 9) * (0.4 + 0.6 * (dv - low) / 1.4)
+    shine = 0.02 + 0.16 * random01(column, story, seed + 9) * (0.4 + 0.6 * (dv - low) / 1.4)
     return 0.8 * shine, shine, 1.2 * shine
 
 

@@ -17,7 +17,7 @@ from sc3d.synthetic.shading import SUN, shade, surface_labels
 
 @dataclass(frozen=True)
 class World:
-    """A site centred on the origin, z up, metres.
+    """A site centered on the origin, z up, meters.
 
     corners: (T, 3, 3) float32 triangles; floats: (T, 17) float32 and ints: (T, 3) int32 as
         `MeshBuilder.finish` returns them

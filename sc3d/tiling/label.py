@@ -164,7 +164,7 @@ def label_tile(job: LabelJob, tile: int) -> None:
     normals = unit_normals(
         columns(records, ("nx", "ny", "nz")),
         points,
-        np.array([view.centre for view in masks.views]),
+        np.array([view.center for view in masks.views]),
         job.extent.low,
     )
     origin = voxel_origin(job.extent.low, job.settings.voxel_size)

@@ -1,4 +1,4 @@
-"""What `propagate` keeps of each tile between its passes: the neighbour graph of the tile and its margin, and
+"""What `propagate` keeps of each tile between its passes: the neighbor graph of the tile and its margin, and
 arrays of the tile's own points.
 """
 

@@ -124,12 +124,12 @@ def _cast(
 ) -> None:
     """Lower `nearest` (H * W,) to the hits in one part."""
     low, high = parts.boxes[part]
-    slack = SLACK * (1 + np.abs(view.centre - parts.origin).max() + (high - low).max())
+    slack = SLACK * (1 + np.abs(view.center - parts.origin).max() + (high - low).max())
     reached = np.empty(len(nearest), np.bool_)
     _reach(
         directions,
         view.cam_from_world,
-        view.centre - parts.origin,
+        view.center - parts.origin,
         low - slack,
         high + slack,
         nearest,

@@ -1,7 +1,7 @@
 """The points of a cloud sorted into square tiles of the ground plane, on disk; a tile is read with a margin
-of its neighbours' points.
+of its neighbors' points.
 
-Memory: one chunk while sorting; one tile with its margin, and one neighbour, while reading.
+Memory: one chunk while sorting; one tile with its margin, and one neighbor, while reading.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from sc3d.tiling.ranges import MeshParts, RangeMaps, read_triangles, write_range
 from sc3d.tiling.store import Survey, TileStore
 
 GROUP = 16  # views whose ranges are held at once
-SURFEL_MARGIN = 8.0  # of a tile, in point spacings: room for the neighbours of its points
+SURFEL_MARGIN = 8.0  # of a tile, in point spacings: room for the neighbors of its points
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ def _range_task(job: RangeJob, names: list[str]) -> None:
 
 
 def _by_place(job: RangeJob) -> list[str]:
-    """Names of the views such that neighbours in the list see the same parts of the surface."""
+    """Names of the views such that neighbors in the list see the same parts of the surface."""
     views = views_of(job.scene)
     names = sorted(job.sizes)
-    centres = np.array([views[name].centre for name in names])
+    centers = np.array([views[name].center for name in names])
     cells = (
-        (centres - centres.min(axis=0)) / max(float(np.ptp(centres, axis=0).max()), 1e-9) * 7.999
+        (centers - centers.min(axis=0)) / max(float(np.ptp(centers, axis=0).max()), 1e-9) * 7.999
     ).astype(int)
     return [names[row] for row in np.lexsort((cells[:, 1], cells[:, 0]))]
 

@@ -1,12 +1,12 @@
-"""Looking at a scene: colours, pictures without a display, labels in the photos, the window."""
+"""Looking at a scene: colors, pictures without a display, labels in the photos, the window."""
 
-from sc3d.view.colors import COLOURINGS, STATES, color_points
+from sc3d.view.colors import COLORINGS, STATES, color_points
 from sc3d.view.screenshot import PointImage, Style, draw_points, screenshot
 from sc3d.view.viewpoints import aerial_view
 from sc3d.view.window import show
 
 __all__ = [
-    "COLOURINGS",
+    "COLORINGS",
     "STATES",
     "PointImage",
     "Style",

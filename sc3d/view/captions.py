@@ -1,22 +1,22 @@
-"""The strip below a picture that explains its colours."""
+"""The strip below a picture that explains its colors."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from sc3d.scene.class_table import ClassTable
-from sc3d.view.colors import ColorScale, Colouring, color_scale, legend_entries
+from sc3d.view.colors import Coloring, ColorScale, color_scale, legend_entries
 
 PAPER, INK = (255, 255, 255), (32, 34, 38)
 
 
 def add_legend(
-    image: np.ndarray, by: Colouring, class_table: ClassTable | None, present: set[int] | None = None
+    image: np.ndarray, by: Coloring, class_table: ClassTable | None, present: set[int] | None = None
 ) -> np.ndarray:
     """The picture with a legend strip below it; the picture itself stays as it is.
 
     image: (H, W, 3) uint8 RGB; present: ids to list, None = all
-    returns: (H + strip, W, 3) uint8 RGB; unchanged for photo colours
+    returns: (H + strip, W, 3) uint8 RGB; unchanged for photo colors
     """
     scale = color_scale(by)
     if scale is not None:

@@ -1,4 +1,4 @@
-"""What a point's colour means: the photos, its class, its confidence, the way its label came about, or how
+"""What a point's color means: the photos, its class, its confidence, the way its label came about, or how
 much the photos disagree about it.
 """
 
@@ -16,8 +16,8 @@ from sc3d.scene.labelled_cloud import read_votes
 if TYPE_CHECKING:
     import open3d as o3d
 
-Colouring = Literal["photo", "label", "confidence", "state", "disagreement"]
-COLOURINGS: tuple[str, ...] = get_args(Colouring)
+Coloring = Literal["photo", "label", "confidence", "state", "disagreement"]
+COLORINGS: tuple[str, ...] = get_args(Coloring)
 
 
 class State(NamedTuple):
@@ -27,7 +27,7 @@ class State(NamedTuple):
     color: tuple[int, int, int]
 
 
-STATES = (  # by value of `state`; colours apart for the colour-blind too (Okabe and Ito)
+STATES = (  # by value of `state`; colors apart for the color-blind too (Okabe and Ito)
     State("unseen", (138, 138, 138)),
     State("seed", (0, 158, 115)),
     State("locked", (213, 94, 0)),
@@ -35,7 +35,7 @@ STATES = (  # by value of `state`; colours apart for the colour-blind too (Okabe
     State("unlocked by reprojection", (204, 121, 167)),
 )
 
-CONTESTED = 0.5  # disagreement from which on the colour stays the same: no class has a majority there
+CONTESTED = 0.5  # disagreement from which on the color stays the same: no class has a majority there
 _AGREED_TO_CONTESTED = ((222, 226, 230), (244, 165, 60), (165, 15, 60))
 _LIGHT, _AMBIENT = (-0.5, 0.5, 0.7071), 0.45
 _ATTRIBUTES = {
@@ -46,7 +46,7 @@ _ATTRIBUTES = {
     "disagreement": "votes_1",
 }
 _MAKERS = {
-    "photo": "the cloud has no photo colours: `sc3d extract SCENE` makes them",
+    "photo": "the cloud has no photo colors: `sc3d extract SCENE` makes them",
     "label": "the cloud has no labels: run `sc3d label SCENE` and `sc3d propagate SCENE`, or look at it with --by photo",
     "confidence": "the cloud has no confidence: run `sc3d label SCENE` and `sc3d propagate SCENE`",
     "state": "the cloud has no label states: run `sc3d label SCENE` and `sc3d propagate SCENE`",
@@ -55,18 +55,18 @@ _MAKERS = {
 
 
 def color_points(
-    cloud: o3d.t.geometry.PointCloud, by: Colouring, class_table: ClassTable | None = None
+    cloud: o3d.t.geometry.PointCloud, by: Coloring, class_table: ClassTable | None = None
 ) -> np.ndarray:
-    """Colours that show one attribute of a cloud, or of the vertices of a mesh.
+    """Colors that show one attribute of a cloud, or of the vertices of a mesh.
 
-    by: "photo" (colors), "label" (class colours), "confidence" (viridis, 0 dark to 1 bright), "state" (see
+    by: "photo" (colors), "label" (class colors), "confidence" (viridis, 0 dark to 1 bright), "state" (see
         STATES) or "disagreement" (of the votes)
     class_table: needed for "label"
     returns: (N, 3) uint8 RGB
     Raises InputError that names the stage if the attribute is missing.
     """
-    if by not in COLOURINGS:
-        raise InputError(f"unknown colouring {by!r}: choose one of {', '.join(COLOURINGS)}")
+    if by not in COLORINGS:
+        raise InputError(f"unknown coloring {by!r}: choose one of {', '.join(COLORINGS)}")
     if not can_color(cloud, by):
         raise InputError(_MAKERS[by])
     if by == "disagreement":
@@ -81,14 +81,14 @@ def color_points(
             [STATES[value if value < len(STATES) else 0].color for value in range(256)], np.uint8
         )
     elif class_table is None:
-        raise InputError("class colours need the class table (classes.json)")
+        raise InputError("class colors need the class table (classes.json)")
     else:
         palette = class_table.palette
     return palette[values.reshape(-1).astype(np.uint8)]
 
 
-def can_color(cloud: o3d.t.geometry.PointCloud, by: Colouring) -> bool:
-    """Whether a cloud, or a mesh, has the attribute that a colouring shows."""
+def can_color(cloud: o3d.t.geometry.PointCloud, by: Coloring) -> bool:
+    """Whether a cloud, or a mesh, has the attribute that a coloring shows."""
     return _ATTRIBUTES[by] in _attributes(cloud)
 
 
@@ -111,8 +111,8 @@ def disagreement(votes: np.ndarray) -> np.ndarray:
 
 
 def disagreement_colors(values: np.ndarray) -> np.ndarray:
-    """(N, 3) uint8 RGB of (N,) disagreements: light grey where all agree, over orange to dark red from
-    CONTESTED on; grey like unseen points where NaN.
+    """(N, 3) uint8 RGB of (N,) disagreements: light gray where all agree, over orange to dark red from
+    CONTESTED on; gray like unseen points where NaN.
     """
     stops = np.linspace(0, CONTESTED, len(_AGREED_TO_CONTESTED))
     known = np.nan_to_num(np.asarray(values, np.float64))
@@ -133,9 +133,9 @@ def confidence_colors(confidence: np.ndarray) -> np.ndarray:
 
 
 def legend_entries(
-    by: Colouring, class_table: ClassTable | None, present: set[int] | None = None
+    by: Coloring, class_table: ClassTable | None, present: set[int] | None = None
 ) -> list[tuple[str, tuple[int, int, int]]]:
-    """Names and RGB colours that explain a colouring; empty for photo colours and for confidence and
+    """Names and RGB colors that explain a coloring; empty for photo colors and for confidence and
     disagreement, which have a scale.
 
     present: ids that occur; None = list all classes or states
@@ -154,15 +154,15 @@ def legend_entries(
 
 
 class ColorScale(NamedTuple):
-    """A colouring by a number. low, high: what its ends mean; colors: (256, 3) uint8 RGB from low to high."""
+    """A coloring by a number. low, high: what its ends mean; colors: (256, 3) uint8 RGB from low to high."""
 
     low: str
     high: str
     colors: np.ndarray
 
 
-def color_scale(by: Colouring) -> ColorScale | None:
-    """The scale of a colouring by a number; None for the others."""
+def color_scale(by: Coloring) -> ColorScale | None:
+    """The scale of a coloring by a number; None for the others."""
     steps = np.linspace(0, 1, 256)
     if by == "confidence":
         return ColorScale("confidence 0", "1", confidence_colors(steps))
@@ -172,11 +172,11 @@ def color_scale(by: Colouring) -> ColorScale | None:
 
 
 def shaded(colors: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Colours in light from the north-west and above, as maps shade hills, so that shapes show where a whole
-    class has one colour.
+    """Colors in light from the north-west and above, as maps shade hills, so that shapes show where a whole
+    class has one color.
 
     colors: (N, 3) uint8 RGB; normals: (N, 3) towards the outside; returns: (N, 3) uint8 RGB, the given
-        colours on level ground
+        colors on level ground
     """
     lengths = np.linalg.norm(normals, axis=1)
     cosine = normals @ np.float32(_LIGHT) / np.where(lengths > 0, lengths, 1)
@@ -185,7 +185,7 @@ def shaded(colors: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def as_uint8(colors: np.ndarray) -> np.ndarray:
-    """(N, 3) uint8 of colours that may be floats from 0 to 1."""
+    """(N, 3) uint8 of colors that may be floats from 0 to 1."""
     if colors.dtype == np.uint8:
         return colors
     return np.round(np.clip(np.nan_to_num(colors), 0.0, 1.0) * 255).astype(np.uint8)

@@ -47,7 +47,7 @@ def contact_sheet(rows: Sequence[Comparison], title: str, width: int = 1600) -> 
     """Photos beside what the Gaussians show in their place.
 
     rows: at least one
-    returns: (H, width, 3) uint8 RGB; columns photo, rendering, depth (one colour scale for all rows), normals
+    returns: (H, width, 3) uint8 RGB; columns photo, rendering, depth (one color scale for all rows), normals
     """
     from PIL import Image, ImageDraw
 
@@ -90,7 +90,7 @@ def contact_sheet(rows: Sequence[Comparison], title: str, width: int = 1600) -> 
 
 
 def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Nearest and farthest depth that the colours tell apart: 1st and 99th percentile of all; (1, 1) if all
+    """Nearest and farthest depth that the colors tell apart: 1st and 99th percentile of all; (1, 1) if all
     are empty.
     """
     found = np.concatenate([depth[depth > 0].ravel()[::7] for depth in depths])
@@ -98,7 +98,7 @@ def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 def depth_colors(depth: np.ndarray, near_far: tuple[float, float]) -> np.ndarray:
-    """(H, W, 3) uint8 RGB, viridis in inverse depth: near is bright; dark grey where (H, W) `depth` is 0."""
+    """(H, W, 3) uint8 RGB, viridis in inverse depth: near is bright; dark gray where (H, W) `depth` is 0."""
     near, far = near_far
     present = depth > 0
     inverse = 1 / np.where(present, depth, 1)
@@ -109,7 +109,7 @@ def depth_colors(depth: np.ndarray, near_far: tuple[float, float]) -> np.ndarray
 
 
 def normal_colors(normals: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 RGB (n + 1) / 2 of (H, W, 3) unit normals, so that up (+z) is light blue; dark grey
+    """(H, W, 3) uint8 RGB (n + 1) / 2 of (H, W, 3) unit normals, so that up (+z) is light blue; dark gray
     where they are 0.
     """
     colors = np.round((np.clip(normals, -1, 1) + 1) * 127.5).astype(np.uint8)
@@ -147,7 +147,7 @@ def side_by_side(pictures: Sequence[np.ndarray], captions: Sequence[str]) -> np.
 def _heads(
     sheet: Image.Image, lefts: list[int], middle: int, cell: int, near_far: tuple[float, float]
 ) -> None:
-    """Names of the columns, with the colour bar of the depth and the colours of three directions."""
+    """Names of the columns, with the color bar of the depth and the colors of three directions."""
     from PIL import Image, ImageDraw
 
     draw, (font, size) = ImageDraw.Draw(sheet), caption_font(sheet.width)

@@ -1,5 +1,5 @@
 """What a viewer shows of a cloud: positions near zero, in an order whose beginnings thin it evenly, and its
-colours.
+colors.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import VOTES, spacing_of
-from sc3d.view.colors import COLOURINGS, Colouring, can_color, color_points, shaded
+from sc3d.view.colors import COLORINGS, Coloring, can_color, color_points, shaded
 from sc3d.view.progressive_order import even_order
 
 if TYPE_CHECKING:
@@ -27,9 +27,9 @@ _SAMPLE = 50_000  # points from which the spacing is found
 class ShownCloud:
     """N points in the order in which they are shown.
 
-    points: (N, 3) float32, world minus `origin` (3,) float64, so that UTM coordinates keep their millimetres
+    points: (N, 3) float32, world minus `origin` (3,) float64, so that UTM coordinates keep their millimeters
     rows: (N,) int64 rows of the points in `cloud`; label: (N,) uint8 ids, 0 without labels
-    spacing: distance between neighbours of the whole cloud, world units
+    spacing: distance between neighbors of the whole cloud, world units
     """
 
     cloud: o3d.t.geometry.PointCloud
@@ -66,11 +66,11 @@ class ShownCloud:
         )
 
     @property
-    def colourings(self) -> tuple[Colouring, ...]:
-        """What the cloud can be coloured by."""
+    def colorings(self) -> tuple[Coloring, ...]:
+        """What the cloud can be colored by."""
         return tuple(
             by
-            for by in COLOURINGS
+            for by in COLORINGS
             if can_color(self.cloud, by) and (by != "label" or self.class_table is not None)
         )
 
@@ -79,8 +79,8 @@ class ShownCloud:
         """Whether the cloud has normals, so that it can be shaded."""
         return "normals" in self.cloud.point
 
-    def colors(self, by: Colouring, relief: bool = False) -> np.ndarray:
-        """(N, 3) uint8 RGB; kept once made. relief: shaded by the normals, but for the colours of the photos,
+    def colors(self, by: Coloring, relief: bool = False) -> np.ndarray:
+        """(N, 3) uint8 RGB; kept once made. relief: shaded by the normals, but for the colors of the photos,
         which have light and shade
         """
         if relief and (by == "photo" or not self.has_relief):
@@ -116,7 +116,7 @@ class ShownCloud:
         return min(len(self.points), max(_SMALLEST_CHUNK, -(-len(self.points) // _CHUNKS)))
 
     def spacing_at(self, count: int) -> float:
-        """Distance between neighbours of the first `count` points, world units."""
+        """Distance between neighbors of the first `count` points, world units."""
         return self.spacing * float(np.sqrt(len(self.points) / max(count, 1)))
 
 

@@ -13,14 +13,14 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
-from sc3d.view.colors import Colouring, confidence_colors
+from sc3d.view.colors import Coloring, confidence_colors
 
 if TYPE_CHECKING:
     import open3d as o3d
 
     from sc3d.splatting.gaussians import Gaussians
 
-SPLAT_COLOURINGS: tuple[Colouring, ...] = ("photo", "label", "confidence")
+SPLAT_COLORINGS: tuple[Coloring, ...] = ("photo", "label", "confidence")
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,15 @@ class ShownSplats:
     label: np.ndarray | None = None
     confidence: np.ndarray | None = None
 
-    def painted(self, by: Colouring, table: ClassTable | None) -> Gaussians:
-        """Class colours or confidences instead of the photos' colours. InputError if there are no labels."""
+    def painted(self, by: Coloring, table: ClassTable | None) -> Gaussians:
+        """Class colors or confidences instead of the photos' colors. InputError if there are no labels."""
         if by == "photo":
             return self.gaussians
         from sc3d.splatting.lifting import painted
 
         return painted(self.gaussians, self.colors(by, table) / 255)
 
-    def colors(self, by: Colouring, table: ClassTable | None) -> np.ndarray:
+    def colors(self, by: Coloring, table: ClassTable | None) -> np.ndarray:
         """(N, 3) uint8 RGB; of the photos: the mean over all directions of view, without what changes with
         them.
         """
@@ -54,7 +54,7 @@ class ShownSplats:
             return np.round(np.clip(0.5 + SH_C0 * self.gaussians.sh[:, 0].numpy(), 0, 1) * 255).astype(
                 np.uint8
             )
-        if by not in SPLAT_COLOURINGS:
+        if by not in SPLAT_COLORINGS:
             raise InputError(f"splats have no {by}: choose --by photo, label or confidence")
         if self.label is None or table is None:
             raise InputError("the splats have no labels: run `sc3d export SCENE --format splats`")
@@ -73,8 +73,8 @@ class ShownSplats:
             raise InputError("no splat has one of the chosen classes: nothing to show")
         return self[chosen]
 
-    def centres(self) -> o3d.t.geometry.PointCloud:
-        """The centres as a cloud: positions (world), colors, and label and confidence where there are labels."""
+    def centers(self) -> o3d.t.geometry.PointCloud:
+        """The centers as a cloud: positions (world), colors, and label and confidence where there are labels."""
         import open3d as o3d
 
         cloud = o3d.t.geometry.PointCloud(

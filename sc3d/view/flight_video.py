@@ -24,19 +24,19 @@ def flight_path(
     """Pinhole cameras of a smooth ride through the views in their order, at even speed.
 
     size: (width, height) px that the frames fit into; they have the first view's field of view and even sides
-    frames_per_view, longest: about so many frames between two neighbours, and never more than so many in all
+    frames_per_view, longest: about so many frames between two neighbors, and never more than so many in all
     """
     first = fitted(views[0], size, even=True)
     frame, calibration = (first.width, first.height), tuple(first.matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
-    centres = np.array([view.centre for view in views])
+    centers = np.array([view.center for view in views])
     rotations = Rotation.from_matrix([view.cam_from_world[:3, :3] for view in views])
     if len(views) < 2:
         return [pinhole_view("flight", frame, calibration, first.cam_from_world)]
-    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     turns = (rotations[1:] * rotations[:-1].inv()).magnitude()
     times = np.concatenate([[0], np.cumsum(steps / max(np.median(steps), 1e-9) + turns + 1e-3)])
     moments = np.linspace(0, times[-1], int(np.clip(round(frames_per_view * times[-1]), 2, longest)))
-    turned, moved = Slerp(times, rotations)(moments).as_matrix(), PchipInterpolator(times, centres)(moments)
+    turned, moved = Slerp(times, rotations)(moments).as_matrix(), PchipInterpolator(times, centers)(moments)
     poses = np.tile(np.eye(4), (len(moments), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = turned, -np.einsum("nij,nj->ni", turned, moved)
     return [pinhole_view("flight", frame, calibration, pose) for pose in poses]

@@ -143,7 +143,7 @@ class Inspector:
         if count < 3:
             return np.array([0.0, 0.0, 1.0])
         normal = estimate_normals(self._points[np.asarray(rows)], np.arange(count)[None])[:1]
-        return orient_normals(point, normal, np.array([view.centre for view in self.views]))[0]
+        return orient_normals(point, normal, np.array([view.center for view in self.views]))[0]
 
     @cached_property
     def _tree(self) -> o3d.geometry.KDTreeFlann:
@@ -179,7 +179,7 @@ def _sees(view: View, points: np.ndarray, normals: np.ndarray, surface: RayTarge
     pixels, _ = project(view, points)
     if not in_image(view, pixels)[0]:
         return False
-    # of the pixel's centre, as in a picture of the whole surface
+    # of the pixel's center, as in a picture of the whole surface
     directions, ray_z = rays(view, np.floor(pixels) + 0.5)
     distance, incidence = surface.cast(view, (directions @ view.cam_from_world[:3, :3].T).astype(np.float32))
     everywhere = (

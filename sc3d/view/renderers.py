@@ -5,7 +5,7 @@ Known failures, and what is done about them (Open3D 0.20):
 - no Vulkan driver: the process aborts instead of raising, and after a failed start the OpenGL visualizer
     fails too: so another process tries first;
 - two living OffscreenRenderers abort: each dies in the function that made it;
-- the OpenGL visualizer ignores the principal point and fx != fy: it draws a larger centred picture, from
+- the OpenGL visualizer ignores the principal point and fx != fy: it draws a larger centered picture, from
     which the view is cut.
 """
 
@@ -55,7 +55,7 @@ def render(
     """Draw through a pinhole view.
 
     view: without distortion, in the frame of `drawing`; renderer: "auto", "vulkan" or "egl"
-    returns: (H, W, 3) uint8 RGB, colours exactly as given: no light, no antialiasing
+    returns: (H, W, 3) uint8 RGB, colors exactly as given: no light, no antialiasing
     Raises Sc3dError that names the packages to install.
     """
     if renderer == "auto":
@@ -88,7 +88,7 @@ def _render_vulkan(drawing: Drawing, view: View, background: tuple[int, int, int
         raise Sc3dError(_NO_RENDERER) from None
     scene = renderer.scene
     scene.set_background([*(np.array(background) / 255.0), 1.0])
-    scene.view.set_post_processing(False)  # tone mapping would change class colours
+    scene.view.set_post_processing(False)  # tone mapping would change class colors
     scene.view.set_antialiasing(False)
     scene.view.set_sample_count(1)
     for name, geometry in _tensor_geometries(drawing).items():
@@ -139,7 +139,7 @@ def _line_set(drawing: Drawing) -> object:
 def _render_egl(drawing: Drawing, view: View, background: tuple[int, int, int]) -> np.ndarray:
     import open3d as o3d
 
-    canvas, rows, columns = _centred_canvas(view)
+    canvas, rows, columns = _centered_canvas(view)
     visualizer = o3d.visualization.Visualizer()
     if not visualizer.create_window(width=canvas.width, height=canvas.height, visible=False):
         raise Sc3dError(_NO_RENDERER)
@@ -167,16 +167,16 @@ def _render_egl(drawing: Drawing, view: View, background: tuple[int, int, int]) 
     return image[rows[:, None], columns]
 
 
-def _centred_canvas(view: View) -> tuple[View, np.ndarray, np.ndarray]:
-    """A view with square pixels and centred principal point that holds `view`, and the canvas rows (H,) and
+def _centered_canvas(view: View) -> tuple[View, np.ndarray, np.ndarray]:
+    """A view with square pixels and centered principal point that holds `view`, and the canvas rows (H,) and
     columns (W,) of its pixels.
     """
-    (focal_x, _, centre_x), (_, focal_y, centre_y) = view.matrix[:2]
+    (focal_x, _, center_x), (_, focal_y, center_y) = view.matrix[:2]
     focal = max(focal_x, focal_y)
-    half_width = int(np.ceil(max(centre_x, view.width - centre_x) * focal / focal_x))
-    half_height = int(np.ceil(max(centre_y, view.height - centre_y) * focal / focal_y))
-    columns = np.floor((np.arange(view.width) + 0.5 - centre_x) * focal / focal_x + half_width).astype(int)
-    rows = np.floor((np.arange(view.height) + 0.5 - centre_y) * focal / focal_y + half_height).astype(int)
+    half_width = int(np.ceil(max(center_x, view.width - center_x) * focal / focal_x))
+    half_height = int(np.ceil(max(center_y, view.height - center_y) * focal / focal_y))
+    columns = np.floor((np.arange(view.width) + 0.5 - center_x) * focal / focal_x + half_width).astype(int)
+    rows = np.floor((np.arange(view.height) + 0.5 - center_y) * focal / focal_y + half_height).astype(int)
     size = (2 * half_width, 2 * half_height)
     canvas = pinhole_view(view.name, size, (focal, focal, half_width, half_height), view.cam_from_world)
     return canvas, np.clip(rows, 0, size[1] - 1), np.clip(columns, 0, size[0] - 1)

@@ -14,7 +14,7 @@ from sc3d.geometry.cameras import View, local_origin, undistorted
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.scene.class_table import ClassTable
 from sc3d.view.captions import add_legend
-from sc3d.view.colors import Colouring, as_uint8, color_points
+from sc3d.view.colors import Coloring, as_uint8, color_points
 from sc3d.view.renderers import Drawing, render
 from sc3d.view.viewpoints import aerial_view, frusta, frustum_depth, without_outliers
 
@@ -29,18 +29,18 @@ _LARGEST_CANVAS = 8192  # px; what software renderers take
 class Style:
     """How a picture looks.
 
-    by: colouring; a mesh is always drawn in its own colours
+    by: coloring; a mesh is always drawn in its own colors
     from_above: straight down instead of oblique from the south, where no view is given
     cameras: views whose frusta are drawn
-    legend: append the strip that explains the colours
-    shading: strength of the darkened depth edges that make bare points readable; 0 = colours exactly as given
+    legend: append the strip that explains the colors
+    shading: strength of the darkened depth edges that make bare points readable; 0 = colors exactly as given
     background: RGB uint8
     max_points: larger clouds are thinned at random with `seed`
     supersampling: pixels drawn per picture pixel, along each side
     renderer: "vulkan", "egl", or the one that works
     """
 
-    by: Colouring = "label"
+    by: Coloring = "label"
     from_above: bool = False
     cameras: Sequence[View] = ()
     legend: bool = True
@@ -54,7 +54,7 @@ class Style:
 
 @dataclass(frozen=True)
 class PointImage:
-    """Which point each pixel of a picture shows; any colouring of the cloud can be painted from it.
+    """Which point each pixel of a picture shows; any coloring of the cloud can be painted from it.
 
     rows: (H', W') int32 rows of the points; -1 = background, -2 = a camera's line
     depth: (H', W') float32 z, world units; inf = background
@@ -110,7 +110,7 @@ def draw_points(points: np.ndarray, view: View | None, size: tuple[int, int], st
     canvas, lines, factor = _canvas(points[finite], view, size, style)
     chosen = finite[_visible_sample(points[finite], canvas, style)]
     origin = local_origin([canvas])
-    # every point is drawn in a colour of its own: its number, 24 bits; the last stands for lines
+    # every point is drawn in a color of its own: its number, 24 bits; the last stands for lines
     codes = np.arange(len(chosen) + 1)
     colors = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=1).astype(np.uint8)
     drawing = Drawing(
@@ -134,7 +134,7 @@ def draw_points(points: np.ndarray, view: View | None, size: tuple[int, int], st
 def _mesh_picture(
     mesh: o3d.t.geometry.TriangleMesh, view: View | None, size: tuple[int, int], style: Style
 ) -> np.ndarray:
-    """A mesh in its own colours, grey without."""
+    """A mesh in its own colors, gray without."""
     if "indices" not in mesh.triangle or not len(mesh.triangle.indices):
         raise InputError("the mesh has no triangles, nothing to draw")
     points = mesh.vertex.positions.cpu().numpy().astype(np.float64)
@@ -197,7 +197,7 @@ def _point_size(points: np.ndarray, view: View) -> float:
     if len(sample) < 8:
         return 3.0 * max(1.0, view.width / 1600)
     queries = sample[:: max(1, len(sample) // 5000)]
-    # 4th neighbour: about 1 / sqrt(density) on surfaces
+    # 4th neighbor: about 1 / sqrt(density) on surfaces
     spacing = NeighborIndex(sample).nearest(queries, 5)[1][:, 4] / np.sqrt(step)
     depth = queries @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
     apart = float(np.quantile(spacing / depth, 0.8)) * view.focal
@@ -205,15 +205,15 @@ def _point_size(points: np.ndarray, view: View) -> float:
 
 
 def _shade_edges(image: np.ndarray, depth: np.ndarray, strength: float, radius: int) -> np.ndarray:
-    """Eye-dome lighting (Boucheny 2009): darken a pixel by how much nearer its neighbours are, in log depth."""
+    """Eye-dome lighting (Boucheny 2009): darken a pixel by how much nearer its neighbors are, in log depth."""
     far = ~np.isfinite(depth) | (depth <= 0)
     logs = np.log2(np.where(far, 1.0, depth)).astype(np.float32)
     logs[far] = np.inf
     response = np.zeros_like(logs)
     for dy, dx in ((0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
-        neighbour = np.roll(logs, (dy * radius, dx * radius), axis=(0, 1))
+        neighbor = np.roll(logs, (dy * radius, dx * radius), axis=(0, 1))
         with np.errstate(invalid="ignore"):
-            response += np.nan_to_num(np.maximum(logs - neighbour, 0.0), nan=0.0, posinf=0.0)
+            response += np.nan_to_num(np.maximum(logs - neighbor, 0.0), nan=0.0, posinf=0.0)
     shade = np.exp(-300.0 * strength * response / 8)
     shade = np.where(far, 1.0, np.maximum(shade, 0.35)).astype(np.float32)
     return np.round(image * shade[..., None]).astype(np.uint8)

@@ -22,18 +22,18 @@ def aerial_view(points: np.ndarray, size: tuple[int, int], from_above: bool = Fa
     focal = (3.0 if from_above else 1.4) * max(size)  # from above nearly parallel, so that walls do not show
     slopes = 0.95 * np.array(size) / (2 * focal)
     span = max(float(np.ptp(points, axis=0).max()), 1e-3)
-    # centre what is seen, then step back until it fits; converges because the view is narrow
+    # center what is seen, then step back until it fits; converges because the view is narrow
     for _ in range(8):
         cam_from_world = look_at(target + span * backward, target)
         offsets = (points - target) @ cam_from_world[:3, :3].T
         distance = max(float((np.abs(offsets[:, :2]) / slopes - offsets[:, 2:]).max()), 0.2 * span)
         seen = offsets[:, :2] / (offsets[:, 2:] + distance)
         shift = (seen.min(axis=0) + seen.max(axis=0)) / 2 * distance
-        centre = target + distance * backward
+        center = target + distance * backward
         target = target + shift @ cam_from_world[:2, :3]
     calibration = (focal, focal, size[0] / 2, size[1] / 2)
     return pinhole_view(
-        "above" if from_above else "oblique", size, calibration, look_at(centre, centre - backward)
+        "above" if from_above else "oblique", size, calibration, look_at(center, center - backward)
     )
 
 
@@ -50,15 +50,15 @@ def fitted(view: View, size: tuple[int, int], even: bool = False) -> View:
 
 def frusta(views: Sequence[View], depth: float) -> np.ndarray:
     """(8 M, 2, 3) float64 line ends, world, of camera pyramids whose base lies `depth` (world units) before
-    the centre.
+    the center.
     """
     lines = np.empty((len(views), 8, 2, 3))
     for edges, view in zip(lines, views, strict=True):
         pinhole = undistorted(view, 100)
         width, height = pinhole.width, pinhole.height
         directions, z = rays(pinhole, np.array([[0, 0], [width, 0], [width, height], [0, height]], float))
-        corners = view.centre + directions / z[:, None] * depth
-        edges[:4, 0], edges[:4, 1] = view.centre, corners
+        corners = view.center + directions / z[:, None] * depth
+        edges[:4, 0], edges[:4, 1] = view.center, corners
         edges[4:, 0], edges[4:, 1] = corners, np.roll(corners, -1, axis=0)
     return lines.reshape(-1, 2, 3)
 
@@ -68,8 +68,8 @@ def frustum_depth(views: Sequence[View], points: np.ndarray) -> float:
     extent = float(np.linalg.norm(np.ptp(without_outliers(points), axis=0)))
     if len(views) < 2:
         return 0.05 * extent
-    centres = np.array([view.centre for view in views])
-    gaps = np.linalg.norm(centres[:, None] - centres[None], axis=2) + np.diag(np.full(len(views), np.inf))
+    centers = np.array([view.center for view in views])
+    gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2) + np.diag(np.full(len(views), np.inf))
     return float(np.clip(0.4 * np.median(gaps.min(axis=1)), 0.01 * extent, 0.08 * extent))
 
 

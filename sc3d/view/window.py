@@ -1,4 +1,4 @@
-"""The window: the cloud in any of its colourings, classes on and off, the cameras, and what is known of a
+"""The window: the cloud in any of its colorings, classes on and off, the cameras, and what is known of a
 clicked point. Needs a display.
 """
 
@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from sc3d.geometry.cameras import View, local_origin
-from sc3d.view.colors import Colouring, color_points, color_scale, legend_entries
+from sc3d.view.colors import Coloring, color_points, color_scale, legend_entries
 from sc3d.view.display import check_display
 from sc3d.view.display_cloud import ShownCloud
 from sc3d.view.picking import Inspector, PickedPoint, position_at
@@ -26,13 +26,13 @@ _PICKED_COLOR = (1.0, 0.0, 0.8)
 
 
 def show(
-    inspector: Inspector, views: Sequence[View] = (), by: Colouring = "label", classes: set[int] | None = None
+    inspector: Inspector, views: Sequence[View] = (), by: Coloring = "label", classes: set[int] | None = None
 ) -> None:
     """Open a window and return when it is closed. A point clicked with Ctrl held is described in the panel
     and in the log.
 
     inspector: has the cloud, with any of the attributes that `color_points` shows; those it has can be chosen
-    views: cameras drawn as pyramids; by: colouring at the start; classes: ids shown at the start, None = all
+    views: cameras drawn as pyramids; by: coloring at the start; classes: ids shown at the start, None = all
     Raises Sc3dError without a display, InputError if the attribute for `by` is missing.
     """
     check_display()
@@ -51,7 +51,7 @@ def show(
 
 
 def _show_with_panel(
-    shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int], by: Colouring
+    shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int], by: Coloring
 ) -> None:
     import open3d as o3d
 
@@ -64,7 +64,7 @@ def _show_with_panel(
 
 
 class _Window:
-    """A 3D view with a panel at its right: colouring, legend, classes, cameras, point size, the picked point.
+    """A 3D view with a panel at its right: coloring, legend, classes, cameras, point size, the picked point.
     One geometry per class.
     """
 
@@ -80,7 +80,7 @@ class _Window:
         self._scene = self._gui.SceneWidget()
         self._scene.scene = self._rendering.Open3DScene(self._window.renderer)
         self._scene.scene.set_background([1.0, 1.0, 1.0, 1.0])
-        self._scene.scene.view.set_post_processing(False)  # tone mapping would change class colours
+        self._scene.scene.view.set_post_processing(False)  # tone mapping would change class colors
         self._scene.set_on_mouse(self._on_mouse)
         self._panel = self._build_panel()
         self._window.add_child(self._scene)
@@ -92,10 +92,10 @@ class _Window:
         self._look()
 
     def choose(self, by: str) -> None:
-        """Colour the cloud by an attribute and explain its colours."""
+        """Color the cloud by an attribute and explain its colors."""
         import open3d as o3d
 
-        self._radio.selected_index = self._shown.colourings.index(by)
+        self._radio.selected_index = self._shown.colorings.index(by)
         colors = self._shown.colors(by).astype(np.float32) / np.float32(255)
         for label in self._shown.class_counts:
             chosen = self._shown.label == label
@@ -129,12 +129,12 @@ class _Window:
     def _build_panel(self) -> object:
         gui, half = self._gui, self._em // 2
         panel = gui.ScrollableVert(half, gui.Margins(self._em, self._em, self._em, self._em))
-        panel.add_child(gui.Label("Colour by"))
+        panel.add_child(gui.Label("Color by"))
         self._radio = gui.RadioButton(gui.RadioButton.VERT)
-        self._radio.set_items(list(self._shown.colourings))
-        self._radio.set_on_selection_changed(lambda index: self.choose(self._shown.colourings[index]))
+        self._radio.set_items(list(self._shown.colorings))
+        self._radio.set_on_selection_changed(lambda index: self.choose(self._shown.colorings[index]))
         panel.add_child(self._radio)
-        self._legends = {name: self._build_legend(name) for name in self._shown.colourings}
+        self._legends = {name: self._build_legend(name) for name in self._shown.colorings}
         for legend in self._legends.values():
             panel.add_child(legend)
         self._add_class_boxes(panel)

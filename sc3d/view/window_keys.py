@@ -8,7 +8,7 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.errors import Sc3dError
-from sc3d.view.colors import Colouring, legend_entries
+from sc3d.view.colors import Coloring, legend_entries
 from sc3d.view.display_cloud import ShownCloud
 from sc3d.view.picking import Inspector, point_on_ray
 from sc3d.view.screenshot import LINE_COLOR
@@ -20,9 +20,9 @@ _MAX_CLASS_KEYS = 12
 
 
 def show_with_keys(
-    shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int], by: Colouring
+    shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int], by: Coloring
 ) -> None:
-    """Keys 1 to 5 choose the colouring, F1 to F12 show and hide classes, P describes the point in the middle;
+    """Keys 1 to 5 choose the coloring, F1 to F12 show and hide classes, P describes the point in the middle;
     the log is the legend.
 
     lines: (L, 2, 3) ends of the cameras' lines, in the frame of `shown`; hidden: ids of classes that are not
@@ -42,7 +42,7 @@ def show_with_keys(
         )
         line_set.paint_uniform_color(np.array(LINE_COLOR) / 255)
         visualizer.add_geometry(line_set)
-    for number, name in enumerate(shown.colourings, start=1):
+    for number, name in enumerate(shown.colorings, start=1):
         visualizer.register_key_callback(ord(str(number)), lambda _, name=name: window.choose(name))
         legend = ", ".join(
             f"{entry} rgb{tuple(color)}" for entry, color in legend_entries(name, shown.class_table)
@@ -82,7 +82,7 @@ class _KeyWindow:
         visualizer.add_geometry(self._cloud)
 
     def choose(self, by: str) -> bool:
-        """Colour by an attribute."""
+        """Color by an attribute."""
         self._by = by
         return self._update()
 

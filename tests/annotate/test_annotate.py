@@ -141,7 +141,7 @@ def test_photos_with_any_name_are_found(server, scene):
     )
 
 
-def test_run_shows_a_mask_in_the_colours_of_the_classes(server):
+def test_run_shows_a_mask_in_the_colors_of_the_classes(server):
     assert ask(server, "/try/a", {})[0] == 422  # nothing is drawn yet
     ask(server, "/strokes/a", {"shapes": [ROAD, GRASS]})
     status, body, headers = ask(server, "/try/b%20c%2B%C3%A4", {})

@@ -16,20 +16,20 @@ def run(*arguments) -> None:
     main([str(argument) for argument in arguments])
 
 
-def centre_error(found, truth) -> tuple[int, float, float]:
-    """Photos in both models, largest distance of the centres after similarity alignment over the extent of
+def center_error(found, truth) -> tuple[int, float, float]:
+    """Photos in both models, largest distance of the centers after similarity alignment over the extent of
     the true ones, and the scale found.
     """
-    true_centres = {view.name: view.centre for view in truth.views}
-    names = [view.name for view in found.views if view.name in true_centres]
-    source = np.array([view.centre for view in found.views if view.name in true_centres])
-    target = np.array([true_centres[name] for name in names])
-    centred_source, centred_target = source - source.mean(axis=0), target - target.mean(axis=0)
-    left, values, right = np.linalg.svd(centred_target.T @ centred_source)
+    true_centers = {view.name: view.center for view in truth.views}
+    names = [view.name for view in found.views if view.name in true_centers]
+    source = np.array([view.center for view in found.views if view.name in true_centers])
+    target = np.array([true_centers[name] for name in names])
+    centered_source, centered_target = source - source.mean(axis=0), target - target.mean(axis=0)
+    left, values, right = np.linalg.svd(centered_target.T @ centered_source)
     flip = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
     rotation = left @ flip @ right
-    scale = (values * np.diag(flip)).sum() / (centred_source**2).sum()
-    error = np.linalg.norm(centred_target - scale * centred_source @ rotation.T, axis=1).max()
+    scale = (values * np.diag(flip)).sum() / (centered_source**2).sum()
+    error = np.linalg.norm(centered_target - scale * centered_source @ rotation.T, axis=1).max()
     return len(names), float(error / np.linalg.norm(np.ptp(target, axis=0))), float(scale)
 
 
@@ -81,7 +81,7 @@ def scene(site):
 
 
 def test_cameras_are_metric_and_right(site, scene):
-    count, error, scale = centre_error(
+    count, error, scale = center_error(
         read_sparse_model(scene / "sparse" / "0"), read_sparse_model(site / "sparse" / "0")
     )
     assert count == 12
@@ -143,7 +143,7 @@ def test_second_run_does_nothing_and_a_changed_option_reruns_what_follows(scene,
 def test_forty_views_register_within_two_thousandths(tmp_path):
     run("synthesize", tmp_path / "site", "--views", 40)
     run("reconstruct", tmp_path / "site" / "images", tmp_path / "scene")
-    count, error, scale = centre_error(
+    count, error, scale = center_error(
         read_sparse_model(tmp_path / "scene" / "sparse" / "0"),
         read_sparse_model(tmp_path / "site" / "sparse" / "0"),
     )

@@ -26,7 +26,7 @@ def expected_labels(points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("method", ["knn", "geometry", "map"])
-def test_bare_scene_keeps_order_count_and_millimetres(scene, method):
+def test_bare_scene_keeps_order_count_and_millimeters(scene, method):
     run("label", scene)
     run("propagate", scene, "--method", method)
     cloud = o3d.t.io.read_point_cloud(str(scene / "labelled.ply"))

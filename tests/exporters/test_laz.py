@@ -35,7 +35,7 @@ def array(cloud, name) -> np.ndarray:
     return cloud.point[name].numpy().squeeze()
 
 
-def test_laz_keeps_positions_to_the_millimetre_and_everything_else_exactly(tmp_path):
+def test_laz_keeps_positions_to_the_millimeter_and_everything_else_exactly(tmp_path):
     cloud = random_cloud()
     las = read(write_scene(tmp_path, cloud, UTM))
     assert (str(las.header.version), las.header.point_format.id) == ("1.4", 7)
@@ -63,7 +63,7 @@ def test_laz_of_local_enu_lies_where_proj_says(tmp_path):
     cloud = random_cloud()
     las = read(write_scene(tmp_path, cloud, ENU))
     latitude, longitude, height = ENU["origin"]
-    centre = np.array(
+    center = np.array(
         pyproj.Transformer.from_crs(4979, 4978, always_xy=True).transform(longitude, latitude, height)
     )
     a, b = np.radians([longitude, latitude])
@@ -72,7 +72,7 @@ def test_laz_of_local_enu_lies_where_proj_says(tmp_path):
         np.array([np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)]),
     )
     axes = np.stack([east, np.cross(up, east), up])
-    geocentric = centre + array(cloud, "positions") @ axes
+    geocentric = center + array(cloud, "positions") @ axes
     geodetic = pyproj.Transformer.from_crs(4978, 4979, always_xy=True).transform(*geocentric.T)
     east, north = pyproj.Proj("EPSG:32615")(geodetic[0], geodetic[1])
     assert np.abs(las.xyz - np.stack([east, north, geodetic[2]], 1)).max() < 0.001
@@ -120,12 +120,12 @@ def test_feet_stay_feet(tmp_path):
     """EPSG:2229 is in US survey feet, heights too."""
     cloud = random_cloud(50)
     georeference = {"epsg": 32611, "offset": [384000.0, 3768000.0, 90.0]}
-    feet, metres = (
+    feet, meters = (
         read(write_scene(tmp_path, cloud, georeference), Export(epsg=2229)),
         read(write_scene(tmp_path, cloud, georeference)),
     )
-    assert np.abs(feet.z * 1200 / 3937 - metres.z).max() < 0.001
-    distance = [np.hypot(*np.diff(las.xyz[:2, :2], axis=0)[0]) for las in (feet, metres)]
+    assert np.abs(feet.z * 1200 / 3937 - meters.z).max() < 0.001
+    distance = [np.hypot(*np.diff(las.xyz[:2, :2], axis=0)[0]) for las in (feet, meters)]
     assert distance[0] * 1200 / 3937 == pytest.approx(distance[1], rel=1e-3)
 
 
@@ -149,7 +149,7 @@ def test_bad_input_says_what_to_do(tmp_path):
     assert not (tmp_path / "export").exists()
 
 
-def test_a_cloud_without_colours_has_point_format_6(tmp_path):
+def test_a_cloud_without_colors_has_point_format_6(tmp_path):
     las = read(write_scene(tmp_path, random_cloud(colors=False), UTM))
     assert las.header.point_format.id == 6 and "red" not in las.point_format.dimension_names
 

@@ -104,11 +104,11 @@ def test_geojson_is_on_earth_and_geopackage_in_the_crs(tmp_path, site):
             columns[list(meta["fields"]).index("height_m")],
             [item["properties"]["height_m"] for item in features],
         )
-    centres = [shapely.from_wkb(item).centroid.coords[0] for item in raw.read(package, layer="buildings")[2]]
-    assert np.abs(np.array(centres) - [to_utm(*shape.centroid.coords[0]) for shape in shapes]).max() < 0.001
+    centers = [shapely.from_wkb(item).centroid.coords[0] for item in raw.read(package, layer="buildings")[2]]
+    assert np.abs(np.array(centers) - [to_utm(*shape.centroid.coords[0]) for shape in shapes]).max() < 0.001
 
 
-def test_feet_and_metres_count_the_same(tmp_path, site):
+def test_feet_and_meters_count_the_same(tmp_path, site):
     _, cloud = site
     georeference = {"epsg": 32611, "offset": [384000.0, 3768000.0, 90.0]}
     scene = write_scene(
@@ -116,10 +116,10 @@ def test_feet_and_metres_count_the_same(tmp_path, site):
         labelled_cloud(cloud.point.positions.numpy(), cloud.point.label.numpy().ravel()),
         georeference,
     )
-    metres, feet = exported(scene), exported(scene, Export(epsg=2229))
+    meters, feet = exported(scene), exported(scene, Export(epsg=2229))
     for kind in (0, 1):
-        assert abs(len(metres[kind]) - len(feet[kind])) <= 1
-    area = [sum(item["properties"]["area_m2"] for item in kind[0]) for kind in (metres, feet)]
+        assert abs(len(meters[kind]) - len(feet[kind])) <= 1
+    area = [sum(item["properties"]["area_m2"] for item in kind[0]) for kind in (meters, feet)]
     assert area[0] == pytest.approx(area[1], rel=0.02)
 
 
@@ -153,7 +153,7 @@ def test_a_scene_without_objects_gives_empty_layers(tmp_path):
 
 
 def test_ground_under_a_house_on_a_slope():
-    """The plane is found to a centimetre, also under the roof and around mislabelled roof points."""
+    """The plane is found to a centimeter, also under the roof and around mislabelled roof points."""
     rng = np.random.default_rng(0)
     points = np.c_[rng.uniform(0, 40, 40_000), rng.uniform(0, 30, 40_000), np.zeros(40_000)]
     points[:, 2] = 0.1 * points[:, 0] - 0.05 * points[:, 1]
@@ -161,9 +161,9 @@ def test_ground_under_a_house_on_a_slope():
     points[roof, 2] += 5
     mislabelled = roof & (np.abs(points[:, 0] - 20) < 2)
     found = ground_height(points, ~roof | mislabelled, GRID)
-    centres = GRID.centres()
-    error = found.ravel() - (0.1 * centres[:, 0] - 0.05 * centres[:, 1])
-    inner = (np.abs(centres - [20, 15]) < [17, 12]).all(axis=1)
+    centers = GRID.centers()
+    error = found.ravel() - (0.1 * centers[:, 0] - 0.05 * centers[:, 1])
+    inner = (np.abs(centers - [20, 15]) < [17, 12]).all(axis=1)
     assert np.abs(error[inner]).max() < 0.25 and np.median(np.abs(error[inner])) < 0.03
 
 
@@ -200,7 +200,7 @@ def test_connected_cells_against_scipy():
 
 
 def box(grid: Grid, x0: float, y0: float, x1: float, y1: float) -> np.ndarray:
-    x, y = grid.centres().T
+    x, y = grid.centers().T
     return ((x > x0) & (x < x1) & (y > y0) & (y < y1)).reshape(grid.shape)
 
 
@@ -221,7 +221,7 @@ def test_roofs_split_where_their_heights_part_and_towers_stay():
         and found[low][0] != found[high][0]
     )
     # the same cells under one steep roof
-    sloping = np.where(low | high, GRID.centres()[:, 0].reshape(GRID.shape), np.nan)
+    sloping = np.where(low | high, GRID.centers()[:, 0].reshape(GRID.shape), np.nan)
     assert split_buildings(low | high, sloping, GRID, 10.0).max() == 1
 
 
@@ -236,7 +236,7 @@ def test_join_enclosed_takes_chains():
 
 def test_roof_tops_leave_out_chimneys():
     building = box(GRID, 5, 5, 15, 12).astype(np.int32)
-    y = GRID.centres()[:, 1].reshape(GRID.shape)
+    y = GRID.centers()[:, 1].reshape(GRID.shape)
     heights = np.where(building, 6 - 0.6 * np.abs(y - 8.5), np.nan)
     heights[box(GRID, 7, 9, 7.8, 9.8)] += 1.5
     assert roof_tops(building, heights, 0.25)[0] == pytest.approx(6.0, abs=0.15)
@@ -250,7 +250,7 @@ def test_rectangular_outline_of_a_noisy_l(turn):
         [-np.sin(turn), np.cos(turn)],
     ] + [20, 15]
     true = shapely.Polygon(corners)
-    noisy = shapely.contains_xy(true.buffer(0.01), *GRID.centres().T).reshape(GRID.shape)
+    noisy = shapely.contains_xy(true.buffer(0.01), *GRID.centers().T).reshape(GRID.shape)
     edge = ndimage.binary_dilation(noisy) & ~ndimage.binary_erosion(noisy)
     noisy = np.where(edge & (np.random.default_rng(3).random(GRID.shape) < 0.3), ~noisy, noisy)
     noisy = ndimage.binary_opening(ndimage.binary_closing(noisy))
@@ -263,7 +263,7 @@ def test_rectangular_outline_of_a_noisy_l(turn):
 
 
 def test_round_buildings_are_not_squared():
-    disk = (np.hypot(*(GRID.centres() - [20, 15]).T) < 8).reshape(GRID.shape)
+    disk = (np.hypot(*(GRID.centers() - [20, 15]).T) < 8).reshape(GRID.shape)
     outline = trace(disk.astype(np.int32), GRID)[1]
     found = squared(outline, 0.5)
     assert len(found.exterior.coords) > 7 and found.symmetric_difference(outline).area < 0.06 * outline.area
@@ -280,7 +280,7 @@ def test_trace_keeps_area_and_holes():
 
 def canopy_of(trees_: list[tuple[float, float, float, float]]) -> np.ndarray:
     """Highest of several round crowns (x, y, radius, height); NaN outside."""
-    x, y = (values.reshape(GRID.shape) for values in GRID.centres().T)
+    x, y = (values.reshape(GRID.shape) for values in GRID.centers().T)
     layers = [
         np.where(
             np.hypot(x - a, y - b) < radius,

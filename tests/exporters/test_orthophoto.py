@@ -1,4 +1,4 @@
-"""Maps from above: every cell shows what lies under its centre, and GDAL understands the files."""
+"""Maps from above: every cell shows what lies under its center, and GDAL understands the files."""
 
 import xml.etree.ElementTree
 
@@ -71,7 +71,7 @@ def sampled(file, places) -> np.ndarray:
 
 
 @pytest.mark.parametrize("mesh", [True, False])
-def test_places_show_their_class_colour_and_height(tmp_path, mesh):
+def test_places_show_their_class_color_and_height(tmp_path, mesh):
     points, label = site()
     cloud = labelled_cloud(points, label)
     scene = write_scene(tmp_path, cloud, UTM)
@@ -148,7 +148,7 @@ def test_strips_and_point_order_do_not_show(tmp_path, monkeypatch):
         if file.suffix == ".tif":
             with rasterio.open(file) as first, rasterio.open(twin) as second:
                 same = (first.read() == second.read()).all(axis=0)
-                assert same.mean() > 0.99  # cells whose centre is as far from two points may show either
+                assert same.mean() > 0.99  # cells whose center is as far from two points may show either
                 if first.dtypes[0] == "float32":
                     assert same.all()
 
@@ -200,10 +200,10 @@ def test_highest_points_against_a_loop():
             best[cell] = row
     found = grids.highest_points(grid, points).ravel()
     assert {cell: row for cell, row in enumerate(found) if row >= 0} == best
-    assert np.allclose(grid.centres()[grid.flat_cells(points)], points[:, :2], atol=0.35 + 1e-9)
+    assert np.allclose(grid.centers()[grid.flat_cells(points)], points[:, :2], atol=0.35 + 1e-9)
 
 
-def test_grids_of_neighbours_share_their_lines():
+def test_grids_of_neighbors_share_their_lines():
     first, second = (
         Grid.around(np.array([[576000.03, 5188000.0, 0], [576010.0, 5188010.0, 0]]), 0.3),
         Grid.around(np.array([[576011.0, 5188007.7, 0]]), 0.3),

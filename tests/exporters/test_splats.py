@@ -30,7 +30,7 @@ def run(*arguments) -> None:
 
 
 def site() -> Gaussians:
-    """Opaque flat Gaussians on the ground of `scenes`, with random colours and odd quaternions, and 30 small
+    """Opaque flat Gaussians on the ground of `scenes`, with random colors and odd quaternions, and 30 small
     floaters 6 m above it; local frame.
     """
     generator = torch.Generator().manual_seed(0)
@@ -100,7 +100,7 @@ def test_ply_loses_nothing(scene, splats):
     np.testing.assert_array_equal(splats.origin, local_origin(views()))
 
 
-def test_world_positions_keep_millimetres_at_utm_size(splats):
+def test_world_positions_keep_millimeters_at_utm_size(splats):
     expected = site().means.double().numpy() + local_origin(views())
     found = splats.gaussians.means.numpy().astype(np.float64) + splats.origin
     assert np.abs(found).max() > 5e6 and np.abs(found - expected).max() < 1e-3
@@ -168,7 +168,7 @@ def test_the_comment_says_where_the_origin_lies(scene):
     run("export", scene, "--format", "splats", "spz")
 
 
-def test_pictures_in_class_colours(scene, tmp_path):
+def test_pictures_in_class_colors(scene, tmp_path):
     def picture(*options) -> np.ndarray:
         run(
             "view",

@@ -32,13 +32,13 @@ def test_pixel_ray_point_pixel_round_trip(model):
     pixels = np.random.default_rng(0).uniform([0, 0], [1280, 720], (2000, 2))
     directions, ray_z = cameras.rays(view, pixels)
     ranges = np.random.default_rng(1).uniform(5, 200, 2000)
-    found, depth = cameras.project(view, view.centre + directions * ranges[:, None])
+    found, depth = cameras.project(view, view.center + directions * ranges[:, None])
     assert np.abs(found - pixels).max() < 1e-6
     np.testing.assert_allclose(depth, ranges * ray_z, rtol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-12)
 
 
-def test_rays_without_pixels_are_the_pixel_centres():
+def test_rays_without_pixels_are_the_pixel_centers():
     view = cameras.pinhole_view("a", (4, 3), (10, 10, 2, 1.5), np.eye(4))
     directions, ray_z = cameras.rays(view)
     first = np.array([0.5 - 2, 0.5 - 1.5, 10])
@@ -59,9 +59,9 @@ def test_projection_is_the_textbook_formula_with_the_real_principal_point():
 
 def test_points_behind_or_far_outside_the_field_of_view_are_not_seen():
     view = make_view("OPENCV")  # its polynomial folds far points back into the image
-    away = view.centre - 10 * view.cam_from_world[2, :3]
-    sideways = view.centre + view.cam_from_world[2, :3] + 5 * view.cam_from_world[0, :3]
-    pixels, _ = cameras.project(view, np.stack([away, sideways, view.centre]))
+    away = view.center - 10 * view.cam_from_world[2, :3]
+    sideways = view.center + view.cam_from_world[2, :3] + 5 * view.cam_from_world[0, :3]
+    pixels, _ = cameras.project(view, np.stack([away, sideways, view.center]))
     assert np.isnan(pixels).all()
     assert not cameras.in_image(view, pixels).any()
 
@@ -101,7 +101,7 @@ def test_undistorted_photo_shows_what_the_pinhole_view_projects(model):
     pinhole = cameras.undistorted(view, 640)
     assert pinhole.camera.is_undistorted() and max(pinhole.width, pinhole.height) == 640
     columns, rows = np.meshgrid(np.arange(1280), np.arange(720))
-    # colour = position in the distorted photo
+    # color = position in the distorted photo
     photo = np.stack([columns / 5, rows / 3, np.zeros_like(rows)], axis=2)
     warped = cameras.resample(photo.astype(np.float32), view, pinhole)
     pixels = (
@@ -110,7 +110,7 @@ def test_undistorted_photo_shows_what_the_pinhole_view_projects(model):
         .astype(int)
     )
     directions, _ = cameras.rays(pinhole, pixels + 0.5)
-    expected, _ = cameras.project(view, view.centre + 10 * directions)
+    expected, _ = cameras.project(view, view.center + 10 * directions)
     found = warped[pixels[:, 1], pixels[:, 0], :2] * [5, 3] + 0.5
     assert np.abs(found - expected).max() < 0.1
 

@@ -1,4 +1,4 @@
-"""Neighbours, normals (eq. 5) and curvature (eq. 6) on analytic surfaces; KDTreeFlann and scipy as oracles."""
+"""Neighbors, normals (eq. 5) and curvature (eq. 6) on analytic surfaces; KDTreeFlann and scipy as oracles."""
 
 import numpy as np
 import open3d as o3d
@@ -54,8 +54,8 @@ def test_normals_of_noisy_plane_and_sphere_within_two_degrees():
 def test_orientation_towards_the_cameras():
     ball = sphere(20000)
     estimated = neighbors.estimate_normals(ball, neighbors.NeighborIndex(ball).nearest(ball, 20)[0])
-    centres = 10 * sphere(60, seed=1)
-    oriented = neighbors.orient_normals(ball, estimated, centres)
+    centers = 10 * sphere(60, seed=1)
+    oriented = neighbors.orient_normals(ball, estimated, centers)
     assert (np.einsum("ij,ij->i", oriented, ball) > 0).all()
 
 

@@ -42,8 +42,8 @@ def test_range_and_depth_of_a_sphere_are_analytic(offset):
     points = surface_points(first, view, rows, columns) - offset
     assert hit.sum() > 5000
     assert np.abs(np.linalg.norm(points, axis=1) - 2).max() < 1e-3
-    towards = (view.centre - offset - points) / np.linalg.norm(
-        view.centre - offset - points, axis=1, keepdims=True
+    towards = (view.center - offset - points) / np.linalg.norm(
+        view.center - offset - points, axis=1, keepdims=True
     )
     cosine = np.einsum("ij,ij->i", towards, points / 2)
     assert np.quantile(np.abs(first.incidence[hit] - cosine), 0.99) < 0.03
@@ -104,9 +104,9 @@ def test_pixel_to_surface_and_point_to_pixel_agree_on_a_sphere():
     normals = (points / 2).astype(np.float32)
     index, agree, total = NeighborIndex(points), 0, 0
     for seed in range(6):
-        centre = np.random.default_rng(seed).normal(size=3)
+        center = np.random.default_rng(seed).normal(size=3)
         view = pinhole_view(
-            "a", (900, 900), (1000, 1000, 450, 450), look_at(9 * centre / np.linalg.norm(centre), np.zeros(3))
+            "a", (900, 900), (1000, 1000, 450, 450), look_at(9 * center / np.linalg.norm(center), np.zeros(3))
         )
         first = first_surface(surface, view)
         forward = np.zeros(len(points), bool)

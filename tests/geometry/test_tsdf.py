@@ -1,4 +1,4 @@
-"""TSDF fusion of exact depth maps: sphere, deep scene, off-centre principal point."""
+"""TSDF fusion of exact depth maps: sphere, deep scene, off-center principal point."""
 
 import os
 import subprocess
@@ -32,10 +32,10 @@ def sphere():
     color = np.broadcast_to(np.uint8([200, 100, 0]), (300, 400, 3))
     for row in range(40):  # spread evenly, by the golden angle
         height, turn = 1 - (2 * row + 1) / 40, np.pi * (3 - np.sqrt(5)) * row
-        centre = np.array(
+        center = np.array(
             [np.cos(turn) * np.sqrt(1 - height**2), np.sin(turn) * np.sqrt(1 - height**2), height]
         )
-        view = pinhole_view("a", (400, 300), (600, 600, 190, 155), look_at(8 * centre, np.zeros(3)))
+        view = pinhole_view("a", (400, 300), (600, 600, 190, 155), look_at(8 * center, np.zeros(3)))
         first = first_surface(surface, view)
         depth = np.where(
             np.isfinite(first.range) & (first.incidence > np.cos(np.deg2rad(75))),
@@ -56,7 +56,7 @@ def test_sphere_within_half_a_voxel_and_closed(sphere):
     assert near_mesh(onto, mesh, VOXEL).mean() > 0.999
 
 
-def test_cloud_has_colours_and_outward_normals(sphere):
+def test_cloud_has_colors_and_outward_normals(sphere):
     cloud = sphere.cloud()
     points, normals = cloud.point.positions.numpy(), cloud.point.normals.numpy()
     assert np.abs(np.linalg.norm(points, axis=1) - 2).max() < 0.5 * VOXEL
@@ -73,7 +73,7 @@ def test_triangles_face_outwards(sphere):
 
 
 def test_a_deep_scene_keeps_its_depth():
-    """A plane 120 m away: nothing wraps, as 16-bit millimetres would at 65.5 m."""
+    """A plane 120 m away: nothing wraps, as 16-bit millimeters would at 65.5 m."""
     fusion = DepthFusion(0.5, 2000)
     for x in (0.0, 10.0):
         view = pinhole_view(
@@ -133,7 +133,7 @@ def test_pixel_squares_cover_exactly_the_wanted_pixels_at_their_depth():
     facing = np.einsum(
         "ij,ij->i",
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
-        view.centre - corners[:, 0],
+        view.center - corners[:, 0],
     )
     assert (facing > 0).all()
     empty, none = pixel_squares(view, depth, np.zeros((60, 80, 3), np.uint8), np.zeros((60, 80), bool))
@@ -142,7 +142,7 @@ def test_pixel_squares_cover_exactly_the_wanted_pixels_at_their_depth():
 
 def test_order_is_that_of_positions_and_says_the_same():
     """A mesh whose vertices and triangles are shuffled comes out as the same bytes, with the same corners,
-    sense and colours.
+    sense and colors.
     """
     rng = np.random.default_rng(3)
     mesh = o3d.t.geometry.TriangleMesh.create_sphere(1.0, 12)

@@ -27,10 +27,10 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def camera_at(centre: np.ndarray):
-    """A view whose camera frame is the world, moved to `centre`: directions are world directions."""
+def camera_at(center: np.ndarray):
+    """A view whose camera frame is the world, moved to `center`: directions are world directions."""
     cam_from_world = np.eye(4)
-    cam_from_world[:3, 3] = -centre
+    cam_from_world[:3, 3] = -center
     return pinhole_view("a", (4, 4), (4, 4, 2, 2), cam_from_world)
 
 
@@ -216,8 +216,8 @@ def ring(size: int = 300) -> list:
 def range_to_sphere(view) -> np.ndarray:
     """(H, W) exact range; NaN outside."""
     directions, _ = rays(view)
-    along = -directions @ view.centre
-    inside = 4 - (view.centre @ view.centre - along**2)
+    along = -directions @ view.center
+    inside = 4 - (view.center @ view.center - along**2)
     return np.where(inside > 0, along - np.sqrt(np.maximum(inside, 0)), np.nan).reshape(
         view.height, view.width
     )
@@ -231,7 +231,7 @@ def test_ranges_are_finer_than_voxels(noise):
     surface = VoxelSurface.from_cloud(points, normals, voxel)
     for view in ring()[:3]:
         first, exact = first_surface(surface, view), range_to_sphere(view)
-        # between ray and normal, from the triangle of centre, camera and hit
+        # between ray and normal, from the triangle of center, camera and hit
         cosine = np.abs(81 - 4 - exact**2) / (4 * exact)
         inner = np.isfinite(exact) & (cosine > 0.3)
         error = np.abs(first.range - exact)[inner] * cosine[inner] / voxel
@@ -261,7 +261,7 @@ def test_pixel_to_surface_and_point_to_pixel_agree_on_a_sphere():
         rows = nearest_points(first, near, index, 4 * spacing)
         backward[np.unique(rows[rows >= 0])] = True
         assert (forward == backward).mean() > 0.98
-        agree.append((forward == (backward & (dot(near.centre - points, normals) > 0))).mean())
+        agree.append((forward == (backward & (dot(near.center - points, normals) > 0))).mean())
     assert min(agree) > 0.99
 
 
@@ -374,7 +374,7 @@ def test_the_surface_depends_on_neither_order_nor_threads_nor_units_nor_zero():
         np.testing.assert_array_equal(first.incidence, other.incidence)
     offset = np.array([5e5, 5e6, 200.0])
     far = first_surface(VoxelSurface.from_cloud(points + offset, normals, voxel), view.shifted(-offset))
-    larger = pinhole_view("a", (300, 300), (330, 330, 150, 150), look_at(100 * view.centre, np.zeros(3)))
+    larger = pinhole_view("a", (300, 300), (330, 330, 150, 150), look_at(100 * view.center, np.zeros(3)))
     scaled = first_surface(VoxelSurface.from_cloud(100 * points, normals, 100 * voxel), larger)
     for other in (far.range, scaled.range / 100):
         assert (np.isfinite(other) == np.isfinite(first.range)).mean() > 0.9999

@@ -27,8 +27,8 @@ def test_find_groups_points_exactly_by_voxel(points):
 def test_cells_are_the_voxels_that_open3d_calls_by_the_same_index(points):
     field = VoxelField.around(points, 0.2, 4)
     coordinates, indices = field.grid.voxel_coordinates_and_flattened_indices()
-    centres = field.origin + coordinates.numpy().astype(np.float64) + 0.1
-    np.testing.assert_array_equal(field.find(centres), indices.numpy() * SIDES)
+    centers = field.origin + coordinates.numpy().astype(np.float64) + 0.1
+    np.testing.assert_array_equal(field.find(centers), indices.numpy() * SIDES)
 
 
 def test_merge_adds_and_save_round_trips(points, tmp_path):

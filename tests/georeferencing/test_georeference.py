@@ -71,7 +71,7 @@ class TestCrs:
         assert np.abs(found.to_crs(points) - found.offset - points)[:, :2].max() > 0.2
 
     @pytest.mark.parametrize("epsg", [32615, 26915, 6344, 26991, 2232])
-    def test_round_trip_in_other_crs_keeps_micrometres(self, epsg):
+    def test_round_trip_in_other_crs_keeps_micrometers(self, epsg):
         found, points = from_origin(BRIGHTON, epsg, altitude_offset=-31.5), random_points()
         there = found.to_crs(points)
         np.testing.assert_allclose(found.from_crs(there), points, rtol=0, atol=1e-6)
@@ -251,17 +251,17 @@ def flown(positions: np.ndarray, origin: tuple = BRIGHTON) -> Flight:
 
 
 class TestGps:
-    def centres(self) -> np.ndarray:
+    def centers(self) -> np.ndarray:
         x, y = np.meshgrid(np.arange(5) * 20.0, np.arange(4) * 25.0)
         return np.stack([x.ravel(), y.ravel(), 60 + np.random.default_rng(1).normal(0, 1, 20)], axis=1)
 
-    def test_scene_in_enu_is_recognised_with_its_origin(self):
-        measured = self.centres() + np.random.default_rng(2).normal(0, 0.3, (20, 3))
+    def test_scene_in_enu_is_recognized_with_its_origin(self):
+        measured = self.centers() + np.random.default_rng(2).normal(0, 0.3, (20, 3))
         # as a GPS-aligned model lies
         world = dict(
             zip(
                 [f"{row}.jpg" for row in range(20)],
-                fit_similarity(self.centres(), measured).apply(self.centres()),
+                fit_similarity(self.centers(), measured).apply(self.centers()),
             )
         )
         found = find_georeference(flown(measured), world, random_points(), None)
@@ -271,43 +271,43 @@ class TestGps:
         )
         assert 0.2 < found.figures["gps"]["rms"] < 0.9
 
-    def test_scene_in_utm_is_recognised(self):
-        centres = from_origin(BRIGHTON).to_crs(self.centres())
+    def test_scene_in_utm_is_recognized(self):
+        centers = from_origin(BRIGHTON).to_crs(self.centers())
         found = find_georeference(
-            flown(self.centres()), dict(zip([f"{row}.jpg" for row in range(20)], centres)), centres, None
+            flown(self.centers()), dict(zip([f"{row}.jpg" for row in range(20)], centers)), centers, None
         )
         assert found == Georeference(32615, (0.0, 0.0, 0.0))
 
     def test_scene_in_any_other_frame_gets_a_similarity_and_one_wrong_position_does_no_harm(self):
-        measured = self.centres()
+        measured = self.centers()
         measured[4] += [300.0, 0, 40]
         other = Similarity(0.02, turned([1, 1, 0], 2.5), np.array([3.0, 4.0, 5.0]))
         found = find_georeference(
             flown(measured),
-            dict(zip([f"{row}.jpg" for row in range(20)], other.apply(self.centres()))),
+            dict(zip([f"{row}.jpg" for row in range(20)], other.apply(self.centers()))),
             random_points(),
             None,
         )
         assert found.is_moved
         np.testing.assert_allclose(
-            found.to_crs(other.apply(self.centres())), from_origin(BRIGHTON).to_crs(self.centres()), atol=1e-5
+            found.to_crs(other.apply(self.centers())), from_origin(BRIGHTON).to_crs(self.centers()), atol=1e-5
         )
 
     def test_flight_along_a_line_is_levelled_by_its_points(self):
-        centres = np.outer(np.linspace(-60, 60, 9), [0.8, 0.6, 0]) + [0, 0, 50]
+        centers = np.outer(np.linspace(-60, 60, 9), [0.8, 0.6, 0]) + [0, 0, 50]
         ground = np.random.default_rng(3).uniform(-40, 40, (400, 3)) * [1, 1, 0.01]
         other = Similarity(0.5, turned([3, 1, 2], 1.9), np.array([1.0, 2.0, 3.0]))
-        flight = flown(centres)
+        flight = flown(centers)
         assert flight.shape == "line"
-        fit = place(flight, dict(zip(flight.tags, other.apply(centres))), other.apply(ground))
+        fit = place(flight, dict(zip(flight.tags, other.apply(centers))), other.apply(ground))
         levelled = fit.apply(other.apply(ground))
         assert (
             np.ptp(levelled[:, 2]) < 1.5
-            and levelled[:, 2].mean() < fit.apply(other.apply(centres))[:, 2].mean() - 49
+            and levelled[:, 2].mean() < fit.apply(other.apply(centers))[:, 2].mean() - 49
         )
 
     def test_residuals_are_root_mean_squares(self):
-        flight = flown(self.centres())
+        flight = flown(self.centers())
         shifted = {name: position + [0.3, 0.4, 1.2] for name, position in flight.positions.items()}
         assert residuals(flight, shifted) == {
             "photos": 20,
@@ -355,13 +355,13 @@ def pixels_of(point: np.ndarray, views: list[View]) -> dict[str, np.ndarray]:
 def fly(tilt: float, seed: int = 0) -> list[View]:
     """12 views from 40 m over 60 x 60 m; `tilt` in m moves the point that they look at."""
     rng = np.random.default_rng(seed)
-    centres = np.stack(np.meshgrid([-20.0, -7, 7, 20], [-15.0, 0, 15]), -1).reshape(-1, 2)
+    centers = np.stack(np.meshgrid([-20.0, -7, 7, 20], [-15.0, 0, 15]), -1).reshape(-1, 2)
     views = []
-    for row, (x, y) in enumerate(centres):
-        centre = np.array([x, y, 40 + rng.normal(0, 0.5)])
+    for row, (x, y) in enumerate(centers):
+        center = np.array([x, y, 40 + rng.normal(0, 0.5)])
         target = np.array([x, y, 0]) + [*rng.uniform(-tilt, tilt, 2), 0]
         views.append(
-            pinhole_view(f"{row}.jpg", (640, 480), (600, 600, 320, 240), look_at(centre, target, (0, 1, 0)))
+            pinhole_view(f"{row}.jpg", (640, 480), (600, 600, 320, 240), look_at(center, target, (0, 1, 0)))
         )
     return views
 
@@ -385,7 +385,7 @@ class TestControlPoints:
         lines = [header, "# x y z px py photo name"]
         for row, point in enumerate(self.SURVEYED):
             position = positions[row] + (errors or {}).get(row, 0)
-            # the file's convention: the first pixel's centre is (0, 0)
+            # the file's convention: the first pixel's center is (0, 0)
             for photo, pixel in pixels_of(point, views).items():
                 lines.append(
                     " ".join(
@@ -429,7 +429,7 @@ class TestControlPoints:
             np.array([model.image(row + 1).projection_center() for row in range(12)])
         )
         np.testing.assert_allclose(
-            found, from_origin(BRIGHTON).to_crs(np.array([view.centre for view in views])), atol=1e-3
+            found, from_origin(BRIGHTON).to_crs(np.array([view.center for view in views])), atol=1e-3
         )
         assert figures["points"] == 5 and figures["rms"] < 1e-3 and figures["leave_one_out_rms"] < 1e-3
         assert all(point["reprojection_px"] < 1e-2 for point in figures["residuals"].values())
@@ -531,7 +531,7 @@ class TestFocal:
     @pytest.mark.parametrize("with_gps", [True, False])
     def test_height_follows_exif(self, tmp_path, with_gps, caplog):
         views = fly(1.0)
-        flight = flown(np.array([view.centre for view in views])) if with_gps else None
+        flight = flown(np.array([view.center for view in views])) if with_gps else None
         for view in views:
             write_photo(
                 tmp_path / view.name,
@@ -558,8 +558,8 @@ class TestFocal:
         # the shape is right again; with GPS the frame too
         assert np.abs(fit.apply(points) - site()).max() < 0.05
         if with_gps:
-            centres = np.array([model.image(row + 1).projection_center() for row in range(12)])
-            np.testing.assert_allclose(centres, list(flight.positions.values()), atol=0.02)
+            centers = np.array([model.image(row + 1).projection_center() for row in range(12)])
+            np.testing.assert_allclose(centers, list(flight.positions.values()), atol=0.02)
 
     def test_photos_without_focal_length_are_left_as_they_are(self, tmp_path, caplog):
         views = fly(1.0)
@@ -632,15 +632,15 @@ def test_reconstruct_with_control_points_and_georeference_command(tmp_path, capl
             str(tmp_path / "gcp_list.txt"),
         ]
     )
-    true_centres = {view.name: view.centre for view in truth.views}
+    true_centers = {view.name: view.center for view in truth.views}
 
     def errors() -> np.ndarray:
         """Distance of every camera from its true position, in the scene's CRS, m."""
         views, found = read_sparse_model(scene / "sparse" / "0").views, read_georeference(Scene(scene))
         expected = from_origin(REFERENCE, found.epsg).to_crs(
-            np.array([true_centres[view.name] for view in views])
+            np.array([true_centers[view.name] for view in views])
         )
-        return np.linalg.norm(found.to_crs(np.array([view.centre for view in views])) - expected, axis=1)
+        return np.linalg.norm(found.to_crs(np.array([view.center for view in views])) - expected, axis=1)
 
     assert errors().max() < 0.15
     figures = json.loads((scene / "georeference.json").read_text())["figures"]["control_points"]

@@ -31,7 +31,7 @@ from tests.builders import views as bare_views
 FILES = Path(__file__).parent / "files"
 PLACE = (46.84269, -91.99443, 198.0)
 SIZE = (640, 480)
-CAMERAS = {  # distorted, principal point off centre
+CAMERAS = {  # distorted, principal point off center
     "OPENCV": [505.5, 503.25, 331.5, 226.75, -0.11, 0.04, 0.0012, -0.0023],
     "FULL_OPENCV": [505.5, 503.25, 331.5, 226.75, -0.11, 0.04, 0.0012, -0.0023, -0.012, 0, 0, 0],
     "OPENCV_FISHEYE": [305.5, 303.25, 311.5, 251.75, -0.03, 0.011, -0.004, 0.0006],
@@ -56,10 +56,10 @@ def fails(capsys, *arguments) -> str:
 def fly(model: str = "OPENCV", count: int = 6) -> list[View]:
     camera = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=CAMERAS[model], camera_id=1)
     rng = np.random.default_rng(5)
-    centres = [[20 * np.cos(step), 15 * np.sin(step), 30 + step] for step in range(count)]
+    centers = [[20 * np.cos(step), 15 * np.sin(step), 30 + step] for step in range(count)]
     return [
-        View(f"shot_{row}.jpg", camera, look_at(np.array(centre), rng.normal(0, 3, 3)))
-        for row, centre in enumerate(centres)
+        View(f"shot_{row}.jpg", camera, look_at(np.array(center), rng.normal(0, 3, 3)))
+        for row, center in enumerate(centers)
     ]
 
 
@@ -111,7 +111,7 @@ def metashape_xml(
     for row, view in enumerate(views):
         matrix = np.eye(4)
         matrix[:3, :3] = rotation.T @ view.cam_from_world[:3, :3].T
-        matrix[:3, 3] = rotation.T @ (view.centre - translation) / scale
+        matrix[:3, 3] = rotation.T @ (view.center - translation) / scale
         numbers = " ".join(repr(float(value)) for value in matrix.ravel())
         cameras.append(
             f'<camera id="{row}" sensor_id="0" component_id="0" label="{Path(view.name).stem}"><transform>{numbers}</transform><orientation>1</orientation></camera>'
@@ -179,7 +179,7 @@ def opensfm_json(views: list[View], points: np.ndarray, reference: tuple | None)
             "rotation": (angle * axis).tolist(),
             "translation": view.cam_from_world[:3, 3].tolist(),
             "camera": "v2 dji",
-            "gps_position": view.centre.tolist(),
+            "gps_position": view.center.tolist(),
         }
     listed = {
         str(100 + row): {"coordinates": point.tolist(), "color": [10.0, 20.0, float(row % 256)]}
@@ -213,7 +213,7 @@ def pix4d_text(views: list[View]) -> str:
             f"{p1!r} {p2!r}",
             *(
                 " ".join(repr(float(value)) for value in row)
-                for row in (view.centre, *view.cam_from_world[:3, :3])
+                for row in (view.center, *view.cam_from_world[:3, :3])
             ),
             "",
         ]
@@ -320,11 +320,11 @@ class TestRoundTrips:
             left, _, right = np.linalg.svd(view.cam_from_world[:3, :3] @ np.linalg.inv(matrix))
             pose = np.eye(4)
             pose[:3, :3] = left @ right
-            pose[:3, 3] = -pose[:3, :3] @ (matrix @ view.centre + shift)
+            pose[:3, 3] = -pose[:3, :3] @ (matrix @ view.center + shift)
             in_utm.append(replace(view, cam_from_world=pose))
         content = opensfm_json(in_utm, points @ matrix.T + shift, PLACE)
         for view in views:
-            content[1]["shots"][view.name]["gps_position"] = view.centre.tolist()  # stays topocentric
+            content[1]["shots"][view.name]["gps_position"] = view.center.tolist()  # stays topocentric
         (root / "opensfm" / "reconstruction.json").write_text(json.dumps(content))
         if topocentric:
             (root / "opensfm" / "reconstruction.topocentric.json").write_text(
@@ -338,8 +338,8 @@ class TestRoundTrips:
         # ODM's own rounding of rotations and scale
         assert same_projections(model.views, views, probe(), here) < (1e-5 if topocentric else 0.5)
         np.testing.assert_allclose(
-            found.to_crs(np.array([view.centre for view in model.views])),
-            enu.to_crs(np.array([view.centre for view in views])),
+            found.to_crs(np.array([view.center for view in model.views])),
+            enu.to_crs(np.array([view.center for view in views])),
             atol=1e-6 if topocentric else 1e-2,
         )
 
@@ -383,7 +383,7 @@ class TestRoundTrips:
         transform = (pycolmap.Rotation3d(np.array([0.3, -1.0, 0.5])).matrix(), np.array([3.0, 4, 5]), 12.354)
         (tmp_path / "cameras.xml").write_text(
             metashape_xml(
-                views, metashape_lens(), 'LOCAL_CS["Local Coordinates (m)",UNIT["metre",1]]', transform
+                views, metashape_lens(), 'LOCAL_CS["Local Coordinates (m)",UNIT["meter",1]]', transform
             )
         )
         run(
@@ -398,7 +398,7 @@ class TestRoundTrips:
 
     @pytest.mark.parametrize("epsg, expected", [(4326, 32615), (32615, 32615), (26991, 26991)])
     def test_metashape_on_earth(self, tmp_path, epsg, expected):
-        """Chunk to geocentric coordinates, at 12.35 chunk units per metre, as a real export has it."""
+        """Chunk to geocentric coordinates, at 12.35 chunk units per meter, as a real export has it."""
         views = [
             replace(
                 view,
@@ -421,7 +421,7 @@ class TestRoundTrips:
         for view in views:
             pose = np.eye(4)
             pose[:3, :3] = view.cam_from_world[:3, :3] @ axes.T
-            pose[:3, 3] = -pose[:3, :3] @ ecef(view.centre)[0]
+            pose[:3, 3] = -pose[:3, :3] @ ecef(view.center)[0]
             geocentric.append(replace(view, cam_from_world=pose))
         transform = (pycolmap.Rotation3d(np.array([0.3, -1.0, 0.5])).matrix(), zero + [50, -20, 30], 12.354)
         reference = pyproj.CRS.from_epsg(epsg).to_wkt("WKT1_GDAL")
@@ -432,11 +432,11 @@ class TestRoundTrips:
         found, truth = read_georeference(Scene(tmp_path / "scene")), from_origin(PLACE, expected)
         assert found.epsg == expected and found.origin is not None
         model = Scene(tmp_path / "scene").model
-        centres, expected_centres = (
-            np.array([view.centre for view in some]) for some in (model.views, views)
+        centers, expected_centers = (
+            np.array([view.center for view in some]) for some in (model.views, views)
         )
-        # a millimetre at UTM size
-        np.testing.assert_allclose(found.to_crs(centres), truth.to_crs(expected_centres), atol=1e-3)
+        # a millimeter at UTM size
+        np.testing.assert_allclose(found.to_crs(centers), truth.to_crs(expected_centers), atol=1e-3)
         assert same_projections(model.views, views, probe(), found.from_crs(truth.to_crs(probe()))) < 0.01
 
 
@@ -466,7 +466,7 @@ class TestFilesOfTheToolsThemselves:
 
     @pytest.mark.parametrize("number", range(9))
     def test_lenses_of_opensfm(self, number):
-        """Projections computed by OpenSfM's own C++ code, in its convention: the centre of the first pixel is
+        """Projections computed by OpenSfM's own C++ code, in its convention: the center of the first pixel is
         (0, 0).
         """
         case = json.loads((FILES / "opensfm_projections.json").read_text())["cameras"][number]
@@ -498,7 +498,7 @@ DSC00002.JPG 6000 4000
 """)
         (view,) = read_project(tmp_path, Import()).views
         assert view.camera.model_name == "FULL_OPENCV" and (view.width, view.height) == (6000, 4000)
-        np.testing.assert_allclose(view.centre, [-892.5025, 11.2136, -4.0173], atol=1e-4)
+        np.testing.assert_allclose(view.center, [-892.5025, 11.2136, -4.0173], atol=1e-4)
         assert view.cam_from_world[2, 2] < -0.99  # looks down
 
 
@@ -729,7 +729,7 @@ UTM = np.array([576673.0, 5188174.0, 199.0])
 
 
 def surveyed(count: int = 500) -> np.ndarray:
-    """Positions at UTM size, whole millimetres."""
+    """Positions at UTM size, whole millimeters."""
     return np.round(np.random.default_rng(3).uniform([-30, -30, -2], [30, 30, 8], (count, 3)) + UTM, 3)
 
 
@@ -777,7 +777,7 @@ class TestClouds:
         np.testing.assert_allclose(attributes(scene.cloud)["positions"], truth, atol=1e-3)
         assert read_georeference(scene) == from_origin(PLACE) and len(scene.model.views) == 6
 
-    def test_cloud_without_crs_is_recognised_by_where_the_cameras_are(self, tmp_path):
+    def test_cloud_without_crs_is_recognized_by_where_the_cameras_are(self, tmp_path):
         scene, truth = Scene(tmp_path / "scene"), probe(400)
         write_model(scene.sparse, fly())
         write_georeference(scene, from_origin(PLACE))
@@ -881,7 +881,7 @@ class TestMeshes:
         }
         assert (np.rint(np.asarray(mesh.vertex_colors) * 255) == [255, 128, 0]).all()
 
-    def test_obj_with_quads_references_from_the_end_and_colours(self, tmp_path):
+    def test_obj_with_quads_references_from_the_end_and_colors(self, tmp_path):
         vertices = [f"v {x:.3f} {y:.3f} {z:.3f} 1.0 0.502 0.0" for x, y, z in self.CORNERS]
         (tmp_path / "m.obj").write_text(
             "\n".join(
@@ -925,11 +925,11 @@ class TestColmapInACrs:
         scene = Scene(tmp_path / "scene")
         found = read_georeference(scene)
         assert found.origin is None and found.offset[2] == 0
-        centres = np.array([view.centre for view in scene.model.views])
-        assert np.abs(centres[:, :2]).max() < 10
+        centers = np.array([view.center for view in scene.model.views])
+        assert np.abs(centers[:, :2]).max() < 10
         np.testing.assert_allclose(
-            found.to_crs(centres),
-            [view.centre for view in sorted(bare_views(), key=lambda view: view.name)],
+            found.to_crs(centers),
+            [view.center for view in sorted(bare_views(), key=lambda view: view.name)],
             atol=1e-6,
         )
 
@@ -937,7 +937,7 @@ class TestColmapInACrs:
         run("import", self.project(tmp_path), tmp_path / "scene")
         assert "--epsg" in caplog.text and read_georeference(Scene(tmp_path / "scene")) is None
         np.testing.assert_allclose(
-            Scene(tmp_path / "scene").model.views[0].centre, bare_views()[0].centre, atol=1e-6
+            Scene(tmp_path / "scene").model.views[0].center, bare_views()[0].center, atol=1e-6
         )
 
     def test_imported_scene_can_be_labelled(self, tmp_path):

@@ -85,7 +85,7 @@ def slow_votes(cloud: Cloud, views: list[View], masks: dict, surface: Surface, s
     cells = ballot.to_points(np.arange(len(ballot.votes)))
     facing = ballot.to_points(ballot.cloud.facing)
     votes = np.zeros((len(ballot.votes), 5), np.int64)
-    reference = np.median([np.linalg.norm(view.centre - np.median(cloud.points, axis=0)) for view in views])
+    reference = np.median([np.linalg.norm(view.center - np.median(cloud.points, axis=0)) for view in views])
     for view in views:
         mask, confidence = masks[view.name]
         first = first_surface(surface, view)
@@ -155,7 +155,7 @@ def test_scale_and_position_of_the_world_do_not_matter(scale, offset):
     moved = []
     for view in views:
         pose = view.cam_from_world.copy()
-        pose[:3, 3] = -pose[:3, :3] @ (scale * view.centre + offset)
+        pose[:3, 3] = -pose[:3, :3] @ (scale * view.center + offset)
         moved.append(replace(view, cam_from_world=pose))
     box = o3d.t.geometry.TriangleMesh.create_box(2, 2, 2)
     vertices = np.concatenate(
@@ -235,8 +235,8 @@ def test_grazing_sightings_take_no_part_in_the_second_vote():
         picture_of(mask, None, edge_distance(mask), first.range, Label()),
         Rules(0.25, 9.0, True, True, True, False, True),
     )
-    cosine = np.abs(np.einsum("ij,ij->i", cloud.normals, views[0].centre - cloud.points)) / np.linalg.norm(
-        views[0].centre - cloud.points, axis=1
+    cosine = np.abs(np.einsum("ij,ij->i", cloud.normals, views[0].center - cloud.points)) / np.linalg.norm(
+        views[0].center - cloud.points, axis=1
     )
     steepest = np.zeros(len(ballot.votes))
     np.maximum.at(steepest, ballot.to_points(np.arange(len(ballot.votes))), cosine)

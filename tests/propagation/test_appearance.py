@@ -1,4 +1,4 @@
-"""Colour and relief as raters: errors that all views share, the guard, scale, order."""
+"""Color and relief as raters: errors that all views share, the guard, scale, order."""
 
 import numpy as np
 import pytest
@@ -15,8 +15,8 @@ LAWN, ROOF, ROAD = 1, 2, 3
 
 
 def village(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points, normals, colours and truth of a lawn with a road and flat roofs 5 high; spacing about 0.5. Lawn
-    and roofs share half of their colours.
+    """Points, normals, colors and truth of a lawn with a road and flat roofs 5 high; spacing about 0.5. Lawn
+    and roofs share half of their colors.
     """
     rng = np.random.default_rng(seed)
     flat = rng.uniform(0, 100, (40_000, 2))
@@ -99,7 +99,7 @@ def test_errors_that_all_views_share_are_cured_and_only_by_the_raters(scene):
         assert trusting > 0.9 * before and verified < 0.3 * before
 
 
-def test_labels_that_colour_and_relief_cannot_know_switch_the_raters_off(scene):
+def test_labels_that_color_and_relief_cannot_know_switch_the_raters_off(scene):
     """Classes as a random chessboard of large squares: nothing to learn, so the votes stay as they are."""
     points, normals, colors, _, _ = scene
     board = np.random.default_rng(1).integers(1, 4, (5, 5)).astype(np.uint8)

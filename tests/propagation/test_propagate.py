@@ -221,7 +221,7 @@ def test_locked_points_are_completed_and_seeds_keep_their_label():
         )
 
 
-def test_two_points_and_no_neighbours():
+def test_two_points_and_no_neighbors():
     points = np.array([[0.0, 0, 0], [1.0, 0, 0]])
     label = np.uint8([1, 0])
     result = propagate(

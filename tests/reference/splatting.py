@@ -38,7 +38,7 @@ def render_reference(
     reached = torch.cumprod(torch.cat([torch.ones_like(alphas[:, :1]), 1 - alphas], dim=1), dim=1)[:, :-1]
     weights = alphas * torch.where(reached >= _MIN_TRANSMITTANCE, reached, 0.0)
     normals, distances = _planes(means_cam, axes, gaussians.log_scales[order])
-    directions = gaussians.means[order] - torch.tensor(view.centre, dtype=dtype)
+    directions = gaussians.means[order] - torch.tensor(view.center, dtype=dtype)
     colors = (
         0.5 + torch.einsum("nk,nkc->nc", *_basis_and_coefficients(directions, gaussians.sh[order], sh_degree))
     ).clamp_min(0.0)
@@ -56,7 +56,7 @@ def render_reference(
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """(N, 3, 3) rotations of (N, 4) wxyz quaternions, which are normalised first."""
+    """(N, 3, 3) rotations of (N, 4) wxyz quaternions, which are normalized first."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
     return torch.stack(
         [
@@ -75,7 +75,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def _alphas(means_cam: Tensor, axes: Tensor, scales: Tensor, opacities: Tensor, view: View) -> Tensor:
-    """(H * W, N) alpha of every Gaussian at every pixel centre, 0 below 1/255."""
+    """(H * W, N) alpha of every Gaussian at every pixel center, 0 below 1/255."""
     dtype, matrix = means_cam.dtype, view.matrix
     focal, principal = (
         torch.tensor([matrix[0, 0], matrix[1, 1]], dtype=dtype),

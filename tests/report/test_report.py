@@ -81,9 +81,9 @@ def make_views() -> list[View]:
     camera = pycolmap.Camera(
         model="SIMPLE_RADIAL", width=160, height=120, params=[140, 80, 60, 0.02], camera_id=1
     )
-    centres = [(-12, -12, 35), (12, -12, 35), (12, 12, 35), (-12, 12, 35)]
+    centers = [(-12, -12, 35), (12, -12, 35), (12, 12, 35), (-12, 12, 35)]
     return [
-        View(f"view{number}.jpg", camera, look_at(UTM + centre, UTM)) for number, centre in enumerate(centres)
+        View(f"view{number}.jpg", camera, look_at(UTM + center, UTM)) for number, center in enumerate(centers)
     ]
 
 
@@ -244,7 +244,7 @@ def test_all_sections_and_figures_are_there(page):
 
 def test_images_decode_and_show_the_scene(page):
     images = [decode(data) for data in re.findall(r'<img[^>]* src="data:image/\w+;base64,([^"]+)"', page)]
-    assert len(images) == 2 * 5 + 4 * 4  # four colourings and the mesh, twice; four panels of four photos
+    assert len(images) == 2 * 5 + 4 * 4  # four colorings and the mesh, twice; four panels of four photos
     assert all(image is not None and image.std() > 3 for image in images)
     labels_from_above = images[1]
     height, width = labels_from_above.shape[:2]
@@ -377,13 +377,13 @@ def test_reliability_curve_has_its_dots_where_the_figures_say():
 
 
 def test_flight_map_has_north_up_and_east_right():
-    centres = np.array([[0.0, 0], [100, 0], [0, 50]]) + UTM[:2]
-    chart = flight_map(centres, np.zeros((3, 2)), ["a", "b", EVIL], None)
+    centers = np.array([[0.0, 0], [100, 0], [0, 50]]) + UTM[:2]
+    chart = flight_map(centers, np.zeros((3, 2)), ["a", "b", EVIL], None)
     places = np.array(re.findall(r'cx="([\d.]+)" cy="([\d.]+)"', chart), float)
     assert places[1, 0] > places[0, 0] and places[2, 1] < places[0, 1]
-    pixels_per_metre = (places[1, 0] - places[0, 0]) / 100
+    pixels_per_meter = (places[1, 0] - places[0, 0]) / 100
     length = float(re.search(r"v6h([\d.]+)v-6", chart)[1])
-    assert np.isclose(length / pixels_per_metre, float(re.search(r">(\d+) m<", chart)[1]), rtol=0.01)
+    assert np.isclose(length / pixels_per_meter, float(re.search(r">(\d+) m<", chart)[1]), rtol=0.01)
     assert EVIL not in chart
 
 

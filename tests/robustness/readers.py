@@ -252,7 +252,7 @@ def _build_colored(folder: Path) -> None:
 
 
 def _read_colored(folder: Path) -> object:
-    """A folder of colours, then one of ids, as `segment --format` takes them."""
+    """A folder of colors, then one of ids, as `segment --format` takes them."""
     from sc3d.segmentation.mask_formats.pngs import is_colored
     from sc3d.segmentation.mask_formats.source import MaskFiles, read_masks
 
@@ -376,7 +376,7 @@ def _build_project(kind: str):
                 tracks__csv=tracks,
             )
         elif kind == "metashape":
-            reference = 'LOCAL_CS["Local",LOCAL_DATUM["x",0],UNIT["metre",1]]'
+            reference = 'LOCAL_CS["Local",LOCAL_DATUM["x",0],UNIT["meter",1]]'
             _write(folder, cameras__xml=made.metashape_xml(views, made.metashape_lens(), reference))
         elif kind == "pix4d":
             import pyproj
@@ -506,7 +506,7 @@ READERS: dict[str, Reader] = {
         _copy_mask_file("coco_compressed.json"), _read_mask_files, ("coco_compressed.json",)
     ),
     "labelme": Reader(_copy_mask_file("labelme/DJI_0001.json"), _read_mask_files, ("DJI_0001.json",)),
-    "masks-colour": Reader(
+    "masks-color": Reader(
         _build_colored, _read_colored, tuple(f"DJI_000{number}.png" for number in range(1, 4))
     ),
     "strokes": Reader(_build_strokes, _read_strokes, ("a.json", "b.png")),

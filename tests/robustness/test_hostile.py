@@ -213,7 +213,7 @@ def test_bombs_in_the_details_of_a_png(tmp_path):
 
 
 def test_every_prefix_of_a_photo_is_refused(tmp_path):
-    """Decoders fill what is missing of a JPEG with grey and say nothing."""
+    """Decoders fill what is missing of a JPEG with gray and say nothing."""
     for name, content in (
         ("a.jpg", picture("JPEG")),
         ("b.jpg", picture("JPEG", progressive=True)),

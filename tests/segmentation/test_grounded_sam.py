@@ -174,9 +174,9 @@ def test_outlines_lie_where_the_boxes_are(models, segmenter, keep_aspect):
     height, width, side, cells = 120, 200, 1024, 256
 
     def fill(image_embeddings, input_boxes, multimask_output):
-        centres = (torch.arange(cells) + 0.5) * side / cells
+        centers = (torch.arange(cells) + 0.5) * side / cells
         left, top, right, bottom = (input_boxes[0, :, None, None, index] for index in range(4))
-        inside = (centres > left) & (centres < right) & (centres[:, None] > top) & (centres[:, None] < bottom)
+        inside = (centers > left) & (centers < right) & (centers[:, None] > top) & (centers[:, None] < bottom)
         return types.SimpleNamespace(
             pred_masks=torch.where(inside, 1.0, -1.0)[None, :, None],
             iou_scores=torch.full((1, len(inside), 1), 0.5),

@@ -74,7 +74,7 @@ def _refused(tmp_path: Path, path: Path, *parts: str, **options: object) -> str:
 
 
 def _near_edges(labels: np.ndarray) -> np.ndarray:
-    """Pixels with another label among their eight neighbours."""
+    """Pixels with another label among their eight neighbors."""
     padded = np.pad(labels, 1, mode="edge")
     height, width = labels.shape
     return np.any(
@@ -157,7 +157,7 @@ def _image(outline, size: tuple[int, int]) -> np.ndarray:
 
 
 def _fill_slowly(ring: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Even-odd rule, pixel by pixel: edges that a ray from the centre to the left crosses."""
+    """Even-odd rule, pixel by pixel: edges that a ray from the center to the left crosses."""
     mask = np.zeros((size[1], size[0]), bool)
     for row, column in np.ndindex(*mask.shape):
         x, y, crossings = column + 0.5, row + 0.5, 0
@@ -174,7 +174,7 @@ def test_polygons_equal_brute_force(monkeypatch):
     random, size = np.random.default_rng(1), (13, 9)
     for index in range(60):
         ring = random.uniform(-6, 17, (int(random.integers(3, 9)), 2))
-        # corners on pixels' corners and centres
+        # corners on pixels' corners and centers
         ring = ring.round() if index % 3 == 1 else ring.round() + 0.5 if index % 3 == 2 else ring
         try:
             outline = polygons([ring], size)
@@ -463,7 +463,7 @@ def test_colors(tmp_path):
     np.testing.assert_array_equal(
         _import(tmp_path, tmp_path / "other")["DJI_0001"], np.where(labels == 3, 0, labels)
     )
-    indexed = Image.fromarray(labels * 7)  # a palette whose colours, not ids, are those of the table
+    indexed = Image.fromarray(labels * 7)  # a palette whose colors, not ids, are those of the table
     indexed.putpalette(np.repeat(palette[:4], 7, axis=0).ravel().tolist())
     indexed.save(tmp_path / "other" / "DJI_0001.png")
     np.testing.assert_array_equal(_import(tmp_path, tmp_path / "other", "color")["DJI_0001"], labels)
@@ -486,7 +486,7 @@ def test_colors_are_not_guessed(tmp_path):
         {"[1,2,300]": "tree"},
         {"#010203": "tree", "1,2,3": "road"},
     ):
-        _refused(tmp_path, tmp_path / "rgb", "colour", mapping=mapping)
+        _refused(tmp_path, tmp_path / "rgb", "color", mapping=mapping)
 
 
 def test_ids_of_other_tables(tmp_path):
@@ -519,7 +519,7 @@ def test_masks_in_place_are_not_converted(tmp_path):
         )
     assert (masks / "DJI_0001.png").read_bytes() == before
     write_image(masks / "DJI_0001.png", np.zeros((72, 96, 3), np.uint8))
-    with pytest.raises(InputError, match="has colours"):
+    with pytest.raises(InputError, match="has colors"):
         import_masks(MaskFiles(masks), masks, PHOTOS, TABLE)
 
 

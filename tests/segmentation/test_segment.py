@@ -298,7 +298,7 @@ def test_import_masks(tmp_path):
         ("c", np.zeros((6, 8), np.uint8), "belongs to no photo"),
         ("b", np.zeros((8, 8), np.uint8), "aspect"),
         ("b", np.full((6, 8), 3, np.uint8), "class id 3"),
-        ("b", np.zeros((6, 8, 3), np.uint8), "colours"),
+        ("b", np.zeros((6, 8, 3), np.uint8), "colors"),
     ],
 )
 def test_import_writes_nothing_if_a_mask_does_not_fit(tmp_path, stem, mask, message):
@@ -459,7 +459,7 @@ def _folders(scene: Path) -> Folders:
             (
                 "facebook/sam3",
                 "3440 MB",
-                "SAM licence, gated",
+                "SAM license, gated",
                 "hf auth login",
                 "{0}/sam3",
                 "{0}/facebook/sam3",
@@ -482,7 +482,7 @@ def test_missing_weights_say_what_to_do(tmp_path, monkeypatch, backend, words):
 
 def test_only_names_of_models_are_looked_for(tmp_path):
     pytest.importorskip("huggingface_hub")
-    with pytest.raises(InputError, match="size and licence"):
+    with pytest.raises(InputError, match="size and license"):
         find_weights("someone/else", None, download=False)
     for name in ("../secret", "a/..", "no-owner", "/etc/passwd", "a/b/c", "a b/c"):
         with pytest.raises(InputError, match="not the name of a model"):

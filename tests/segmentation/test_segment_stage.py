@@ -190,7 +190,7 @@ def test_folder_of_masks_and_errors(scene, tmp_path, capsys):
 def test_missing_weights_and_bad_prompts_are_said(scene, capsys):
     for options, word in (
         (["--backend", "grounded-sam", "--model-dir", str(scene)], "grounding-dino"),
-        (["--backend", "sam3", "--model-dir", str(scene)], "SAM licence"),
+        (["--backend", "sam3", "--model-dir", str(scene)], "SAM license"),
         (["--backend", "sam3", "--overlap", "0"], "overlap"),
         (["--backend", "grounded-sam", "--prompts", "street"], "NAME=text"),
     ):

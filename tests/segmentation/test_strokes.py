@@ -35,7 +35,7 @@ def truth() -> np.ndarray:
 
 
 def photo(seed: int, label: np.ndarray | None = None) -> np.ndarray:
-    """A photo of `truth`: flat grey, smooth green, and coarse green of nearly the same mean colour."""
+    """A photo of `truth`: flat gray, smooth green, and coarse green of nearly the same mean color."""
     random, label = np.random.default_rng(seed), truth() if label is None else label
     fine, coarse = (
         random.normal(0, 1, (*label.shape, 1)),
@@ -186,7 +186,7 @@ def test_large_photos_are_looked_at_small_but_cut_finely(scene):
             "no list of shapes",
         ),
         (lambda folder: (folder / "a.json").write_text("{"), "not valid JSON"),
-        (lambda folder: Image.new("RGB", SIZE, (1, 2, 3)).save(folder / "b.png"), "colour #010203"),
+        (lambda folder: Image.new("RGB", SIZE, (1, 2, 3)).save(folder / "b.png"), "color #010203"),
         (lambda folder: Image.new("RGB", (50, 50)).save(folder / "b.png"), "aspect"),
     ],
 )
@@ -210,7 +210,7 @@ def test_shapes_cover_what_geometry_says():
         ] / scale + 0.5 / scale
 
     for scale in (1, 2):
-        for kind, points, width, area, centre in [
+        for kind, points, width, area, center in [
             ("polygon", [[50, 50], [250, 50], [250, 150], [50, 150]], 0, 200 * 100, (150, 100)),
             ("rectangle", [[250, 150], [50, 50]], 0, 200 * 100, (150, 100)),
             ("circle", [[200, 150], [200, 50]], 0, np.pi * 100**2, (200, 150)),
@@ -219,7 +219,7 @@ def test_shapes_cover_what_geometry_says():
         ]:
             found, middle = covered(kind, points, width, scale)
             assert abs(found - area) < 0.04 * area + 0.5 * 2 * np.sqrt(np.pi * area), kind
-            assert np.abs(middle - centre).max() < 0.8, kind
+            assert np.abs(middle - center).max() < 0.8, kind
 
 
 def test_later_shapes_lie_on_top_and_coordinates_follow_the_stated_size():
@@ -233,7 +233,7 @@ def test_later_shapes_lie_on_top_and_coordinates_follow_the_stated_size():
     assert (groups[:, :118] == 1).all() and (groups[:, 122:] == 2).all()
 
 
-def test_colours_of_a_png_and_json_above_it(scene):
+def test_colors_of_a_png_and_json_above_it(scene):
     picture = np.zeros((*SIZE[::-1], 4), np.uint8)
     picture[10:30, 10:30] = [150, 150, 160, 255]
     picture[50:70, 10:13] = [40, 150, 60, 255]
@@ -280,8 +280,10 @@ def test_guided_filter_equals_a_regression_in_every_window():
         for column in range(2, 2 + 19):
             window = (slice(row - 2, row + 3), slice(column - 2, column + 3))
             colors, values = padded_guide[window].reshape(-1, 3), padded[window].ravel()
-            centred = colors - colors.mean(axis=0)
-            slope = np.linalg.solve(centred.T @ centred / 25 + smoothing * np.eye(3), centred.T @ values / 25)
+            centered = colors - colors.mean(axis=0)
+            slope = np.linalg.solve(
+                centered.T @ centered / 25 + smoothing * np.eye(3), centered.T @ values / 25
+            )
             expected[row - 2, column - 2] = *slope, values.mean() - slope @ colors.mean(axis=0)
     means = np.stack(
         [expected[row : row + 14, column : column + 15] for row in range(5) for column in range(5)]

@@ -46,7 +46,7 @@ def test_tiles_cover_the_photo_and_overlap(width, height, tile, overlap):
         assert Window(0, 0, width, height).holds(window)
         seen[window.top : window.bottom, window.left : window.right] += 1
     assert seen.all() and len(set(windows)) == len(windows)
-    for axis in (0, 1):  # two neighbours share at least the wanted strip
+    for axis in (0, 1):  # two neighbors share at least the wanted strip
         starts = sorted({window[axis] for window in windows})
         assert all(
             tile - (second - first) >= int(tile * overlap)
@@ -62,7 +62,7 @@ def test_small_photos_are_seen_once():
 
 
 def _site(seed: int, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A label image as a photo whose colour is the number of the object, 4-connected and of any form; class
+    """A label image as a photo whose color is the number of the object, 4-connected and of any form; class
     and score per number; 0 = nothing.
     """
     random = np.random.default_rng(seed)

@@ -25,18 +25,18 @@ def plane(normal, offset):
     return distances
 
 
-def sphere(centre, radius):
+def sphere(center, radius):
     """Distances along unit rays from an origin outside to a sphere; inf where it is missed."""
 
     def distances(origin, directions):
-        towards = directions @ (np.asarray(centre, float) - origin)
-        inside = towards**2 - np.sum((np.asarray(centre, float) - origin) ** 2) + radius**2
+        towards = directions @ (np.asarray(center, float) - origin)
+        inside = towards**2 - np.sum((np.asarray(center, float) - origin) ** 2) + radius**2
         return np.where((inside > 0) & (towards > 0), towards - np.sqrt(np.maximum(inside, 0)), np.inf)
 
     return distances
 
 
-def colour(points, wave):
+def color(points, wave):
     """(N, 3) in [0, 1]: smooth waves about `wave` long, in all directions."""
     x, y, z = points.T * (2 * np.pi / wave)
     waves = [
@@ -54,10 +54,10 @@ def photographed(views, shapes, wave, noise, num_points=1500):
     random, photos, depths, indices, points = np.random.default_rng(0), [], [], [], []
     for view in views:
         directions, along = rays(view)
-        distances = np.stack([shape(view.centre, directions) for shape in shapes])
-        hits = view.centre + distances.min(0)[:, None] * directions
+        distances = np.stack([shape(view.center, directions) for shape in shapes])
+        hits = view.center + distances.min(0)[:, None] * directions
         photos.append(
-            (np.clip(colour(hits, wave), 0, 1) * 255 + 0.5)
+            (np.clip(color(hits, wave), 0, 1) * 255 + 0.5)
             .astype(np.uint8)
             .reshape(view.height, view.width, 3)
         )
@@ -65,7 +65,7 @@ def photographed(views, shapes, wave, noise, num_points=1500):
         indices.append(distances.argmin(0).reshape(view.height, view.width))
         points.append(hits[random.choice(len(hits), num_points // len(views), replace=False)])
     points = np.concatenate(points)
-    colors = (np.clip(colour(points, wave), 0, 1) * 255).astype(np.uint8)
+    colors = (np.clip(color(points, wave), 0, 1) * 255).astype(np.uint8)
     return (
         TrainingData(views, photos, points + random.normal(0, noise, points.shape), colors),
         np.stack(depths),
@@ -76,10 +76,10 @@ def photographed(views, shapes, wave, noise, num_points=1500):
 def ring(calibration=(90.0, 90.0, 50.0, 31.0)):
     """8 views of the origin from about 9 units above."""
     angles = np.arange(8) * np.pi / 4
-    centres = [np.array([4 * np.cos(a), 3 * np.sin(a), 9 + np.cos(3 * a)]) for a in angles]
+    centers = [np.array([4 * np.cos(a), 3 * np.sin(a), 9 + np.cos(3 * a)]) for a in angles]
     return [
-        pinhole_view(f"{row}.png", SIZE, calibration, look_at(centre, centre * [0.2, 0, 0]))
-        for row, centre in enumerate(centres)
+        pinhole_view(f"{row}.png", SIZE, calibration, look_at(center, center * [0.2, 0, 0]))
+        for row, center in enumerate(centers)
     ]
 
 
@@ -128,9 +128,9 @@ def test_sphere_over_a_plane():
 
 @pytest.mark.parametrize("unit", [1.0, 0.01])
 def test_deep_scene_keeps_its_depth_at_any_scale(unit):
-    """Ground from 20 m in front of the cameras to a wall that is 120 m away, in metres and in units of 100 m."""
-    centres = np.array([(-14, 0, 20), (-8, 3, 23), (-3, -3, 18), (3, 2, 22), (8, -2, 19), (14, 1, 21)], float)
-    poses = [look_at(centre * unit, np.array([0.3 * centre[0], 50, 0]) * unit) for centre in centres]
+    """Ground from 20 m in front of the cameras to a wall that is 120 m away, in meters and in units of 100 m."""
+    centers = np.array([(-14, 0, 20), (-8, 3, 23), (-3, -3, 18), (3, 2, 22), (8, -2, 19), (14, 1, 21)], float)
+    poses = [look_at(center * unit, np.array([0.3 * center[0], 50, 0]) * unit) for center in centers]
     views = [
         pinhole_view(f"{row}.png", SIZE, (60.0, 60.0, 48.0, 32.0), pose) for row, pose in enumerate(poses)
     ]

@@ -108,7 +108,7 @@ def test_masks_show_core_and_border_as_the_exact_depth_does(site):
             directions, along = rays(view)
             depth = np.load(site / "depth" / f"{Path(view.name).stem}.npy").ravel()
             known = depth > 0
-            surface = view.centre + directions * (depth / along)[:, None]
+            surface = view.center + directions * (depth / along)[:, None]
             truth = block.holds(surface, border=True)
             agreed.append((part.mask(row).ravel() == truth)[known].mean())
             shown.append(truth[known].mean())

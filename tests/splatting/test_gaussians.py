@@ -1,4 +1,4 @@
-"""Gaussians: initialisation, accessors, the 3DGS PLY."""
+"""Gaussians: initialization, accessors, the 3DGS PLY."""
 
 import numpy as np
 import open3d as o3d
@@ -15,7 +15,7 @@ def random_gaussians(count: int, degree: int, seed: int = 0) -> Gaussians:
     return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
 
 
-def test_scale_is_the_rms_distance_to_three_neighbours():
+def test_scale_is_the_rms_distance_to_three_neighbors():
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [100, 100, 100]], float)
     gaussians = Gaussians.from_points(points, np.full((5, 3), 128, np.uint8), sh_degree=1)
     assert gaussians.scales[0].numpy() == pytest.approx(np.full(3, np.sqrt((1 + 4 + 9) / 3)), rel=1e-6)

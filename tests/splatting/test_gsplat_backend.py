@@ -138,7 +138,7 @@ def gsplat_images(reference, gaussians, view, sh_degree):
     facing = (normals * means_cam[0]).sum(1, keepdim=True)
     colors = (
         reference._spherical_harmonics(
-            sh_degree, gaussians.means - torch.from_numpy(view.centre).float(), gaussians.sh
+            sh_degree, gaussians.means - torch.from_numpy(view.center).float(), gaussians.sh
         )
         + 0.5
     )
@@ -331,12 +331,12 @@ def test_adam_in_torch_equals_the_kernel(monkeypatch):
     results = []
     for kernels in (True, False):
         monkeypatch.setattr(device, "has_kernels", lambda tensor, answer=kernels: answer)
-        optimiser = RowAdam({"values": start.clone().requires_grad_()}, rates)
+        optimizer = RowAdam({"values": start.clone().requires_grad_()}, rates)
         for gradient, chosen in zip(gradients, rows, strict=True):
-            optimiser.parameters["values"].grad = gradient.clone()
-            optimiser.step(chosen)
+            optimizer.parameters["values"].grad = gradient.clone()
+            optimizer.step(chosen)
         results.append(
-            (optimiser.parameters["values"].detach(), optimiser.means["values"], optimiser.squares["values"])
+            (optimizer.parameters["values"].detach(), optimizer.means["values"], optimizer.squares["values"])
         )
     for one, other in zip(*results, strict=True):
         assert torch.allclose(one, other, rtol=1e-5, atol=1e-7)

@@ -21,15 +21,15 @@ NUM_IDS = 8
 
 
 def some_views(count=4):
-    centres = np.random.default_rng(1).normal(size=(count, 3)) + [0.3, -0.5, -5.0]
+    centers = np.random.default_rng(1).normal(size=(count, 3)) + [0.3, -0.5, -5.0]
     return [
         pinhole_view(
             f"view_{row}",
             (45 + 3 * row, 37),
             (40.0, 42.0, 27.3, 15.1),
-            look_at(centre, np.zeros(3), up=(0, -1, 0)),
+            look_at(center, np.zeros(3), up=(0, -1, 0)),
         )
-        for row, centre in enumerate(centres)
+        for row, center in enumerate(centers)
     ]
 
 

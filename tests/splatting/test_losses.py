@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from sc3d.geometry.cameras import look_at, pinhole_view, pixel_centres, rays
-from sc3d.geometry.view_selection import nearest_views, neighbour_views
+from sc3d.geometry.cameras import look_at, pinhole_view, pixel_centers, rays
+from sc3d.geometry.view_selection import nearest_views, neighbor_views
 from sc3d.splatting import losses
 from sc3d.splatting.consistency import consistent, pinhole, pixel_rays, reprojection_error
 from sc3d.splatting.cpu.normal_loss import depth_normal_loss
@@ -23,7 +23,7 @@ def camera(x: float, y: float, z: float = 10.0, size=SIZE, calibration=CALIBRATI
 def plane_depth(view) -> torch.Tensor:
     """Depth of the plane PLANE . x = 0."""
     directions, along = rays(view)
-    distance = -(view.centre @ PLANE) / (directions @ PLANE)
+    distance = -(view.center @ PLANE) / (directions @ PLANE)
     return torch.from_numpy((distance * along).reshape(view.height, view.width)).float()
 
 
@@ -36,9 +36,9 @@ def texture(points: np.ndarray) -> np.ndarray:
 
 def plane_photo(view) -> torch.Tensor:
     directions, _ = rays(view)
-    distance = -(view.centre @ PLANE) / (directions @ PLANE)
+    distance = -(view.center @ PLANE) / (directions @ PLANE)
     return torch.from_numpy(
-        texture(view.centre + distance[:, None] * directions).reshape(view.height, view.width)
+        texture(view.center + distance[:, None] * directions).reshape(view.height, view.width)
     ).float()
 
 
@@ -46,7 +46,7 @@ def plane_maps(view) -> tuple[torch.Tensor, torch.Tensor]:
     """N (H, W, 3) and D (H, W) of the plane, scaled by an arbitrary alpha."""
     normal = view.cam_from_world[:3, :3] @ PLANE
     alpha = 0.3 + 0.7 * torch.rand(view.height, view.width, generator=torch.Generator().manual_seed(0))
-    return alpha[..., None] * torch.from_numpy(normal).float(), alpha * float(view.centre @ PLANE)
+    return alpha[..., None] * torch.from_numpy(normal).float(), alpha * float(view.center @ PLANE)
 
 
 def test_rays_are_those_of_the_camera_module():
@@ -151,7 +151,7 @@ def test_normal_kernel_equals_its_reference():
 def test_warped_plane_correlates():
     view, other = camera(2, 1), camera(-1, 2, 11)
     normal, distance = plane_maps(view)
-    pixels = torch.from_numpy(pixel_centres(*SIZE).astype(np.int64))
+    pixels = torch.from_numpy(pixel_centers(*SIZE).astype(np.int64))
     planes = normal.reshape(-1, 3).requires_grad_(), distance.reshape(-1).requires_grad_()
     dissimilarity, inside = losses.patch_dissimilarity(
         planes, pixels, (plane_photo(view), view), (plane_photo(other), other)
@@ -170,15 +170,15 @@ def test_warped_plane_correlates():
 def test_patch_kernel_equals_its_reference():
     view, other = camera(2, 1), camera(-1, 2, 11, (80, 70), (100.0, 99.0, 41.0, 33.0))
     normal, distance = plane_maps(view)
-    pixels = torch.from_numpy(pixel_centres(*SIZE).astype(np.int64))
-    greys = (plane_photo(view), view), (plane_photo(other), other)
+    pixels = torch.from_numpy(pixel_centers(*SIZE).astype(np.int64))
+    grays = (plane_photo(view), view), (plane_photo(other), other)
     results = []
     for function in (losses.patch_dissimilarity, losses.patch_dissimilarity_reference):
         planes = (
             (normal * torch.tensor([1.0, 1.1, 0.98])).reshape(-1, 3).requires_grad_(),
             (distance * 1.02).reshape(-1).requires_grad_(),
         )
-        values, inside = function(planes, pixels, *greys)
+        values, inside = function(planes, pixels, *grays)
         (values * inside * torch.linspace(0, 1, len(values))).sum().backward()
         results.append((values.detach() * inside, inside, planes[0].grad, planes[1].grad))
     ours, reference = results
@@ -191,7 +191,7 @@ def test_patch_kernel_equals_its_reference():
 def test_photometric_gradient_leads_to_the_plane():
     view, other = camera(2, 1), camera(-1, 2, 11)
     normal, distance = plane_maps(view)
-    pixels = torch.from_numpy(pixel_centres(*SIZE).astype(np.int64))
+    pixels = torch.from_numpy(pixel_centers(*SIZE).astype(np.int64))
     for factor, sign in ((1.01, 1), (0.99, -1)):
         planes = normal.reshape(-1, 3), (distance.reshape(-1) * factor).requires_grad_()
         loss = losses.photometric_loss(
@@ -205,7 +205,7 @@ def test_photometric_gradient_leads_to_the_plane():
 
 def test_flat_patches_do_not_correlate_and_do_not_explode():
     flat = torch.full((5, 49), 0.4, requires_grad=True)
-    correlation = losses.normalised_correlation(flat, torch.rand(5, 49))
+    correlation = losses.normalized_correlation(flat, torch.rand(5, 49))
     correlation.sum().backward()
     assert correlation.abs().max() < 1e-3 and torch.isfinite(flat.grad).all()
 
@@ -234,20 +234,20 @@ def test_image_edges_are_relative():
     assert edges.max() == 1 and not edges[:, :5].any() and not edges[:, 7:].any()
 
 
-def test_neighbours_share_points_at_a_good_angle():
+def test_neighbors_share_points_at_a_good_angle():
     points = np.random.default_rng(0).uniform(-5, 5, (200, 3)) * [1, 1, 0]
-    centres = np.array([[0, 0, 20], [0.2, 0, 20], [4, 0, 20], [-4, 0, 20], [0, 30, 5], [6, 0, 20]], float)
+    centers = np.array([[0, 0, 20], [0.2, 0, 20], [4, 0, 20], [-4, 0, 20], [0, 30, 5], [6, 0, 20]], float)
     everything = np.arange(200)
     tracks = [everything, everything, everything[:150], everything[:100], everything[:120], np.zeros(0, int)]
-    found = neighbour_views(tracks, points, centres, count=2)
+    found = neighbor_views(tracks, points, centers, count=2)
     assert found[0].tolist() == [2, 3]  # 1 is too close, 4 too oblique, 5 shares nothing
     assert found[5].tolist()[0] == 2  # without tracks: the nearest
-    assert [len(others) for others in neighbour_views(None, points, centres, count=3)] == [3] * 6
+    assert [len(others) for others in neighbor_views(None, points, centers, count=3)] == [3] * 6
 
 
 def test_nearest_views_do_not_depend_on_units():
-    centres = np.random.default_rng(1).uniform(0, 10, (20, 3))
-    for one, other in zip(nearest_views(centres), nearest_views(centres * 1000 + 5e5), strict=True):
+    centers = np.random.default_rng(1).uniform(0, 10, (20, 3))
+    for one, other in zip(nearest_views(centers), nearest_views(centers * 1000 + 5e5), strict=True):
         assert one.tolist() == other.tolist()
     assert nearest_views(np.zeros((1, 3)))[0].size == 0
     assert nearest_views(np.eye(3)[:2])[0].tolist() == [1]

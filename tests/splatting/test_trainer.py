@@ -8,7 +8,7 @@ import torch
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import look_at, pinhole_view, rays
-from sc3d.geometry.view_selection import neighbour_views
+from sc3d.geometry.view_selection import neighbor_views
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.evaluation import depth_map
@@ -21,7 +21,7 @@ WIDTH, HEIGHT = 96, 64
 SHORT = TrainSettings(iterations=60, sh_degree=0, max_gaussians=2000, coarse_until=0.2)
 
 
-def surface_colour(points: np.ndarray) -> np.ndarray:
+def surface_color(points: np.ndarray) -> np.ndarray:
     """A smooth texture whose waves are longer than a few pixels, (N, 3) in [0, 1]."""
     x, y, z = points.T
     waves = [np.sin(2.1 * x + 0.7 * y + z), np.sin(1.3 * y - 0.9 * x + 2 * z), np.sin(1.7 * x - 1.1 * y)]
@@ -35,18 +35,18 @@ def trace(view) -> tuple[np.ndarray, np.ndarray]:
     hits = []
     for side in (1, -1):
         normal = np.array([-0.3 * side, 0, 1.0])
-        distance = -(view.centre @ normal) / (directions @ normal)
+        distance = -(view.center @ normal) / (directions @ normal)
         hits.append(np.where(distance > 0, distance, np.inf))
     distance = np.minimum(*hits)  # the space above both planes is convex
-    colour = surface_colour(view.centre + distance[:, None] * directions)
-    return (colour * 255 + 0.5).astype(np.uint8).reshape(HEIGHT, WIDTH, 3), (distance * along).reshape(
+    color = surface_color(view.center + distance[:, None] * directions)
+    return (color * 255 + 0.5).astype(np.uint8).reshape(HEIGHT, WIDTH, 3), (distance * along).reshape(
         HEIGHT, WIDTH
     )
 
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[TrainingData, list[np.ndarray]]:
-    centres = [(4 * np.cos(a), 3 * np.sin(a), 9 + np.cos(3 * a)) for a in np.arange(8) * np.pi / 4]
+    centers = [(4 * np.cos(a), 3 * np.sin(a), 9 + np.cos(3 * a)) for a in np.arange(8) * np.pi / 4]
     views = [
         pinhole_view(
             f"{i}.png",
@@ -54,20 +54,20 @@ def scene() -> tuple[TrainingData, list[np.ndarray]]:
             (90, 90, WIDTH / 2 + 2, HEIGHT / 2 - 1),
             look_at(np.array(c), np.array([0.2 * c[0], 0, 0])),
         )
-        for i, c in enumerate(centres)
+        for i, c in enumerate(centers)
     ]
     photos, depths = zip(*map(trace, views), strict=True)
     random = np.random.default_rng(0)
     points = np.concatenate([random.uniform(-8, 8, (1500, 2)), np.zeros((1500, 1))], 1)
     points[:, 2] = 0.3 * np.abs(points[:, 0])
-    colors = (surface_colour(points) * 255).astype(np.uint8)
+    colors = (surface_color(points) * 255).astype(np.uint8)
     return TrainingData(views, list(photos), points + random.normal(0, 0.05, points.shape), colors), list(
         depths
     )
 
 
 @pytest.mark.parametrize(("plain", "tolerance"), [(True, 0.015), (False, 0.008)])
-def test_training_recovers_colour_and_depth(scene, plain, tolerance):
+def test_training_recovers_color_and_depth(scene, plain, tolerance):
     data, depths = scene
     result = train(
         data,
@@ -92,16 +92,16 @@ def test_empty_parts_are_filled_at_the_right_depth(scene):
     data, _ = scene
     sparse = data.points[:, 0] < -1  # the right half has no sparse points
     data = replace(data, points=data.points[sparse], colors=data.colors[sparse])
-    neighbours = neighbour_views(None, data.points, np.stack([view.centre for view in data.views]))
-    points, colors = fill_points(data, neighbours, 3000)
+    neighbors = neighbor_views(None, data.points, np.stack([view.center for view in data.views]))
+    points, colors = fill_points(data, neighbors, 3000)
     right = points[points[:, 0] > 0.5]
     assert len(right) > 150
     height = right[:, 2] - 0.3 * np.abs(right[:, 0])
     assert np.median(np.abs(height)) < 0.15 and np.abs(np.median(height)) < 0.1  # at 9 units distance
-    expected = surface_colour(points) * 255
+    expected = surface_color(points) * 255
     assert np.median(np.abs(colors - expected)) < 15
     masked = replace(data, masks=lambda index: np.zeros((HEIGHT, WIDTH), bool))
-    assert len(fill_points(masked, neighbours, 3000)[0]) == 0
+    assert len(fill_points(masked, neighbors, 3000)[0]) == 0
 
 
 def test_same_seed_same_result_and_resume_is_exact(scene, tmp_path):

@@ -14,7 +14,7 @@ import open3d as o3d
 import pytest
 from scipy.spatial import cKDTree
 
-from sc3d.geometry.cameras import View, in_image, local_origin, pixel_centres, project
+from sc3d.geometry.cameras import View, in_image, local_origin, pixel_centers, project
 from sc3d.geometry.raycast import Surface, first_surface, surface_points
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.images import read_index_image
@@ -131,7 +131,7 @@ def test_every_truth_mask_agrees_with_the_cloud(made, surface):
         cell = pixels[inside].astype(int)
         central = np.abs(pixels[inside] - cell - 0.5).max(1) < 0.1
         seen = (
-            np.abs(np.linalg.norm(points[inside] - view.centre, axis=1) - first.range[cell[:, 1], cell[:, 0]])
+            np.abs(np.linalg.norm(points[inside] - view.center, axis=1) - first.range[cell[:, 1], cell[:, 0]])
             < 0.3
         )
         rows = inside[central & seen]
@@ -190,7 +190,7 @@ def test_masks_err_and_flight_covers_the_city(made):
     )
     assert np.abs(local_origin(views)[:2] - city.OFFSET[:2]).max() < 150
     flown = fly_over((720.0, 600.0), SynthesizeCity(Path("x")))
-    ground = pixel_centres(72, 60) * 10 - [360, 300]
+    ground = pixel_centers(72, 60) * 10 - [360, 300]
     seen = sum(
         in_image(view, project(view, np.c_[ground, np.zeros(len(ground))])[0]).astype(int) for view in flown
     )

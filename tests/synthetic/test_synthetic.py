@@ -57,11 +57,11 @@ def scene(tmp_path_factory):
 def surface_points(view, depth):
     """(H * W, 3) world positions of all pixels."""
     directions, cosines = rays(view)
-    return view.centre + directions * (depth.ravel() / cosines)[:, None]
+    return view.center + directions * (depth.ravel() / cosines)[:, None]
 
 
 def plain(label):
-    """(H, W) bool: pixels whose 3 x 3 neighbourhood has one label."""
+    """(H, W) bool: pixels whose 3 x 3 neighborhood has one label."""
     return maximum_filter(label, 3) == minimum_filter(label, 3)
 
 
@@ -92,7 +92,7 @@ def test_depth_lands_on_the_same_class_in_another_view(views, photos, pair):
 
 def test_depth_and_label_of_a_flat_roof_are_exact(world, views, photos):
     hall = next(building for building in world.buildings if building.roof == FLAT)
-    rect = (*hall.centre, np.cos(hall.yaw), np.sin(hall.yaw), hall.half[0] - 0.35, hall.half[1] - 0.35)
+    rect = (*hall.center, np.cos(hall.yaw), np.sin(hall.yaw), hall.half[0] - 0.35, hall.half[1] - 0.35)
     num_seen = 0
     for view, photo in zip(views, photos):
         points = surface_points(view, photo.depth)
@@ -104,11 +104,11 @@ def test_depth_and_label_of_a_flat_roof_are_exact(world, views, photos):
     assert num_seen > 500
 
 
-def test_road_labels_follow_the_centre_lines(world, views, photos):
+def test_road_labels_follow_the_center_lines(world, views, photos):
     view, photo = views[2], photos[2]
     points = surface_points(view, photo.depth)
     label = photo.label.ravel()
-    distance = np.min([cKDTree(line).query(points[:, :2])[0] for line in world.ground.centre_lines], axis=0)
+    distance = np.min([cKDTree(line).query(points[:, :2])[0] for line in world.ground.center_lines], axis=0)
     paved = np.min([rect_distance(points[:, :2], rect) for rect in world.ground.rects], axis=0) < 0.05
     on_ground = np.isin(label, (ROAD, GRASS))
     assert (label[on_ground & (distance < 4.35)] == ROAD).all()
@@ -208,7 +208,7 @@ def test_truth_cloud_has_only_outer_surfaces(world):
     points = cloud.point.positions.numpy()
     for building in world.buildings:
         rect = (
-            *building.centre,
+            *building.center,
             np.cos(building.yaw),
             np.sin(building.yaw),
             building.half[0] - 0.05,
@@ -256,8 +256,8 @@ def test_exif_gives_focal_length_and_position(scene):
         latitude, longitude = (sum(float(part) / 60**i for i, part in enumerate(gps[tag])) for tag in (2, 4))
         assert gps[1] == "S" and gps[3] == "E"
         position = [-latitude, longitude, float(gps[ExifTags.GPS.GPSAltitude])]
-        centre = pycolmap.GPSTransform().ellipsoid_to_enu(np.array([position]), *REFERENCE)[0]
-        assert np.allclose(centre, view.centre, atol=0.002)
+        center = pycolmap.GPSTransform().ellipsoid_to_enu(np.array([position]), *REFERENCE)[0]
+        assert np.allclose(center, view.center, atol=0.002)
 
 
 def test_a_second_run_writes_the_same_bytes(scene, tmp_path):

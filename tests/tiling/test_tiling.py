@@ -403,7 +403,7 @@ def test_a_cloud_that_cannot_be_read_in_parts_is_refused(tmp_path):
 
 
 def test_a_laz_cloud_is_labelled(site, tmp_path):
-    """Normals are estimated by tile; positions are rounded to a millimetre."""
+    """Normals are estimated by tile; positions are rounded to a millimeter."""
     source = read_cloud(site / "cloud.ply")
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales = [1e-3] * 3

@@ -209,11 +209,11 @@ def test_bad_input(tmp_path, capsys):
 
 
 def test_stopwatch_times_and_restores():
-    watch, function = Stopwatch(), kernels_raster.rasterise
-    with pytest.raises(KeyError), watch.watching({"forward": [(kernels_raster, "rasterise")]}):
-        assert kernels_raster.rasterise is not function
+    watch, function = Stopwatch(), kernels_raster.rasterize
+    with pytest.raises(KeyError), watch.watching({"forward": [(kernels_raster, "rasterize")]}):
+        assert kernels_raster.rasterize is not function
         raise KeyError
-    assert kernels_raster.rasterise is function
+    assert kernels_raster.rasterize is function
     with replaced(sys, "copyright", lambda: sum(range(10**6))), watch.watching({"sum": [(sys, "copyright")]}):
         assert sys.copyright() == sum(range(10**6))
     assert (watch.seconds["sum"] > 0).all() and 1 < fma_gflops() < 1000

@@ -43,9 +43,9 @@ def box_on_ground() -> tuple[np.ndarray, np.ndarray]:
 
 def views_around() -> list[View]:
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=240, height=180, params=[210.0, 124.0, 87.0, -0.08])
-    centres = [[0, 0, 30], [18, 2, 14], [-16, 9, 12], [3, -19, 9], [0, 15, 20]]
+    centers = [[0, 0, 30], [18, 2, 14], [-16, 9, 12], [3, -19, 9], [0, 15, 20]]
     return [
-        View(f"photo_{row}.jpg", camera, look_at(UTM + centre, UTM)) for row, centre in enumerate(centres)
+        View(f"photo_{row}.jpg", camera, look_at(UTM + center, UTM)) for row, center in enumerate(centers)
     ]
 
 
@@ -192,7 +192,7 @@ def test_every_beginning_of_the_order_is_spread_evenly():
     assert len(even_order(points[:0])) == 0 and even_order(points[:1]).tolist() == [0]
 
 
-def test_shown_cloud_keeps_millimetres_and_rows():
+def test_shown_cloud_keeps_millimeters_and_rows():
     points = UTM + np.random.default_rng(6).uniform(-60, 60, (5000, 3))
     label = np.random.default_rng(7).choice(np.uint8([0, 1, 3]), (5000, 1))
     shown = ShownCloud.of(
@@ -204,7 +204,7 @@ def test_shown_cloud_keeps_millimetres_and_rows():
     )
     assert np.array_equal(shown.colors("label"), CLASSES.palette[label.ravel()[shown.rows]])
     assert shown.class_counts == {value: int((label == value).sum()) for value in (0, 1, 3)}
-    assert shown.colourings == ("label", "confidence") and np.isclose(
+    assert shown.colorings == ("label", "confidence") and np.isclose(
         shown.spacing_at(1250), 2 * shown.spacing_at(5000)
     )
 

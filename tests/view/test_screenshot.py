@@ -1,4 +1,4 @@
-"""Pictures must be exact: a point lies where `project` says, in the colour it was given, with either
+"""Pictures must be exact: a point lies where `project` says, in the color it was given, with either
 renderer.
 """
 
@@ -20,7 +20,7 @@ from sc3d.scene.class_table import parse_classes
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.view import screenshot
 from sc3d.view.colors import (
-    COLOURINGS,
+    COLORINGS,
     CONTESTED,
     STATES,
     color_points,
@@ -72,7 +72,7 @@ def full_cloud(num_points: int = 5) -> o3d.t.geometry.PointCloud:
 
 
 def odd_view() -> View:
-    """Off-centre principal point, pixels that are not square, rolled."""
+    """Off-center principal point, pixels that are not square, rolled."""
     cam_from_world = look_at(UTM + [3, -22, 18], UTM, up=(0.3, 0.1, 1.0))
     return pinhole_view("odd.jpg", (641, 403), (500, 520, 300, 222), cam_from_world)
 
@@ -173,7 +173,7 @@ def test_large_clouds_are_thinned_the_same_way_each_time():
     assert len(np.unique(first[first >= 0])) <= 300
 
 
-def test_mesh_is_drawn_in_its_colours():
+def test_mesh_is_drawn_in_its_colors():
     mesh = o3d.t.geometry.TriangleMesh(
         np.float64([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]]) + UTM, np.int32([[0, 1, 2], [0, 2, 3]])
     )
@@ -186,8 +186,8 @@ def test_frusta_start_at_the_camera_and_hold_the_image_corners():
     view = odd_view()
     lines = frusta([view], depth=2.0)
     assert lines.shape == (8, 2, 3)
-    assert np.allclose(lines[:4, 0], view.centre)
-    pixels, depth = project(view, view.centre + (lines[:4, 1] - view.centre) * 0.999)
+    assert np.allclose(lines[:4, 0], view.center)
+    pixels, depth = project(view, view.center + (lines[:4, 1] - view.center) * 0.999)
     assert np.allclose(depth, 2.0, rtol=2e-3)
     corners = np.array([[0, 0], [view.width, 0], [view.width, view.height], [0, view.height]], float)
     assert np.allclose(pixels, corners, atol=7)  # of a picture 100 px wide
@@ -204,14 +204,14 @@ def test_frusta_and_legend_change_the_picture():
     assert (cameras.rows == -2).any()
 
 
-def test_colours():
+def test_colors():
     cloud = full_cloud()
     assert np.array_equal(color_points(cloud, "photo"), cloud.point.colors.numpy())
     assert np.array_equal(color_points(cloud, "label", CLASSES)[:3], CLASSES.palette[[0, 1, 4]])
     assert np.array_equal(color_points(cloud, "state"), [state.color for state in STATES])
     confidence = color_points(cloud, "confidence").astype(int).sum(axis=1)
     assert (np.diff(confidence) > 0).all()  # brighter = surer
-    for by in set(COLOURINGS) - {"disagreement"}:  # which needs votes
+    for by in set(COLORINGS) - {"disagreement"}:  # which needs votes
         colors = color_points(cloud, by, CLASSES)
         assert colors.dtype == np.uint8 and colors.shape == (5, 3)
 
@@ -227,10 +227,10 @@ def test_disagreement_is_what_the_winner_did_not_get():
     assert np.allclose(disagreement(many), losers, atol=1e-6)
 
 
-def test_disagreement_colours_rise_and_stop_where_no_class_has_a_majority():
+def test_disagreement_colors_rise_and_stop_where_no_class_has_a_majority():
     colors = disagreement_colors(np.float32([0, 0.2, CONTESTED, 0.9, np.nan])).astype(int)
     assert np.abs(colors[2] - colors[3]).sum() == 0 and (colors[4] == STATES[0].color).all()
-    assert colors[0, 1] > colors[1, 1] > colors[2, 1]  # green falls: light grey, orange, dark red
+    assert colors[0, 1] > colors[1, 1] > colors[2, 1]  # green falls: light gray, orange, dark red
     assert len({tuple(color) for color in colors.tolist()}) == 4
     cloud = full_cloud(50)
     votes = np.concatenate([cloud.point[f"votes_{label}"].numpy() for label in range(5)], axis=1)
@@ -252,7 +252,7 @@ def test_relief_leaves_level_ground_and_darkens_what_faces_away():
     assert (result[1] >= colors[0]).all() and (result[2] < 0.6 * colors[0]).all()
 
 
-@pytest.mark.parametrize("by", COLOURINGS)
+@pytest.mark.parametrize("by", COLORINGS)
 def test_missing_attribute_names_the_stage(by):
     with pytest.raises(InputError, match="sc3d (extract|label)"):
         color_points(make_cloud(np.zeros((3, 3))), by, CLASSES)

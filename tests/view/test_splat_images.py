@@ -1,4 +1,4 @@
-"""Pictures of Gaussians: what is where, in which colour, and beside which photo."""
+"""Pictures of Gaussians: what is where, in which color, and beside which photo."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ def make_gaussians(half: float = 4.0) -> Gaussians:
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(part)) for part in parts))
 
 
-def view_of(centre: tuple[float, float, float], size: tuple[int, int] = (120, 90)):
+def view_of(center: tuple[float, float, float], size: tuple[int, int] = (120, 90)):
     """A view whose principal point is not the middle, image top towards the north-east."""
     calibration = (110, 114, size[0] / 2 + 5, size[1] / 2 - 3)
     return pinhole_view(
         "some photo.jpg",
         size,
         calibration,
-        look_at(np.array(centre, float), np.array([0.3, 0.2, 0]), (0.4, 1, 0.3)),
+        look_at(np.array(center, float), np.array([0.3, 0.2, 0]), (0.4, 1, 0.3)),
     )
 
 
-def centre_of_red(image: np.ndarray) -> np.ndarray:
+def center_of_red(image: np.ndarray) -> np.ndarray:
     """(2,) pixel coordinates of what is red in (H, W, 3) uint8 RGB."""
     weight = np.maximum(image[..., 0].astype(float) - 1.2 * image[..., 1] - 60, 0)
     rows, columns = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
@@ -97,7 +97,7 @@ def test_panels_are_what_the_camera_sees(gaussians):
     found = compare(gaussians, view, photo, exposure=(0.0, 0.0))
     expected = (render(gaussians, view).color.clamp(0, 1) * 255).round().byte().numpy()
     assert np.array_equal(found.rendered, expected) and np.array_equal(found.photo, photo) and found.psnr > 50
-    assert np.abs(centre_of_red(found.rendered) - project(view, RED_POINT[None])[0][0]).max() < 0.1
+    assert np.abs(center_of_red(found.rendered) - project(view, RED_POINT[None])[0][0]).max() < 0.1
     row, column = view.height // 2, view.width // 2
     ray = np.array(
         [
@@ -108,7 +108,7 @@ def test_panels_are_what_the_camera_sees(gaussians):
     )
     height_per_depth = ray @ view.cam_from_world[:3, :3][:, 2]
     # where the ray meets z = 0
-    assert np.isclose(found.depth[row, column], -view.centre[2] / height_per_depth, rtol=1e-3)
+    assert np.isclose(found.depth[row, column], -view.center[2] / height_per_depth, rtol=1e-3)
     # world frame, towards the camera, although it is tilted
     assert np.abs(found.normals[found.depth > 0] - [0, 0, 1]).max() < 0.02
 
@@ -125,7 +125,7 @@ def test_exposure_of_the_photo_is_fitted_or_applied(gaussians):
     assert compare(gaussians, view, photo, exposure=(np.log(0.8), 10 / 255)).psnr > 45
 
 
-def test_near_is_bright_up_is_blue_and_nothing_is_grey(gaussians):
+def test_near_is_bright_up_is_blue_and_nothing_is_gray(gaussians):
     near_far = depth_range([np.float32([[5, 10, 20, 0]])])
     colors = depth_colors(np.float32([[5, 10, 20, 0]]), (5.0, 20.0)).astype(int)
     brightness = colors.sum(axis=2)[0]
@@ -149,8 +149,8 @@ def test_near_is_bright_up_is_blue_and_nothing_is_grey(gaussians):
 
 
 def test_sheet_holds_the_four_panels(gaussians):
-    centres = [(0, -3, 7), (2, 2, 8)]
-    rows = [compare(gaussians, view, rendered(gaussians, view)) for view in map(view_of, centres)]
+    centers = [(0, -3, 7), (2, 2, 8)]
+    rows = [compare(gaussians, view, rendered(gaussians, view)) for view in map(view_of, centers)]
     sheet = contact_sheet(rows, "a title " + "that is too long " * 20, width=560)
     assert sheet.shape[1] == 560 and sheet.dtype == np.uint8
     cell = (560 - 2 * 16 - 3 * 8) // 4
@@ -185,7 +185,7 @@ def test_chosen_photos_are_spread_and_held_out_ones_come_first():
 
 
 def test_training_sheet_uses_the_exposures_found(gaussians, tmp_path):
-    cameras = [view_of(centre) for centre in [(0, -3, 7), (2, 2, 8), (-2, 1, 8), (0, 2, 9)]]
+    cameras = [view_of(center) for center in [(0, -3, 7), (2, 2, 8), (-2, 1, 8), (0, 2, 9)]]
     photos = [np.round(0.7 * rendered(gaussians, view)).astype(np.uint8) for view in cameras]
     data = TrainingData(cameras, photos, np.zeros((10, 3)), np.zeros((10, 3), np.uint8))
     exposures = np.array([[np.log(0.7), 0], [0, 0], [np.log(0.7), 0], [0, 0]])
@@ -224,8 +224,8 @@ def test_splats_lie_where_the_photo_has_them(trained, tmp_path, size):
     assert abs(picture.shape[1] - (2 * width + 8)) <= 2 and picture.shape[0] > height
     photo, splats = picture[:height, :width], picture[:height, -width:]
     expected = project(pinhole.resized(width, height), (ORIGIN + RED_POINT)[None])[0][0]
-    assert np.abs(centre_of_red(photo) - expected).max() < 0.3
-    assert np.abs(centre_of_red(splats) - expected).max() < 0.3
+    assert np.abs(center_of_red(photo) - expected).max() < 0.3
+    assert np.abs(center_of_red(splats) - expected).max() < 0.3
     assert np.abs(np.median(splats.reshape(-1, 3), axis=0) - GREEN).max() < 12
 
 
@@ -238,7 +238,7 @@ def test_splats_from_the_air_have_north_up(trained, tmp_path):
         ground = np.argwhere((np.abs(picture.astype(int) - GREEN) < 40).all(axis=2))
         assert len(ground) > 5000
         offset = (
-            centre_of_red(np.where((picture == 255).all(axis=2, keepdims=True), 0, picture))
+            center_of_red(np.where((picture == 255).all(axis=2, keepdims=True), 0, picture))
             - ground.mean(axis=0)[::-1]
         )
         assert offset[0] > 5 and offset[1] < -5  # in the north-east
@@ -252,10 +252,10 @@ def test_flight_passes_through_the_cameras(trained, tmp_path):
         and path[0].height % 2 == 0
         and max(path[0].width, path[0].height) <= 100
     )
-    centres = np.array([view.centre for view in path])
+    centers = np.array([view.center for view in path])
     for view in views():
-        assert np.linalg.norm(centres - view.centre, axis=1).min() < 0.15
-    assert np.linalg.norm(np.diff(centres, axis=0), axis=1).max() < 0.3  # no jumps
+        assert np.linalg.norm(centers - view.center, axis=1).min() < 0.15
+    assert np.linalg.norm(np.diff(centers, axis=0), axis=1).max() < 0.3  # no jumps
     assert np.allclose(path[-1].cam_from_world, views()[-1].cam_from_world, atol=1e-6)
     assert len(flight_path(views()[:1], (100, 100))) == 1
     target = tmp_path / "flight.mp4"
@@ -265,7 +265,7 @@ def test_flight_passes_through_the_cameras(trained, tmp_path):
     assert read and frame.shape[1] == 160 and int(video.get(cv2.CAP_PROP_FRAME_COUNT)) > 20
     first = flight_path(views(), (160, 160))[0]
     assert (
-        np.abs(centre_of_red(frame[..., ::-1]) - project(first, (ORIGIN + RED_POINT)[None])[0][0]).max() < 1.5
+        np.abs(center_of_red(frame[..., ::-1]) - project(first, (ORIGIN + RED_POINT)[None])[0][0]).max() < 1.5
     )
 
 

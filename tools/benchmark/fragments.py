@@ -39,20 +39,20 @@ from tools.benchmark.machine import replaced
 
 
 def count_fragments(gaussians: Gaussians, view: View) -> tuple[float, float, float]:
-    """What the rasteriser has to do for a view.
+    """What the rasterizer has to do for a view.
 
     returns: fragments per pixel that contribute (alpha >= 1/255, transmittance in front >= 1e-4); slots per
         pixel that are evaluated,
         which are whole runs of 8 pixels; share of the Gaussians that can touch the image
     """
     caught = []
-    rasterise = kernels_raster.rasterise
+    rasterize = kernels_raster.rasterize
 
     def catching(*arguments):
         caught.append(arguments)
-        return rasterise(*arguments)
+        return rasterize(*arguments)
 
-    with replaced(kernels_raster, "rasterise", catching):
+    with replaced(kernels_raster, "rasterize", catching):
         radii = render(gaussians.detached(), view, 0, geometry=False).radii
     records, ranks, _, starts = caught[0][:4]
     counts = np.zeros((len(starts) - 1, 2), np.int64)
@@ -95,12 +95,12 @@ def _count_tile(records, ranks, origin, size, pixels):
         )
         minus_decay = splat(-records[base + 3])
         for row in range(first_row, last_row + 1):
-            centre, peak = lines[TILE + row], splat(lines[2 * TILE + row])
+            center, peak = lines[TILE + row], splat(lines[2 * TILE + row])
             for column in range(ends[row], ends[TILE + row], LANES):
                 place = row * STRIDE + column
                 transmittance = load(pixels, place)
                 if any_at_least(transmittance, limit):
-                    u = lane + splat(np.float32(column) - centre)
+                    u = lane + splat(np.float32(column) - center)
                     exponent = fma(minus_decay * u, u, peak)
                     counted = where_at_least(exponent, low, where_at_least(transmittance, limit, one))
                     store(

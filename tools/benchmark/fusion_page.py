@@ -4,11 +4,11 @@ from __future__ import annotations
 
 RIVALS = {
     "label": ("rays only", "numpy z-buffer voter"),
-    "propagate map": ("16 nearest neighbours", "scikit-learn KNN"),
+    "propagate map": ("16 nearest neighbors", "scikit-learn KNN"),
 }
 NOTE = (
     "CPU s: all threads of the process; wall s counts waiting for busy cores (load at the start was {load:.2f}). Medians; contenders take turns. Rays only: "
-    "`cast_rays` on prepared rays, one per mask pixel of every view. z-buffer voter: project, `np.minimum.at`, compare, `np.add.at`. Nearest neighbours: one "
+    "`cast_rays` on prepared rays, one per mask pixel of every view. z-buffer voter: project, `np.minimum.at`, compare, `np.add.at`. Nearest neighbors: one "
     "batched pass, tree included. scikit-learn: KNeighborsClassifier fitted on the seeds, asked for the points without label."
 )
 MEMORY = "Allowed: 1 GB + 200 bytes per point + 60 bytes per voxel. Memory is that of the process, which also holds mesh, masks and cloud of the benchmark."

@@ -1,4 +1,4 @@
-"""What label and propagate are timed against: bare ray casting, a plain numpy z-buffer voter, one neighbour
+"""What label and propagate are timed against: bare ray casting, a plain numpy z-buffer voter, one neighbor
 pass, scikit-learn.
 """
 
@@ -26,7 +26,7 @@ def ray_bundles(surface: Surface, views: list[View]) -> list[o3d.core.Tensor]:
     for view in views:
         directions, _ = rays(view)
         bundle = np.empty((len(directions), 6), np.float32)
-        bundle[:, :3], bundle[:, 3:] = view.centre - surface.origin, np.nan_to_num(directions)
+        bundle[:, :3], bundle[:, 3:] = view.center - surface.origin, np.nan_to_num(directions)
         bundles.append(o3d.core.Tensor(bundle))
     return bundles
 
@@ -59,7 +59,7 @@ def vote_with_z_buffer(
 
 
 def find_neighbors(points: np.ndarray) -> None:
-    """(c) One batched pass for the 16 nearest neighbours of all points, the tree included."""
+    """(c) One batched pass for the 16 nearest neighbors of all points, the tree included."""
     NeighborIndex(points).nearest(points, NUM_NEIGHBORS)
 
 

@@ -39,7 +39,7 @@ FUSE, MAP, RAYS, Z_BUFFER, NEIGHBORS, SKLEARN = (
     "propagate map",
     "rays only",
     "numpy z-buffer voter",
-    "16 nearest neighbours",
+    "16 nearest neighbors",
     "scikit-learn KNN",
 )
 
@@ -99,7 +99,7 @@ def _workload(scene: Scene, masks: Masks, num_points: int) -> Workload:
     moved at random along the surface.
     """
     read, origin = read_cloud(scene.cloud), local_origin(masks.views)
-    points, normals = point_arrays(read, np.array([view.centre for view in masks.views]))
+    points, normals = point_arrays(read, np.array([view.center for view in masks.views]))
     surface, rng = read_surface(scene.mesh, points, normals, origin), np.random.default_rng(0)
     colors = read.point.colors.numpy() if "colors" in read.point else np.full(points.shape, 127, np.uint8)
     spacing, rows = (

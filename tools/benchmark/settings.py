@@ -65,7 +65,7 @@ class BenchmarkTables:
 
 @dataclass(frozen=True)
 class BenchmarkFusionSpeed:
-    """Time label and propagate against bare ray casting, a numpy z-buffer voter, one nearest-neighbour pass
+    """Time label and propagate against bare ray casting, a numpy z-buffer voter, one nearest-neighbor pass
     and scikit-learn; growth and memory.
     """
 

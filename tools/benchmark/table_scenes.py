@@ -116,7 +116,7 @@ def load_place(scene: Scene, every: int) -> Place:
     )
     views, truth_files = scene.model.views, scene.mask_files(scene.truth, scene.class_table())
     cloud = read_cloud(scene.cloud)
-    points, normals = point_arrays(cloud, np.array([view.centre for view in views]))
+    points, normals = point_arrays(cloud, np.array([view.center for view in views]))
     surface = read_surface(scene.mesh, points, normals, local_origin(views))
     index, reach = NeighborIndex(points, points.min(axis=0)), REACH * spacing_of(points)
     photos = [view for view in views if view.name in truth_files]

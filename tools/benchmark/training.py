@@ -1,4 +1,4 @@
-"""Speed of training: one iteration stage by stage, the rasteriser against the arithmetic limit, whole steps
+"""Speed of training: one iteration stage by stage, the rasterizer against the arithmetic limit, whole steps
 with and without surface terms.
 """
 
@@ -29,8 +29,8 @@ from tools.benchmark.workload import Workload
 FUNCTIONS = {
     "project": [(kernels_project, "project")],
     "sort and bin": [(render, "sort_into_tiles")],
-    "forward": [(kernels_raster, "rasterise"), (kernels_raster, "collect_contributions")],
-    "backward": [(kernels_unraster, "rasterise_backward")],
+    "forward": [(kernels_raster, "rasterize"), (kernels_raster, "collect_contributions")],
+    "backward": [(kernels_unraster, "rasterize_backward")],
     "project backward": [(kernels_backproject, "project_backward")],
 }
 STAGES = ("project", "sort and bin", "forward", "loss", "backward", "project backward", "adam")
@@ -49,7 +49,7 @@ class Iteration:
         parameters = {
             name: tensor.clone().requires_grad_() for name, tensor in workload.gaussians.parameters().items()
         }
-        self.optimiser = RowAdam(parameters, dict.fromkeys(parameters, 1e-7))
+        self.optimizer = RowAdam(parameters, dict.fromkeys(parameters, 1e-7))
         self.view = view
         self.target = (
             torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1))).float().div(255).permute(1, 2, 0)
@@ -65,12 +65,12 @@ class Iteration:
         """
         watch = Stopwatch()
         with watch.watching(FUNCTIONS), watch.stage("total"):
-            rendering = render.render(current(self.optimiser), self.view)
+            rendering = render.render(current(self.optimizer), self.view)
             with watch.stage("loss"):
                 loss = ssim.image_loss(rendering.color, self.target)
             torch.autograd.backward([loss, rendering.normal, rendering.plane_distance], [None, *self.slopes])
             with watch.stage("adam"):
-                self.optimiser.step()
+                self.optimizer.step()
         seconds = {stage: watch.seconds[stage] for stage in STAGES}
         return seconds | {
             "rest": watch.seconds["total"] - sum(seconds.values()),
@@ -120,11 +120,11 @@ def measure_training(
 
 def measure_steps(workload: Workload, repeats: int) -> dict[str, float]:
     """CPU seconds at one thread of whole training steps on the first view, late in a run, without and with
-    surface terms (second view as neighbour).
+    surface terms (second view as neighbor).
     """
     with use_threads(1):
         plain, surface = _trainer(workload, plain=True), _trainer(workload, plain=False)
-        for trainer in (plain, surface):  # compiles, and renders the neighbour's depth
+        for trainer in (plain, surface):  # compiles, and renders the neighbor's depth
             _timed_step(trainer)
         reset_peak_memory()
         seconds = [[_timed_step(plain), _timed_step(surface)] for _ in range(repeats)]
@@ -177,8 +177,8 @@ def _trainer(workload: Workload, plain: bool) -> Trainer:
         settings,
     )
     for name, tensor in workload.gaussians.parameters().items():
-        trainer.optimiser.parameters[name].data.copy_(tensor)
-    trainer.optimiser.rates = {name: rate * 1e-6 for name, rate in trainer.optimiser.rates.items()}
+        trainer.optimizer.parameters[name].data.copy_(tensor)
+    trainer.optimizer.rates = {name: rate * 1e-6 for name, rate in trainer.optimizer.rates.items()}
     trainer.iteration = round(_LATE * _STEPS)
     return trainer
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, local_origin, look_at, pinhole_view, project, undistorted
-from sc3d.geometry.view_selection import neighbour_views
+from sc3d.geometry.view_selection import neighbor_views
 from sc3d.scene.scene import SparseModel
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.rendering import render
@@ -24,7 +24,7 @@ _FULL_SIZE = (1986, 1116)  # of the synthetic photos, px
 
 @dataclass(frozen=True)
 class Ground:
-    """Surface points (P, 3) in a local world frame, their colours (P, 3) uint8, and two views that overlap,
+    """Surface points (P, 3) in a local world frame, their colors (P, 3) uint8, and two views that overlap,
     at full size.
     """
 
@@ -75,7 +75,7 @@ def synthetic_ground(num_points: int = 20_000, seed: int = 0) -> Ground:
 
 
 def ground_of(model: SparseModel) -> Ground:
-    """Sparse points of a COLMAP model; the view that sees nearest to a fifth of them, and its best neighbour.
+    """Sparse points of a COLMAP model; the view that sees nearest to a fifth of them, and its best neighbor.
     InputError for too small models.
     """
     if len(model.views) < 2 or len(model.points) < 100:
@@ -86,7 +86,7 @@ def ground_of(model: SparseModel) -> Ground:
     views, points = [undistorted(view.shifted(origin)) for view in model.views], model.points - origin
     shares = [in_image(view, project(view, points)[0]).mean() for view in views]
     first = int(np.argmin(np.abs(np.array(shares) - VISIBLE_SHARE)))
-    second = int(neighbour_views(model.tracks, points, np.stack([view.centre for view in views]))[first][0])
+    second = int(neighbor_views(model.tracks, points, np.stack([view.center for view in views]))[first][0])
     named = [replace(views[index], name=f"view_{row}.png") for row, index in enumerate((first, second))]
     return Ground(points, model.colors, tuple(named))
 
@@ -110,7 +110,7 @@ def build_workload(ground: Ground, num_gaussians: int, max_size: int, seed: int 
 
 
 def _spread(ground: Ground, count: int, rng: np.random.Generator) -> Gaussians:
-    """Means between points and their neighbours, evenly over the surface; scales from the distances among
+    """Means between points and their neighbors, evenly over the surface; scales from the distances among
     them, first axis across the surface.
     """
     gaps, near = cKDTree(ground.points).query(ground.points, 7)

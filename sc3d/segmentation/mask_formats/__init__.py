@@ -1,3 +1,3 @@
-"""Masks made by other programs: COCO, LabelMe, CVAT, PNGs in colours or ids; one file per format, and the
+"""Masks made by other programs: COCO, LabelMe, CVAT, PNGs in colors or ids; one file per format, and the
 rules they share.
 """

@@ -28,7 +28,7 @@ def import_masks(
     confidence: Path | None = None,
     scene_confidence: Path | None = None,
 ) -> list[str]:
-    """Write masks, and confidence maps if given, into the scene as 8-bit grey PNGs whose values are the ids
+    """Write masks, and confidence maps if given, into the scene as 8-bit gray PNGs whose values are the ids
     of the class table.
 
     source: masks in any format; a bare path is looked at

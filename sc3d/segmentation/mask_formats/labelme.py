@@ -58,8 +58,8 @@ def _outline(shape: dict, kind: str, size: tuple[int, int]) -> Polygons | Runs:
         corners = numbers(points).reshape(-1, 2)
         return rectangle(corners.min(axis=0), corners.max(axis=0), 0.0, size)
     if kind == "circle":
-        centre, edge = numbers(points)
-        return ellipse(centre, [np.hypot(*(edge - centre))] * 2, 0.0, size)
+        center, edge = numbers(points)
+        return ellipse(center, [np.hypot(*(edge - center))] * 2, 0.0, size)
     if kind == "mask":
         return _mask(shape["mask"], numbers(points), size)
     raise OutlineError("is of a type that is not known")

@@ -1,4 +1,4 @@
-"""From the ids, names and colours that other programs use to the classes of the scene."""
+"""From the ids, names and colors that other programs use to the classes of the scene."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UNKNOWN = -1
 class Classes:
     """The class table of a scene, with what stands for its classes elsewhere.
 
-    mapping: class id by id, name or colour in the files, 0 = unlabelled; None without --mapping
+    mapping: class id by id, name or color in the files, 0 = unlabelled; None without --mapping
     origin: the mapping's file, for messages
     """
 
@@ -63,12 +63,12 @@ class Classes:
 
     @cached_property
     def by_color(self) -> np.ndarray:
-        """(2^24,) int16 class id per colour 0xRRGGBB, UNKNOWN where there is none; black is unlabelled unless
+        """(2^24,) int16 class id per color 0xRRGGBB, UNKNOWN where there is none; black is unlabelled unless
         it is a class.
         """
         if self.mapping is None:
             colors = [(entry.color, entry.id, entry.name) for entry in self.table]
-            # The table shows unlabelled pixels in a dark grey, and so do pictures made with it.
+            # The table shows unlabelled pixels in a dark gray, and so do pictures made with it.
             colors = [
                 ((0, 0, 0), 0, "unlabelled"),
                 (tuple(self.table.palette[0].tolist()), 0, "unlabelled"),
@@ -84,7 +84,7 @@ class Classes:
             code = color[0] << 16 | color[1] << 8 | color[2]
             if owners.get(code, class_id) not in (class_id, 0):
                 raise InputError(
-                    f"{self.origin or 'the class table'}: {owner!r} has the colour {color} of another class: colours cannot tell them apart"
+                    f"{self.origin or 'the class table'}: {owner!r} has the color {color} of another class: colors cannot tell them apart"
                 )
             owners[code] = table[code] = class_id
         return table
@@ -95,14 +95,14 @@ class Classes:
             return tuple(bytes.fromhex(code[1]))
         values = re.fullmatch(r"[\[(]?\s*([0-9]{1,3})\s*,\s*([0-9]{1,3})\s*,\s*([0-9]{1,3})\s*[\])]?", key)
         if not values or max(map(int, values.groups())) > 255:
-            raise InputError(f'{self.origin}: {key!r} is no colour: write it as "#d63c3c" or "[214, 60, 60]"')
+            raise InputError(f'{self.origin}: {key!r} is no color: write it as "#d63c3c" or "[214, 60, 60]"')
         return tuple(map(int, values.groups()))
 
 
 def read_mapping(mapping: Path | None, table: ClassTable) -> Classes:
     """The table with the mapping of a JSON file, if there is one.
 
-    The file holds an object: keys are ids ("7"), names ("wall") or colours ("#d63c3c", "[214, 60, 60]") of
+    The file holds an object: keys are ids ("7"), names ("wall") or colors ("#d63c3c", "[214, 60, 60]") of
     the masks; values are names or ids
     of the table, or null or "ignore" for unlabelled. Raises InputError for anything else.
     """

@@ -1,7 +1,7 @@
 """Regions as other programs store them, polygons and run-length codes, drawn to pixels.
 
 One rule for all formats: x to the right, y down, px; the top-left pixel covers 0 to 1, and a pixel belongs to
-a polygon if its centre does.
+a polygon if its center does.
 So polygons that share an edge neither overlap nor leave a gap, which programs that also draw the boundary's
 pixels cannot say.
 Everything is checked when it is built, against the size of the image and before memory is taken; OutlineError
@@ -97,7 +97,7 @@ def _ring(ring: Sequence, size: tuple[int, int]) -> np.ndarray:
 
 def rectangle(corner: Sequence, opposite: Sequence, rotation: float, size: tuple[int, int]) -> Polygons:
     """A rectangle from two opposite corners, turned by `rotation` degrees (clockwise as seen) around its
-    centre.
+    center.
     """
     (x0, y0), (x1, y1) = numbers(corner), numbers(opposite)
     return polygons(
@@ -106,11 +106,11 @@ def rectangle(corner: Sequence, opposite: Sequence, rotation: float, size: tuple
     )
 
 
-def ellipse(centre: Sequence, radii: Sequence, rotation: float, size: tuple[int, int]) -> Polygons:
+def ellipse(center: Sequence, radii: Sequence, rotation: float, size: tuple[int, int]) -> Polygons:
     """An ellipse with half axes `radii` px, turned by `rotation` degrees (clockwise as seen) around its
-    centre.
+    center.
     """
-    (x, y), radii = numbers(centre), numbers(radii)
+    (x, y), radii = numbers(center), numbers(radii)
     if not (radii > 0).all() or (radii > 3 * max(size)).any():
         raise OutlineError("is an ellipse whose radii do not fit the image")
     num_points = max(16, math.ceil(math.pi / math.acos(1 - min(MAX_SAGITTA / radii.max(), 0.1))))
@@ -127,9 +127,9 @@ def ellipse(centre: Sequence, radii: Sequence, rotation: float, size: tuple[int,
     )
 
 
-def _turn(points: np.ndarray, centre: tuple[float, float], degrees: float) -> np.ndarray:
+def _turn(points: np.ndarray, center: tuple[float, float], degrees: float) -> np.ndarray:
     cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    return (points - centre) @ np.array([[cos, sin], [-sin, cos]]) + centre if degrees else points
+    return (points - center) @ np.array([[cos, sin], [-sin, cos]]) + center if degrees else points
 
 
 def runs(counts: Sequence, box: tuple[int, int, int, int], by_column: bool, size: tuple[int, int]) -> Runs:
@@ -182,7 +182,7 @@ def draw(outline: Polygons | Runs, size: tuple[int, int]) -> Patch:
 
 
 def _fill(ring: np.ndarray, height: int, width: int) -> np.ndarray:
-    """(height, width) bool: pixels whose centre lies inside. Every edge toggles, in each row it crosses, all
+    """(height, width) bool: pixels whose center lies inside. Every edge toggles, in each row it crosses, all
     pixels to the right of it.
     """
     toggles = np.zeros(height * (width + 1), np.uint8)

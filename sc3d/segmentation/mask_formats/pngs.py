@@ -1,8 +1,8 @@
-"""PNGs with one id or one colour per pixel, `<photo stem>.png`; values are taken exactly, nothing is guessed.
+"""PNGs with one id or one color per pixel, `<photo stem>.png`; values are taken exactly, nothing is guessed.
 
 Ids are those of the class table, or those of a mapping: then also 16-bit, such as ADE20K's and Cityscapes'.
-Colours are those of the class
-table or of a mapping; a colour between two classes, as JPEG and smooth scaling leave behind, is an error and
+Colors are those of the class
+table or of a mapping; a color between two classes, as JPEG and smooth scaling leave behind, is an error and
 not the nearest class.
 """
 
@@ -45,7 +45,7 @@ def read_png(file: Path, colored: bool, classes: Classes) -> np.ndarray:
 
 
 def is_colored(file: Path) -> bool:
-    """Whether a PNG holds colours rather than ids: a palette counts as ids, because that is how index masks
+    """Whether a PNG holds colors rather than ids: a palette counts as ids, because that is how index masks
     are made to be looked at.
 
     A damaged file decides nothing here: it is reported later, with all others.
@@ -71,7 +71,7 @@ def _read_colors(file: Path) -> np.ndarray:
     """(H, W) int32 0xRRGGBB; transparent pixels are black."""
     with open_image(file, "mask") as image:
         if image.mode in SIXTEEN_BIT:
-            raise InputError(f"{file} is a 16-bit grey PNG and has no colours: --format index is for ids")
+            raise InputError(f"{file} is a 16-bit gray PNG and has no colors: --format index is for ids")
         channels = np.array(image.convert("RGBA"))
     codes = channels[..., 0].astype(np.int32) << 16
     codes |= channels[..., 1].astype(np.int32) << 8
@@ -86,8 +86,8 @@ def _describe(file: Path, codes: np.ndarray, unknown: np.ndarray, colored: bool,
     where = "the class table" if classes.mapping is None else str(classes.origin)
     if colored:
         value, hint = (
-            f"the colour #{code:06x}",
-            ": colours are not guessed, save masks without smoothing and not as JPEG",
+            f"the color #{code:06x}",
+            ": colors are not guessed, save masks without smoothing and not as JPEG",
         )
     else:
         value, hint = (

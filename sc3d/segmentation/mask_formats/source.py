@@ -31,7 +31,7 @@ class MaskFiles:
 
     path: a folder, or a JSON or XML file
     format: auto, index, color, labelme, coco or cvat
-    mapping: JSON file of the ids, names or colours in them and the classes that they stand for
+    mapping: JSON file of the ids, names or colors in them and the classes that they stand for
     """
 
     path: Path

@@ -1,4 +1,4 @@
-"""Masks from a few strokes, without any model: a pixel classifier on colour and texture, cleaned by an
+"""Masks from a few strokes, without any model: a pixel classifier on color and texture, cleaned by an
 edge-aware filter.
 """
 
@@ -39,7 +39,7 @@ class StrokesSettings:
     radius: int = 16
     """Half width of the windows of the edge-aware filter, px at working size."""
     smoothing: float = 0.01
-    """Variance of grey values (0 to 1) that counts as an edge; larger smooths more."""
+    """Variance of gray values (0 to 1) that counts as an edge; larger smooths more."""
     members: int = 4
     """Networks and forests, each blind to some of the strokes, by which the others' certainty is judged."""
     trees: int = 60

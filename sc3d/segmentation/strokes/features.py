@@ -1,4 +1,4 @@
-"""Colour and texture of every pixel at several scales; nothing depends on position or orientation, so that
+"""Color and texture of every pixel at several scales; nothing depends on position or orientation, so that
 one photo teaches another.
 """
 
@@ -11,7 +11,7 @@ RADII = (1, 2, 4, 8, 16, 32)  # half widths of the windows, px of the photo at w
 TEXTURE_RADII = (2, 4, 8, 16, 32)
 TENSOR_RADII = (4, 12)
 EXTREME_RADII = (3, 9)
-DARK = 6.0  # added to grey values before ratios, so that noise in the dark does not look like colour
+DARK = 6.0  # added to gray values before ratios, so that noise in the dark does not look like color
 
 
 def pixel_features(image: np.ndarray) -> np.ndarray:
@@ -46,13 +46,13 @@ def _mean(plane: np.ndarray, radius: int) -> np.ndarray:
 
 def _deviation(plane: np.ndarray, radius: int) -> np.ndarray:
     """Local standard deviation, as a logarithm because contrasts multiply."""
-    centred = plane - plane.mean()  # else squares of float32 cancel
-    variance = _mean(centred * centred, radius) - _mean(centred, radius) ** 2
+    centered = plane - plane.mean()  # else squares of float32 cancel
+    variance = _mean(centered * centered, radius) - _mean(centered, radius) ** 2
     return 5 * np.log(np.sqrt(np.maximum(variance, 0)) + 0.5)
 
 
 def _band_energies(lightness: np.ndarray) -> list[np.ndarray]:
-    """Mean size of the differences between neighbouring scales: how coarse the texture is."""
+    """Mean size of the differences between neighboring scales: how coarse the texture is."""
     radii = RADII[:-1]
     levels = [lightness, *(_mean(lightness, radius) for radius in radii)]
     return [

@@ -1,10 +1,10 @@
-"""What a user drew on photos: strokes, polygons and colours, read, checked and painted at any size.
+"""What a user drew on photos: strokes, polygons and colors, read, checked and painted at any size.
 
 LabelMe JSON: shapes of type linestrip, line, point (with `"width": <px>`, which LabelMe keeps although it
 does not know it), polygon,
 rectangle and circle; coordinates in px from the upper left corner of the photo as it is stored; later shapes
 cover earlier ones.
-The label is the name of a class, or `_background_` for what belongs to no class. PNG: the colours of the
+The label is the name of a class, or `_background_` for what belongs to no class. PNG: the colors of the
 class table; black and
 transparent pixels say nothing. A photo may have both, the PNG below.
 """
@@ -86,7 +86,7 @@ def read_strokes(folder: Path, photos_folder: Path, class_table: ClassTable) -> 
     """Strokes of all photos that have some, ordered by photo.
 
     Raises InputError for a folder without strokes, files that belong to no photo, cannot be read or name
-    unknown classes or colours.
+    unknown classes or colors.
     """
     files = (
         sorted(
@@ -184,7 +184,7 @@ def _photo_of(file: Path, content: object, photos: dict[str, Path]) -> Path:
 
 
 def _read_picture(file: Path, size: tuple[int, int], class_table: ClassTable) -> np.ndarray:
-    """(H, W) int16 class ids of a PNG in the colours of the class table, NOTHING where it is black or
+    """(H, W) int16 class ids of a PNG in the colors of the class table, NOTHING where it is black or
     transparent.
     """
     check_mask_aspect(file, image_size(file), size)
@@ -201,7 +201,7 @@ def _read_picture(file: Path, size: tuple[int, int], class_table: ClassTable) ->
     unknown = [int(value) for value in values if int(value) not in ids]
     if unknown:
         raise InputError(
-            f"{file} has the colour #{unknown[0]:06x}, which is not in the class table: draw without smoothing, and not as JPEG"
+            f"{file} has the color #{unknown[0]:06x}, which is not in the class table: draw without smoothing, and not as JPEG"
         )
     return np.array([ids[int(value)] for value in values], np.int16)[places].reshape(codes.shape)
 
@@ -245,7 +245,7 @@ def _draw(shape: Shape, scale: np.ndarray, default_width: float, size: tuple[int
     elif shape.kind == "rectangle":
         (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
         points = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
-    # OpenCV counts from the centre of the first pixel
+    # OpenCV counts from the center of the first pixel
     fixed = [np.rint((points * scale - 0.5) * 2**_SHIFT).astype(np.int32)]
     if shape.kind in ("polygon", "rectangle", "circle"):
         cv2.fillPoly(canvas, fixed, 1, shift=_SHIFT)

@@ -1,6 +1,6 @@
 """Guided filter: probabilities are smoothed, but not across the edges of the photo.
 
-Source: He, Sun and Tang, "Guided image filtering" (2013), colour guide; the coefficients are found at a
+Source: He, Sun and Tang, "Guided image filtering" (2013), color guide; the coefficients are found at a
     reduced size and applied to the
 large photo, as in He and Sun, "Fast guided filter" (2015).
 """
@@ -15,8 +15,8 @@ import numpy as np
 
 
 class LocalLines(NamedTuple):
-    """One plane as a linear function of the colour around each pixel: (H, W, 3) float32 slope per unit of
-    grey value 0 to 1; (H, W) float32 offset.
+    """One plane as a linear function of the color around each pixel: (H, W, 3) float32 slope per unit of
+    gray value 0 to 1; (H, W) float32 offset.
     """
 
     slope: np.ndarray
@@ -30,7 +30,7 @@ class LocalLines(NamedTuple):
 
 
 def fit_lines(guide: np.ndarray, planes: np.ndarray, radius: int, smoothing: float) -> Iterator[LocalLines]:
-    """Fit each plane by the guide's colour in windows around every pixel.
+    """Fit each plane by the guide's color in windows around every pixel.
 
     guide: (H, W, 3) float32 0 to 1; planes: (H, W, C) float32
     radius: half width of the windows, px

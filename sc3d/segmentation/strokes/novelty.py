@@ -24,11 +24,11 @@ class _Space:
     """Where distances are measured: principal components, half whitened because the first say most, and what
     they leave over.
 
-    centre, scale: (F,) of the features; axes: (6, F) orthonormal; sizes: (6,) divisors; rest: divisor of the
+    center, scale: (F,) of the features; axes: (6, F) orthonormal; sizes: (6,) divisors; rest: divisor of the
         remainder
     """
 
-    centre: np.ndarray
+    center: np.ndarray
     scale: np.ndarray
     axes: np.ndarray
     sizes: np.ndarray
@@ -36,9 +36,9 @@ class _Space:
 
     def place(self, features: np.ndarray) -> np.ndarray:
         """(N, 7) places of (N, F) features; the last coordinate is the distance from the plane of the
-        components, where strange colours show.
+        components, where strange colors show.
         """
-        scaled = (features - self.centre) / self.scale
+        scaled = (features - self.center) / self.scale
         components = scaled @ self.axes.T
         rest = np.sqrt(np.maximum((scaled**2).sum(axis=1) - (components**2).sum(axis=1), 0))
         return np.concatenate([components / self.sizes, rest[:, None] / self.rest], axis=1)
@@ -85,13 +85,13 @@ def learn_novelty(features: np.ndarray, folds: np.ndarray) -> Novelty | None:
 
 
 def _fit(features: np.ndarray) -> _Space:
-    centre, scale = features.mean(axis=0), features.std(axis=0) + _UNIT
-    _, sizes, axes = np.linalg.svd((features - centre) / scale, full_matrices=False)
+    center, scale = features.mean(axis=0), features.std(axis=0) + _UNIT
+    _, sizes, axes = np.linalg.svd((features - center) / scale, full_matrices=False)
     space = _Space(
-        centre,
+        center,
         scale,
         axes[:_DIMENSIONS],
         np.sqrt(np.maximum(sizes[:_DIMENSIONS] / np.sqrt(len(features)), _UNIT)),
     )
     rest = max(float(space.place(features)[:, -1].std()), _UNIT)
-    return _Space(space.centre, space.scale, space.axes, space.sizes, rest)
+    return _Space(space.center, space.scale, space.axes, space.sizes, rest)

@@ -46,12 +46,12 @@ class Member:
 
 @dataclass(frozen=True)
 class PixelClassifier:
-    """The members, and how features are scaled for the networks. low, high, centre, scale: (F,) float32."""
+    """The members, and how features are scaled for the networks. low, high, center, scale: (F,) float32."""
 
     members: tuple[Member, ...]
     low: np.ndarray
     high: np.ndarray
-    centre: np.ndarray
+    center: np.ndarray
     scale: np.ndarray
 
     def probabilities(self, features: np.ndarray, member: int | None = None) -> np.ndarray:
@@ -68,7 +68,7 @@ class PixelClassifier:
         return np.concatenate(found).reshape(*features.shape[:-1], -1)
 
     def _classify(self, rows: np.ndarray, members: tuple[Member, ...]) -> np.ndarray:
-        scaled = torch.from_numpy((np.clip(rows, self.low, self.high) - self.centre) / self.scale)
+        scaled = torch.from_numpy((np.clip(rows, self.low, self.high) - self.center) / self.scale)
         with torch.inference_mode():
             by_networks = sum(member.network(scaled).softmax(dim=1) for member in members).numpy()
         by_forests = sum(member.forest.predict_proba(rows).astype(np.float32) for member in members)
@@ -84,8 +84,8 @@ def train(samples: Samples, num_members: int, num_trees: int, num_steps: int, se
         np.quantile(samples.features, share, axis=0).astype(np.float32) for share in (_CLIP, 1 - _CLIP)
     )
     clipped = np.clip(samples.features, low, high)
-    centre, scale = clipped.mean(axis=0), clipped.std(axis=0) + 1e-3
-    scaled, members = (clipped - centre) / scale, []
+    center, scale = clipped.mean(axis=0), clipped.std(axis=0) + 1e-3
+    scaled, members = (clipped - center) / scale, []
     for index in range(num_members):
         used = samples.folds != index
         codes = samples.codes[used]
@@ -99,7 +99,7 @@ def train(samples: Samples, num_members: int, num_trees: int, num_steps: int, se
             random_state=seed + index,
         )
         members.append(Member(network, forest.fit(samples.features[used], codes, weights)))
-    return PixelClassifier(tuple(members), low, high, centre, scale)
+    return PixelClassifier(tuple(members), low, high, center, scale)
 
 
 def _train_network(
@@ -109,18 +109,18 @@ def _train_network(
     with _one_thread(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = _network(scaled.shape[1], int(codes.max()) + 1)
-        optimiser = torch.optim.AdamW(network.parameters(), _RATE, weight_decay=1e-2)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, num_steps)
+        optimizer = torch.optim.AdamW(network.parameters(), _RATE, weight_decay=1e-2)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATE, num_steps)
         inputs, targets = torch.from_numpy(scaled), torch.from_numpy(codes)
         batches = torch.multinomial(torch.from_numpy(weights), num_steps * _BATCH, replacement=True).view(
             num_steps, _BATCH
         )
         for batch in batches:
-            optimiser.zero_grad()
+            optimizer.zero_grad()
             torch.nn.functional.cross_entropy(
                 network(inputs[batch]), targets[batch], label_smoothing=0.02
             ).backward()
-            optimiser.step()
+            optimizer.step()
             schedule.step()
     return network.eval()
 
@@ -146,7 +146,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def best_temperature(probabilities: np.ndarray, codes: np.ndarray) -> float:
-    """The exponent's inverse T for which p ** (1 / T), normalised, describes (N, C) probabilities of known
+    """The exponent's inverse T for which p ** (1 / T), normalized, describes (N, C) probabilities of known
     (N,) codes best; 1 if there are none.
 
     Source: Guo et al., "On calibration of modern neural networks" (2017).

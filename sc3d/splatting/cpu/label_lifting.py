@@ -1,7 +1,7 @@
 """Numba kernels: how much of each class every Gaussian shows in a view.
 
 The walk of `kernels_raster` with the same operations, hence the same fragments and weights; instead of
-compositing colours it sums the weights w
+compositing colors it sums the weights w
 of a fragment over the pixels of each class. A tile keeps one plane of mask weights per class that occurs in
 it, mostly one or two.
 """
@@ -63,7 +63,7 @@ def _lift_tile(
         minus_decay = splat(-records[base + 3])
         sums[:] = _ZERO
         for row in range(first_row, last_row + 1):
-            column, end, centre, peak = (
+            column, end, center, peak = (
                 np.int64(ends[row]),
                 np.int64(ends[TILE + row]),
                 lines[TILE + row],
@@ -75,7 +75,7 @@ def _lift_tile(
                 column += LANES
                 if not any_at_least(transmittance, limit):
                     continue
-                u = lane + splat(np.float32(column - LANES) - centre)
+                u = lane + splat(np.float32(column - LANES) - center)
                 exponent = fma(minus_decay * u, u, peak)
                 alpha = where_at_least(
                     exponent, low, where_at_least(transmittance, limit, minimum(exp2(exponent), high))

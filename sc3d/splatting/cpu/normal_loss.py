@@ -2,7 +2,7 @@
 
 `losses.normal_loss` with `losses.normals_from_depth` is the slow twin.
 
-With a, b the differences of the 4 neighbours' points across and down, m = b x a, n = m / |m| and residual
+With a, b the differences of the 4 neighbors' points across and down, m = b x a, n = m / |m| and residual
 signs s = sign(A n - N):
     dL/dm = (I - n n^T) (w A s) / |m|,   dL/da = dL/dm x b,   dL/db = a x dL/dm,   and each point is its depth
     times a fixed ray.
@@ -103,7 +103,7 @@ def _compare(normal, depth, alpha, edges, columns, rows, normal_slope, pulls, su
 
 @numba.njit(parallel=True, cache=True)
 def _gather(pulls, columns, rows, depth_slope):
-    """d loss / d depth: a point is the right end of its left neighbour's difference, and so on."""
+    """d loss / d depth: a point is the right end of its left neighbor's difference, and so on."""
     height, width = depth_slope.shape
     for i in numba.prange(height):
         for j in range(width):

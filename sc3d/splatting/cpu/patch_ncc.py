@@ -1,7 +1,7 @@
 """1 - NCC of patches warped by their planes, with its analytic gradient, as one kernel;
 `losses.patch_dissimilarity_reference` is the slow twin.
 
-A patch pixel with ray r (z = 1) lands at q = d R r - t (n . r), projected. With grey values a_p of the photo
+A patch pixel with ray r (z = 1) lands at q = d R r - t (n . r), projected. With gray values a_p of the photo
 and b_p sampled at q_p, and
 g_p = db_p / d(n, d), all sums that NCC and its gradient need are gathered in one pass:
     d NCC = sum_p [(a_p - mean a) / (P s) - NCC (b_p - mean b) / (P (var b + e))] g_p,   s = sqrt((var a +
@@ -16,33 +16,33 @@ import torch
 from torch import Tensor
 
 NOISE = 1 / 255**2
-"""variance of grey values that counts as noise"""
+"""variance of gray values that counts as noise"""
 
 
 def patch_dissimilarity(
-    normals: Tensor, distances: Tensor, pixels: Tensor, greys: tuple[Tensor, Tensor], cameras: np.ndarray
+    normals: Tensor, distances: Tensor, pixels: Tensor, grays: tuple[Tensor, Tensor], cameras: np.ndarray
 ) -> tuple[Tensor, Tensor]:
     """(M,) 1 - NCC, differentiable in `normals` (M, 3) and `distances` (M,); (M,) bool: both patches lie
     inside their images.
 
-    pixels: (M, 2) int64 column, row; greys: (H, W) and (h, w)
+    pixels: (M, 2) int64 column, row; grays: (H, W) and (h, w)
     cameras: (20,) fx fy cx cy of both views, R (9, row by row) and t (3) from the first to the second camera
         frame
     """
-    return _Patches.apply(normals, distances, pixels, greys, cameras)
+    return _Patches.apply(normals, distances, pixels, grays, cameras)
 
 
 class _Patches(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, normals, distances, pixels, greys, cameras):
+    def forward(ctx, normals, distances, pixels, grays, cameras):
         planes = torch.cat([normals.detach(), distances.detach()[:, None]], 1).numpy()
         values, inside = np.empty(len(planes), np.float32), np.empty(len(planes), np.bool_)
         slopes = np.empty((len(planes), 4), np.float32)
-        grey, other = (image.detach().contiguous().numpy() for image in greys)
+        gray, other = (image.detach().contiguous().numpy() for image in grays)
         _compare(
             planes,
             pixels.contiguous().numpy(),
-            grey,
+            gray,
             other,
             cameras.astype(np.float32),
             values,
@@ -61,7 +61,7 @@ class _Patches(torch.autograd.Function):
 
 
 @numba.njit(parallel=True, cache=True, fastmath=True)
-def _compare(planes, pixels, grey, other, camera, values, inside, slopes):
+def _compare(planes, pixels, gray, other, camera, values, inside, slopes):
     """Fill values, inside and slopes (d value / d (n, d)) patch by patch; a patch that leaves an image has
     value 1 and slope 0.
     """
@@ -69,14 +69,14 @@ def _compare(planes, pixels, grey, other, camera, values, inside, slopes):
         column, row = pixels[patch, 0], pixels[patch, 1]
         values[patch] = 1
         slopes[patch] = 0
-        within = 3 <= column < grey.shape[1] - 3 and 3 <= row < grey.shape[0] - 3
+        within = 3 <= column < gray.shape[1] - 3 and 3 <= row < gray.shape[0] - 3
         inside[patch] = within and _compare_one(
-            planes[patch], column, row, grey, other, camera, values[patch:], slopes[patch]
+            planes[patch], column, row, gray, other, camera, values[patch:], slopes[patch]
         )
 
 
 @numba.njit(cache=True, fastmath=True, inline="always")
-def _compare_one(plane, column, row, grey, other, camera, value, slope):
+def _compare_one(plane, column, row, gray, other, camera, value, slope):
     n0, n1, n2, distance = plane[0], plane[1], plane[2], plane[3]
     t0, t1, t2 = camera[17], camera[18], camera[19]
     one, half = np.float32(1), np.float32(0.5)
@@ -106,7 +106,7 @@ def _compare_one(plane, column, row, grey, other, camera, value, slope):
             other[top + 1, left],
             other[top + 1, left + 1],
         )
-        a, b = grey[i, j], (one - fv) * (b00 + fu * (b01 - b00)) + fv * (b10 + fu * (b11 - b10))
+        a, b = gray[i, j], (one - fv) * (b00 + fu * (b01 - b00)) + fv * (b10 + fu * (b11 - b10))
         c0 = ((one - fv) * (b01 - b00) + fv * (b11 - b10)) * camera[4] / q2
         c1 = ((one - fu) * (b10 - b00) + fu * (b11 - b01)) * camera[5] / q2
         c2 = -(c0 * p0 + c1 * p1)

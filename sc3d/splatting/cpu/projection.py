@@ -9,7 +9,7 @@ interval of a row at once.
 
 Record of a Gaussian, 16 float32 (64 bytes): mean x, y (px); m; a and h in units of 2^-x (times log2(e) / 2);
 log2 opacity; half extents in x and y
-(px) of the ellipse where alpha falls to 1/255; colour (3); normal (3) and plane distance, camera frame; dy of
+(px) of the ellipse where alpha falls to 1/255; color (3); normal (3) and plane distance, camera frame; dy of
 the right-most point of that ellipse.
 Arithmetic is float64 inside: far Gaussians of a large scene keep their place, and it costs nothing in scalar
 code.
@@ -169,9 +169,9 @@ def _covariance(axes, scales, j00, j11, j02, j12, rows):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _touches(centre, half, size):
-    """Whether [centre - half, centre + half] holds a pixel centre of 0.5, 1.5, ... size - 0.5; False for NaN."""
-    low, high = centre - half, centre + half
+def _touches(center, half, size):
+    """Whether [center - half, center + half] holds a pixel center of 0.5, 1.5, ... size - 0.5; False for NaN."""
+    low, high = center - half, center + half
     return (
         low <= size - 0.5
         and high >= 0.5
@@ -180,7 +180,7 @@ def _touches(centre, half, size):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _colour(sh, degree, i, basis, channel):
+def _color(sh, degree, i, basis, channel):
     value = 0.5
     for k in range((degree + 1) * (degree + 1)):
         value += basis[k] * sh[i, k, channel]
@@ -255,7 +255,7 @@ def _project_one(
     )
     records[i, 6], records[i, 7], records[i, 15] = half_x, half_y, half_x * sxy / sxx
     for k in range(3):
-        records[i, 8 + k] = max(_colour(sh, degree, i, basis, k), 0.0)
+        records[i, 8 + k] = max(_color(sh, degree, i, basis, k), 0.0)
         records[i, 11 + k] = sign * axes[k, axis]
     records[i, 14] = abs(facing)
     middle = 0.5 * (sxx + syy)
@@ -268,7 +268,7 @@ def project(means, log_scales, quats, opacity_logits, sh, degree, camera, order,
     image.
 
     camera: (25,) float64: rotation (9, row-major), translation (3), fx, fy, cx, cy, width, height, camera
-        centre (3), and the limits of
+        center (3), and the limits of
         x / z (2) and y / z (2) beyond which the Jacobian is that of the limit
     order: permutation of the chunks, for balance between threads
     """

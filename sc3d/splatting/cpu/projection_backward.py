@@ -14,7 +14,7 @@ from sc3d.splatting.cpu.projection import (
     _axes_cam,
     _basis,
     _basis_slopes,
-    _colour,
+    _color,
     _covariance,
     _jacobian,
     _mean_cam,
@@ -23,7 +23,7 @@ from sc3d.splatting.cpu.projection import (
 
 # sums over pixels in one raster gradient record; s = d loss / d ln(alpha), w = weight, g = d loss / d output
 # channel
-# s, s u, s u^2, s dy, s u dy, s dy^2, |ds/dx|, |ds/dy|, w g (colour 3, normal 3, plane distance), spare
+# s, s u, s u^2, s dy, s u dy, s dy^2, |ds/dx|, |ds/dy|, w g (color 3, normal 3, plane distance), spare
 SUMS = 16
 
 
@@ -47,7 +47,7 @@ def _plane_gradient(sums, axes, axis, x, y, z, grad_axes, grad_mean):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _colour_gradient(i, sums, means, sh, degree, camera, basis, slopes, grad_sh, grad_means):
+def _color_gradient(i, sums, means, sh, degree, camera, basis, slopes, grad_sh, grad_means):
     """Gradient of the SH coefficients, and of the mean through the viewing direction. Channels clamped at 0
     have none.
     """
@@ -59,7 +59,7 @@ def _colour_gradient(i, sums, means, sh, degree, camera, basis, slopes, grad_sh,
     gx, gy, gz = 0.0, 0.0, 0.0
     for channel in range(3):
         gradient = sums[8 + channel]
-        if _colour(sh, degree, i, basis, channel) < 0.0:
+        if _color(sh, degree, i, basis, channel) < 0.0:
             continue
         for k in range((degree + 1) * (degree + 1)):
             grad_sh[i, k, channel] = gradient * basis[k]
@@ -74,7 +74,7 @@ def _colour_gradient(i, sums, means, sh, degree, camera, basis, slopes, grad_sh,
 
 @numba.njit(cache=True, error_model="numpy")
 def _quat_gradient(i, quats, scale, g, grad_quats):
-    """Gradient of the unnormalised quaternion from g (3, 3), that of the rotation matrix; scale = 1 / |quat|."""
+    """Gradient of the unnormalized quaternion from g (3, 3), that of the rotation matrix; scale = 1 / |quat|."""
     w, x, y, z = quats[i, 0] * scale, quats[i, 1] * scale, quats[i, 2] * scale, quats[i, 3] * scale
     gw = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
     gx = 2 * (
@@ -214,7 +214,7 @@ def project_backward(
                         + camera[6 + row] * grad_axes[2, k]
                     )
             _quat_gradient(i, quats, scale, grad_rotation, grad_quats)
-            _colour_gradient(i, sums, means, sh, degree, camera, basis, slopes, grad_sh, grad_means)
+            _color_gradient(i, sums, means, sh, degree, camera, basis, slopes, grad_sh, grad_means)
             grad_opacity_logits[i] = sums[0] / (1.0 + math.exp(opacity_logits[i]))
             gradient[i] = math.hypot(screen[0] * camera[16] * 0.5, screen[1] * camera[17] * 0.5)
             absolute_gradient[i] = math.hypot(sums[6] * camera[16] * 0.5, sums[7] * camera[17] * 0.5)

@@ -39,7 +39,7 @@ from sc3d.splatting.cpu.tile_binning import ROOM, TILE, first_pixel, last_pixel
 
 MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4
-CHANNELS = 8  # colour 3, normal 3, plane distance, alpha
+CHANNELS = 8  # color 3, normal 3, plane distance, alpha
 STRIDE = TILE + LANES  # floats per row of a plane
 PLANE = TILE * STRIDE
 CHECK = 16  # instances between two checks whether a tile is finished
@@ -71,7 +71,7 @@ def finished(pixels):
 def measure_rows(records, base, origin_x, origin_y, rows, columns, lines, ends):
     """Where the ellipse of a record meets the 16 pixel rows of a tile; returns first and last row.
 
-    lines (3 * 16,): dy, centre - 0.5 (px, tile frame) and log2 alpha at the centre of each row
+    lines (3 * 16,): dy, center - 0.5 (px, tile frame) and log2 alpha at the center of each row
     ends (2 * 16,): first column and one past the last column of each row
     """
     mean_y, half_y = records[base + 1] - origin_y, records[base + 7]
@@ -83,14 +83,14 @@ def measure_rows(records, base, origin_x, origin_y, rows, columns, lines, ends):
     )
     for row in range(0, TILE, LANES):
         dy = ramp() + splat(np.float32(row) + _HALF - mean_y)
-        peak, centre = fma(minus_decay_y * dy, dy, log_opacity), fma(slope, dy, mean_x)
+        peak, center = fma(minus_decay_y * dy, dy, log_opacity), fma(slope, dy, mean_x)
         half = root(maximum((peak + splat(ROOM)) * inverse_decay, splat(_ZERO)))
         store(lines, row, dy)
-        store(lines, TILE + row, centre)
+        store(lines, TILE + row, center)
         store(lines, 2 * TILE + row, peak)
         limit = splat(np.float32(columns))
-        store_whole(ends, row, minimum(maximum(centre - half + splat(_CEIL), splat(_ZERO)), limit))
-        store_whole(ends, TILE + row, minimum(maximum(centre + half + splat(_ONE), splat(_ZERO)), limit))
+        store_whole(ends, row, minimum(maximum(center - half + splat(_CEIL), splat(_ZERO)), limit))
+        store_whole(ends, TILE + row, minimum(maximum(center + half + splat(_ONE), splat(_ZERO)), limit))
     return first_pixel(mean_y - half_y, rows), last_pixel(mean_y + half_y, rows - 1)
 
 
@@ -118,7 +118,7 @@ def _forward_tile(
         distance = splat(records[base + 14])
         weight, brightest = splat(_ZERO), splat(_ZERO)
         for row in range(first_row, last_row + 1):
-            column, end, centre, peak = (
+            column, end, center, peak = (
                 np.int64(ends[row]),
                 np.int64(ends[TILE + row]),
                 lines[TILE + row],
@@ -130,7 +130,7 @@ def _forward_tile(
                 if not any_at_least(transmittance, limit):
                     column += LANES
                     continue
-                u = lane + splat(np.float32(column) - centre)
+                u = lane + splat(np.float32(column) - center)
                 exponent = fma(minus_decay * u, u, peak)
                 alpha = where_at_least(
                     exponent, low, where_at_least(transmittance, limit, minimum(exp2(exponent), high))
@@ -156,12 +156,12 @@ def _forward_tile(
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def rasterise(records, ranks, instances, starts, order, background, geometry, image, contributions):
+def rasterize(records, ranks, instances, starts, order, background, geometry, image, contributions):
     """Composites all tiles.
 
     records: (M * 16,) in depth order; ranks, instances: (P,) tile by tile, starts (tiles + 1,); order:
         (tiles,) permutation, for balance
-    background: (3,); image: (8, H, W) filled with colour, normal, plane distance, alpha; contributions: (P,
+    background: (3,); image: (8, H, W) filled with color, normal, plane distance, alpha; contributions: (P,
         2), zero on entry
     """
     height, width = image.shape[1], image.shape[2]

@@ -56,7 +56,7 @@ def _backward_tile(
     (`kernels_backproject.SUMS`).
 
     pixels: planes transmittance; rest = sum_c g_c (output_c of the fragments still to come); g of alpha,
-        colour 3, normal 3, plane distance.
+        color 3, normal 3, plane distance.
     With t = transmittance in front of the fragment:  d loss / d ln(alpha) = w g.f - alpha / (1 - alpha)
     rest_behind,  w = alpha t.
     """
@@ -95,7 +95,7 @@ def _backward_tile(
         # m, a and h
         slope, to_x, to_y = records[base + 2], records[base + 3] / _SCALE, records[base + 4] / _SCALE
         for row in range(first_row, last_row + 1):
-            column, end, centre, peak = (
+            column, end, center, peak = (
                 np.int64(ends[row]),
                 np.int64(ends[TILE + row]),
                 lines[TILE + row],
@@ -110,7 +110,7 @@ def _backward_tile(
                 if not any_at_least(transmittance, limit):
                     column += LANES
                     continue
-                u = lane + splat(np.float32(column) - centre)
+                u = lane + splat(np.float32(column) - center)
                 exponent = fma(minus_decay * u, u, peak)
                 alpha = where_at_least(
                     exponent, low, where_at_least(transmittance, limit, minimum(exp2(exponent), high))
@@ -210,7 +210,7 @@ def _load_gradients(
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def rasterise_backward(
+def rasterize_backward(
     records,
     ranks,
     instances,
@@ -225,7 +225,7 @@ def rasterise_backward(
     grad_alpha,
     gradients,
 ):
-    """Reverse of `rasterise`: fills gradients (P * 16,), zero on entry, from d loss / d outputs.
+    """Reverse of `rasterize`: fills gradients (P * 16,), zero on entry, from d loss / d outputs.
 
     grad_color: (3, H, W); grad_normal (3, H, W) and grad_distance (H, W) are read only if `geometry`;
         grad_alpha: (H, W)

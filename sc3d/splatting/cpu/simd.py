@@ -1,7 +1,7 @@
-"""Eight float32 lanes as one numba value, so that kernels say themselves what is vectorised instead of hoping
+"""Eight float32 lanes as one numba value, so that kernels say themselves what is vectorized instead of hoping
 for LLVM.
 
-Only what the rasteriser and SSIM need. Everything maps to single LLVM instructions without fast-math flags:
+Only what the rasterizer and SSIM need. Everything maps to single LLVM instructions without fast-math flags:
 the same expression gives the same bits in every kernel, on which the agreement of forward and backward pass
 rests.
 """
@@ -81,7 +81,7 @@ def _shuffle(builder, a, b, order: list[int]):
 
 @intrinsic
 def load(typingctx, array, index):
-    """Eight neighbours of a flat contiguous float32 array from `index`; no bounds check, any alignment."""
+    """Eight neighbors of a flat contiguous float32 array from `index`; no bounds check, any alignment."""
 
     def codegen(context, builder, sig, args):
         return builder.load(_address(context, builder, sig.args[0], args[0], sig.args[1], args[1]), align=4)
@@ -91,7 +91,7 @@ def load(typingctx, array, index):
 
 @intrinsic
 def store(typingctx, array, index, value):
-    """Write eight neighbours of a flat contiguous float32 array from `index`; no bounds check, any alignment."""
+    """Write eight neighbors of a flat contiguous float32 array from `index`; no bounds check, any alignment."""
 
     def codegen(context, builder, sig, args):
         builder.store(

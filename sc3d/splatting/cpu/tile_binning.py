@@ -23,7 +23,7 @@ _HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0.0), np.float32(1.0)
 
 @numba.njit(cache=True, error_model="numpy")
 def first_pixel(low, limit):
-    """Smallest pixel index >= 0 whose centre is >= low, at most limit."""
+    """Smallest pixel index >= 0 whose center is >= low, at most limit."""
     place = min(max(low - _HALF, _ZERO), np.float32(limit))
     whole = np.int64(place)
     # math.ceil would be a library call in the innermost loops
@@ -32,7 +32,7 @@ def first_pixel(low, limit):
 
 @numba.njit(cache=True, error_model="numpy")
 def last_pixel(high, limit):
-    """Largest pixel index <= limit whose centre is <= high, at least -1."""
+    """Largest pixel index <= limit whose center is <= high, at least -1."""
     return np.int64(min(max(high + _HALF, _ZERO), np.float32(limit) + _ONE)) - 1
 
 
@@ -46,7 +46,7 @@ def _tile_rows(record, height):
 
 @numba.njit(cache=True, error_model="numpy")
 def _tile_columns(record, tile_row, width, height):
-    """First and last tile column that the ellipse touches between the first and last pixel centre of a tile
+    """First and last tile column that the ellipse touches between the first and last pixel center of a tile
     row; empty if first > last.
     """
     mean_y, half_y, extreme = record[1], record[7], record[15]

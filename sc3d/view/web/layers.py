@@ -13,23 +13,23 @@ import numpy as np
 
 from sc3d.geometry.cameras import View, undistorted
 from sc3d.scene.class_table import ClassTable
-from sc3d.view.colors import Colouring
+from sc3d.view.colors import Coloring
 from sc3d.view.display_cloud import ShownCloud
-from sc3d.view.display_splats import SPLAT_COLOURINGS, ShownSplats
+from sc3d.view.display_splats import SPLAT_COLORINGS, ShownSplats
 from sc3d.view.screenshot import LINE_COLOR
 from sc3d.view.web.orbit_camera import field_of_view, orientation
 
 if TYPE_CHECKING:
     import viser
 
-_COVER = 0.9  # half side of a drawn point, in point spacings: neighbours overlap a little
+_COVER = 0.9  # half side of a drawn point, in point spacings: neighbors overlap a little
 _LINE_WIDTH = 2.0  # px
 _SPLAT_UNIT, _LARGEST_HALF = 4.0, 6e4  # of the median splat; covariance that a 16-bit float can hold
 _SEEING_COLOR = (0, 158, 115)  # of cameras that see the picked point
 
 
 class CloudLayer:
-    """The first points of a cloud, in chunks: what is added, hidden or recoloured is sent once, and the rest
+    """The first points of a cloud, in chunks: what is added, hidden or recolored is sent once, and the rest
     stays in the browser.
 
     root: name of its node in the scene tree; node /ROOT/CLASS holds the chunks of a class
@@ -40,7 +40,7 @@ class CloudLayer:
         server: viser.ViserServer,
         shown: ShownCloud,
         root: str,
-        by: Colouring,
+        by: Coloring,
         hidden: set[int] = frozenset(),
     ) -> None:
         self._scene, self._shown, self._by, self._relief, self._scale = server.scene, shown, by, True, 1.0
@@ -73,7 +73,7 @@ class CloudLayer:
                 self._chunks.append(self._add_chunk(len(self._chunks)))
             self.resize(self._scale)
 
-    def color_by(self, by: Colouring, relief: bool = True) -> None:
+    def color_by(self, by: Coloring, relief: bool = True) -> None:
         """Show another attribute. relief: shaded, where the cloud has normals"""
         with self._lock:
             self._by, self._relief, colors = by, relief, self._shown.colors(by, relief)
@@ -129,7 +129,7 @@ class SplatLayer:
         server: viser.ViserServer,
         load: Callable[[], ShownSplats],
         shown: ShownCloud,
-        by: Colouring,
+        by: Coloring,
         hidden: set[int] = frozenset(),
     ) -> None:
         """load: reads them; shown: has the frame of the viewer and the class table"""
@@ -139,8 +139,8 @@ class SplatLayer:
         self._nodes: dict[int, tuple[np.ndarray, viser.GaussianSplatHandle]] = {}
         self._lock = threading.RLock()
 
-    def color_by(self, by: Colouring) -> None:
-        """Class colours or confidences where there are labels; else the photos'."""
+    def color_by(self, by: Coloring) -> None:
+        """Class colors or confidences where there are labels; else the photos'."""
         with self._lock:
             self._by = by
             if self._splats is not None:
@@ -188,7 +188,7 @@ class SplatLayer:
             self._nodes[present] = rows, handle
 
     def _colors(self) -> np.ndarray:
-        labelled = self._splats.label is not None and self._by in SPLAT_COLOURINGS
+        labelled = self._splats.label is not None and self._by in SPLAT_COLORINGS
         return self._splats.colors(self._by if labelled else "photo", self._shown.class_table)
 
 
@@ -210,7 +210,7 @@ class CameraLayer:
                 thickness_units="screen",
                 color=LINE_COLOR,
                 wxyz=orientation(view),
-                position=view.centre,
+                position=view.center,
                 variant="filled",
             )
             handle.scale = depth / handle.compute_canonical_frustum_size()[2]
@@ -233,7 +233,7 @@ class CameraLayer:
             handle.visible = name != hidden
 
     def mark(self, names: Sequence[str]) -> None:
-        """Another colour for these cameras, and for no others."""
+        """Another color for these cameras, and for no others."""
         for name, handle in self._handles.items():
             handle.color = _SEEING_COLOR if name in names else LINE_COLOR
 

@@ -33,10 +33,10 @@ class OrbitPose:
         +z unless the view is straight down
         """
         forward, image_up = view.cam_from_world[2, :3], -view.cam_from_world[1, :3]
-        towards = float((np.asarray(middle, np.float64) - view.centre) @ forward)
-        distance = towards if towards > 0 else float(np.linalg.norm(middle - view.centre)) or 1.0
+        towards = float((np.asarray(middle, np.float64) - view.center) @ forward)
+        distance = towards if towards > 0 else float(np.linalg.norm(middle - view.center)) or 1.0
         up = np.array([0.0, 0.0, 1.0]) if upright and abs(forward[2]) < 0.99 else image_up
-        return cls(view.centre, view.centre + distance * forward, up, field_of_view(undistorted(view))[0])
+        return cls(view.center, view.center + distance * forward, up, field_of_view(undistorted(view))[0])
 
     @property
     def distance(self) -> float:

@@ -21,7 +21,7 @@ from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
 from sc3d.scene.scene import Scene
-from sc3d.view.colors import Colouring
+from sc3d.view.colors import Coloring
 from sc3d.view.display_cloud import ShownCloud
 from sc3d.view.display_splats import ShownSplats
 from sc3d.view.picking import Inspector
@@ -55,7 +55,7 @@ class WebView:
     inspector: has the cloud, the class table and all views
     load_splats: reads the Gaussians, None = there are none; splats_first: they are shown instead of the cloud
         at the start, and in a file
-    by: colouring at the start; classes: ids shown at the start, None = all; cameras: draw them
+    by: coloring at the start; classes: ids shown at the start, None = all; cameras: draw them
     photo: name of the photo to look at and through at the start; from_above: straight down at the start;
         num_points: 0 = a default
     """
@@ -64,7 +64,7 @@ class WebView:
     inspector: Inspector
     load_splats: Callable[[], ShownSplats] | None = None
     splats_first: bool = False
-    by: Colouring = "label"
+    by: Coloring = "label"
     classes: set[int] | None = None
     cameras: bool = True
     photo: str | None = None
@@ -121,13 +121,13 @@ def serve(view: WebView, host: str, port: int) -> None:
 
 
 def write_page(path: Path, view: WebView) -> None:
-    """Write a page that opens from disk, without a server: every colouring of the cloud as a node of its own
+    """Write a page that opens from disk, without a server: every coloring of the cloud as a node of its own
     that can be switched on and off.
     """
     shown = _shown(view)
     with _server(LOCAL, 0) as server:
         hidden = _hidden(view, shown)
-        for by in (view.by, *(other for other in shown.colourings if other != view.by)):
+        for by in (view.by, *(other for other in shown.colorings if other != view.by)):
             layer = CloudLayer(server, shown, f"cloud by {by}", by, hidden)
             layer.show_points(min(len(shown.points), view.num_points or FILE_POINTS))
             layer.show(by == view.by and not view.splats_first)
@@ -183,7 +183,7 @@ def _shown(view: WebView) -> ShownCloud:
     points = view.inspector.cloud.point.positions
     views = view.inspector.views
     middle = (
-        np.median([one.centre for one in views], axis=0)
+        np.median([one.center for one in views], axis=0)
         if views
         else points[: max(1, len(points) // 2)].cpu().numpy().mean(axis=0)
     )
@@ -200,7 +200,7 @@ def _start(server: viser.ViserServer, view: WebView, shown: ShownCloud, views: l
     """
     points = without_outliers(shown.points.astype(np.float64))
     above = aerial_view(
-        np.concatenate([points, *(one.centre[None] for one in views)]), _WINDOW, view.from_above
+        np.concatenate([points, *(one.center[None] for one in views)]), _WINDOW, view.from_above
     )
     home = OrbitPose.of(above, shown.middle, upright=True)
     photo = next((one for one in views if one.name == view.photo), None)

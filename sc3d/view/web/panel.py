@@ -13,7 +13,7 @@ import numpy as np
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View
 from sc3d.scene.scene import Scene
-from sc3d.view.colors import Colouring, color_scale, legend_entries
+from sc3d.view.colors import Coloring, color_scale, legend_entries
 from sc3d.view.display_cloud import ShownCloud
 from sc3d.view.picking import Inspector, PickedPoint, point_on_ray
 from sc3d.view.web.layers import CameraLayer, CloudLayer, SplatLayer
@@ -46,9 +46,9 @@ class Page:
 
 
 class ShowPanel:
-    """What is shown: cloud or splats, colouring with its legend, classes, number and size of points, cameras."""
+    """What is shown: cloud or splats, coloring with its legend, classes, number and size of points, cameras."""
 
-    def __init__(self, page: Page, by: Colouring, hidden: set[int], splats_first: bool) -> None:
+    def __init__(self, page: Page, by: Coloring, hidden: set[int], splats_first: bool) -> None:
         self._page, self.hidden, gui = page, set(hidden), page.server.gui
         with gui.add_folder("Show"):
             if page.splats is not None:
@@ -57,14 +57,14 @@ class ShowPanel:
                 )
                 layers.on_update(lambda _: self._choose_layers(layers.value))
                 self._choose_layers(layers.value)
-            self._by = gui.add_dropdown("Colour by", page.shown.colourings, initial_value=by)
+            self._by = gui.add_dropdown("Color by", page.shown.colorings, initial_value=by)
             self._legend = gui.add_html(legend_html(by, page.shown))
             has_relief = page.shown.has_relief
             self._relief = gui.add_checkbox(
                 "relief",
                 has_relief,
                 visible=has_relief,
-                hint="light from the north-west; not on photo colours",
+                hint="light from the north-west; not on photo colors",
             )
             for handle in (self._by, self._relief):
                 handle.on_update(lambda _: self._color())
@@ -203,9 +203,9 @@ class PointPanel:
         self._text.content = point_html(picked)
 
 
-def legend_html(by: Colouring, shown: ShownCloud) -> str:
-    """What the colours mean, as HTML: swatches of classes and states, or a colour scale; empty for photo
-    colours.
+def legend_html(by: Coloring, shown: ShownCloud) -> str:
+    """What the colors mean, as HTML: swatches of classes and states, or a color scale; empty for photo
+    colors.
     """
     scale = color_scale(by)
     if scale is not None:

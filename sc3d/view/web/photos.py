@@ -21,7 +21,7 @@ _OPACITY = 0.6  # of a mask over its photo
 
 @dataclass(frozen=True)
 class PhotoPictures:
-    """photo: (H, W, 3) uint8 RGB, None if the file is missing; mask: the class colours over it, None without
+    """photo: (H, W, 3) uint8 RGB, None if the file is missing; mask: the class colors over it, None without
     a mask; note: what is missing, or "".
     """
 
@@ -48,7 +48,7 @@ def photo_pictures(scene: Scene, view: View, table: ClassTable | None, max_size:
 
 
 def overlay(photo: np.ndarray | None, labels: np.ndarray, table: ClassTable) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: class colours over a photo of the same size, which stays as it is where there is
+    """(H, W, 3) uint8 RGB: class colors over a photo of the same size, which stays as it is where there is
     no label; None: on white.
 
     photo: (H, W, 3) uint8; labels: (H, W) uint8

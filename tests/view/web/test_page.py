@@ -56,7 +56,7 @@ class Visit(NamedTuple):
         return decoded(self.page.screenshot())
 
     def share(self, color: list[int]) -> float:
-        """Of the pixels at the left that have exactly this colour."""
+        """Of the pixels at the left that have exactly this color."""
         return float((self.picture[LEFT] == color).all(axis=-1).mean())
 
     def is_still(self) -> bool:
@@ -133,7 +133,7 @@ def served(scene: Scene, browser: object) -> Iterator[Visit]:
     from sc3d.view.web.page import WebView, serving
 
     with serving(WebView(scene, inspector_of(scene))) as address, visit(browser, address) as found:
-        found.page.get_by_text("Colour by", exact=True).wait_for()
+        found.page.get_by_text("Color by", exact=True).wait_for()
         # viser's remark on software rendering lies over the cameras
         found.page.locator(".mantine-Notification-closeButton").click()
         yield found
@@ -146,7 +146,7 @@ def opened(served: Visit) -> Iterator[Visit]:
     served.page.get_by_role("button", name="Overview").click()
     served.wait_for(
         lambda: served.share(ROAD) > 0.05 and served.share(GRASS) > 0.05 and served.is_still(),
-        "road and grass in their own colours",
+        "road and grass in their own colors",
     )
     yield served
     assert served.errors == []
@@ -167,11 +167,11 @@ def in_canvas(page: object, pose: OrbitPose, fov: float | None = None) -> tuple[
 
 def home_of(scene: Scene) -> tuple[OrbitPose, ShownCloud]:
     """The pose that the page starts with, and the cloud in its frame."""
-    centres = np.array([view.centre for view in views()])
+    centers = np.array([view.center for view in views()])
     shown = ShownCloud.of(
-        inspector_of(scene).cloud, np.round(np.median(centres, axis=0)), scene.class_table()
+        inspector_of(scene).cloud, np.round(np.median(centers, axis=0)), scene.class_table()
     )
-    points = np.concatenate([without_outliers(shown.points.astype(np.float64)), centres - shown.origin])
+    points = np.concatenate([without_outliers(shown.points.astype(np.float64)), centers - shown.origin])
     return OrbitPose.of(aerial_view(points, (1600, 1000)), shown.middle, upright=True), shown
 
 
@@ -181,7 +181,7 @@ def click_camera(page: object, scene: Scene, name: str) -> None:
     local = [view.shifted(shown.origin) for view in scene.model.views]
     window, corner = in_canvas(page, home)
     view = next(one for one in local if one.name == name)
-    target = view.centre + 0.6 * frustum_depth(local, shown.points) * view.cam_from_world[2, :3]
+    target = view.center + 0.6 * frustum_depth(local, shown.points) * view.cam_from_world[2, :3]
     page.mouse.click(*(corner + project(window, target[None])[0][0]))
 
 
@@ -221,17 +221,17 @@ def test_clicked_camera_shows_its_photo_and_mask_and_is_looked_through(scene, op
 
 
 def agreement(picture: np.ndarray, page: object, view: View) -> float:
-    """Share of the pixels of road and grass that show what a photo's camera sees there, with its centre in
+    """Share of the pixels of road and grass that show what a photo's camera sees there, with its center in
     the middle; 0 if there are few.
     """
     forward = view.cam_from_world[2, :3]
     pose = OrbitPose(
-        view.centre, view.centre + forward, -view.cam_from_world[1, :3], field_of_view(undistorted(view))[0]
+        view.center, view.center + forward, -view.cam_from_world[1, :3], field_of_view(undistorted(view))[0]
     )
     window, corner = in_canvas(page, pose)
     left, top = corner.astype(int)
     directions, _ = rays(window)
-    hits = view.centre + directions * (-(view.centre[2] - ORIGIN[2]) / directions[:, 2])[:, None] - ORIGIN
+    hits = view.center + directions * (-(view.center[2] - ORIGIN[2]) / directions[:, 2])[:, None] - ORIGIN
     part = picture[top : top + window.height, left : left + window.width].reshape(-1, 3)
     is_road, is_grass = ((part == color).all(axis=1) for color in (ROAD, GRASS))
     right = np.where(hits[:, 0] < 0, is_road, is_grass) & (np.abs(hits[:, :2]).max(axis=1) < 4.2)
@@ -320,7 +320,7 @@ def test_file_opens_from_disk_and_sorts_splats_by_depth(scene, browser, tmp_path
     splats = two_layers()
     view = WebView(
         scene,
-        Inspector(splats.centres(), scene.model.views, scene.class_table(), scene.mesh),
+        Inspector(splats.centers(), scene.model.views, scene.class_table(), scene.mesh),
         lambda: splats,
         splats_first=True,
         cameras=False,
@@ -339,7 +339,7 @@ def test_file_opens_from_disk_and_sorts_splats_by_depth(scene, browser, tmp_path
         assert not [text for text in found.errors if "computeBoundingSphere" not in text]
 
 
-def test_file_holds_every_colouring(scene, tmp_path):
+def test_file_holds_every_coloring(scene, tmp_path):
     pytest.importorskip("viser", reason="the viewer in the browser needs viser: pip install 'sc3d[web]'")
     main(
         [

@@ -166,7 +166,7 @@ def test_frusta_lie_where_the_cameras_are(scene):
         layer.mark(["photo_1.jpg"])
         for view in views():
             handle = server.scene._handle_from_node_name[f"/cameras/{Path(view.name).stem}"]
-            assert np.allclose(handle.position, view.centre - ORIGIN, atol=1e-6) and np.allclose(
+            assert np.allclose(handle.position, view.center - ORIGIN, atol=1e-6) and np.allclose(
                 np.abs(handle.wxyz @ orientation(view)), 1
             )
             assert np.isclose(handle.scale * handle.compute_canonical_frustum_size()[2], 2.0)
@@ -271,7 +271,7 @@ def test_missing_viser_says_how_to_install_it(scene, monkeypatch, capfd):
         (["--web", "--classes", "house"], "choose from road, grass"),
         (["--web", "--port", "70000"], "65535"),
         (["--web", "--splats", "--by", "disagreement"], "splats have no disagreement"),
-        (["--web", "--by", "photo"], "no photo colours"),
+        (["--web", "--by", "photo"], "no photo colors"),
     ],
 )
 def test_options_that_do_not_fit_are_one_line(scene, options, message, capfd):
