@@ -209,7 +209,7 @@ class _Relief:
     high: np.ndarray
 
     @classmethod
-    def of(cls, vertices: np.ndarray, views: list[View]) -> _Relief:
+    def from_vertices(cls, vertices: np.ndarray, views: list[View]) -> _Relief:
         up = -np.sum([view.cam_from_world[2, :3] for view in views], axis=0)
         axes = np.linalg.svd(up[None])[2][[1, 2, 0]]
         axes[2] *= np.sign(axes[2] @ up)
@@ -279,7 +279,7 @@ class _DepthMaps:
     def trust(self, mesh: o3d.t.geometry.TriangleMesh) -> None:
         """Take what the views see of a mesh for sure."""
         surface = _surface(mesh)
-        self.relief = _Relief.of(mesh.vertex.positions.numpy(), self.data.views)
+        self.relief = _Relief.from_vertices(mesh.vertex.positions.numpy(), self.data.views)
         for row, view in enumerate(self.data.views):
             first = first_surface(surface, view)
             np.save(

@@ -22,7 +22,7 @@ class Confusion:
     counts: np.ndarray
 
     @classmethod
-    def of(cls, truth: np.ndarray, predicted: np.ndarray, num_ids: int) -> Confusion:
+    def from_labels(cls, truth: np.ndarray, predicted: np.ndarray, num_ids: int) -> Confusion:
         """Count the pixels whose truth is not 0. truth, predicted: uint8 arrays of one shape."""
         judged = truth > 0
         flat = truth[judged].astype(np.int64) * num_ids + predicted[judged]
@@ -79,7 +79,7 @@ def total(parts: Iterable[Confusion], num_ids: int) -> Confusion:
 
 
 @dataclass(frozen=True)
-class JudgedPixels:
+class EvaluationPixels:
     """The P pixels that have truth, and the cloud point that each of them shows: found once, then every
     labelling of the cloud is judged by a look-up.
 
@@ -92,7 +92,7 @@ class JudgedPixels:
     band: np.ndarray
 
     @classmethod
-    def of(cls, truth: np.ndarray, rows: np.ndarray, band: np.ndarray) -> JudgedPixels:
+    def from_photo(cls, truth: np.ndarray, rows: np.ndarray, band: np.ndarray) -> EvaluationPixels:
         """One photo. truth: (H, W) uint8, 0 = not judged; rows: (H, W) int32 as `nearest_points` returns
         them; band: (H, W) bool.
         """
@@ -100,7 +100,7 @@ class JudgedPixels:
         return cls(truth[judged], rows[judged].astype(np.int32), band[judged])
 
     @classmethod
-    def joined(cls, parts: list[JudgedPixels]) -> JudgedPixels:
+    def concatenate(cls, parts: list[EvaluationPixels]) -> EvaluationPixels:
         """All pixels of several photos, in order."""
         return cls(
             *(np.concatenate([getattr(part, name) for part in parts]) for name in ("truth", "rows", "band"))
@@ -156,7 +156,7 @@ class Reliability:
     ece: float
 
     @classmethod
-    def of_sums(cls, confidence: np.ndarray, right: np.ndarray, count: np.ndarray) -> Reliability:
+    def from_sums(cls, confidence: np.ndarray, right: np.ndarray, count: np.ndarray) -> Reliability:
         """From the sum of confidences, the number of right samples and of all samples in each bin (B,)."""
         some, total = np.where(count > 0, count, np.nan), count.sum()
         mean, accuracy = confidence / some, right / some
@@ -164,7 +164,7 @@ class Reliability:
         return cls(mean, accuracy, count, ece)
 
     @classmethod
-    def total(cls, parts: list[Reliability]) -> Reliability:
+    def merge(cls, parts: list[Reliability]) -> Reliability:
         """Of all samples of several parts, one at least."""
         count = sum(part.count for part in parts)
         sums = (
@@ -174,7 +174,7 @@ class Reliability:
             )
             for name in ("confidence", "accuracy")
         )
-        return cls.of_sums(*sums, count)
+        return cls.from_sums(*sums, count)
 
     def summary(self) -> dict[str, object]:
         """JSON-ready figures; None for an empty bin."""
@@ -193,7 +193,7 @@ def reliability(confidence: np.ndarray, right: np.ndarray, bins: int = 10) -> Re
         raise ValueError("confidences must lie in [0, 1]")
     row = np.minimum((np.asarray(confidence, np.float64) * bins).astype(np.int64), bins - 1)
     count = np.bincount(row, minlength=bins)
-    return Reliability.of_sums(
+    return Reliability.from_sums(
         np.bincount(row, confidence, minlength=bins),
         np.bincount(row, np.asarray(right, np.float64), minlength=bins),
         count,

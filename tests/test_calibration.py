@@ -25,9 +25,9 @@ def test_right_as_often_as_said_is_calibrated_and_boasting_is_not():
     assert reliability(np.sqrt(confidence), right).ece > 0.1
     parts = [reliability(confidence[rows], right[rows]) for rows in np.array_split(np.arange(len(right)), 3)]
     np.testing.assert_allclose(
-        Reliability.total(parts).accuracy, reliability(confidence, right).accuracy, rtol=1e-12
+        Reliability.merge(parts).accuracy, reliability(confidence, right).accuracy, rtol=1e-12
     )
-    assert Reliability.total(parts).ece == pytest.approx(reliability(confidence, right).ece, abs=1e-12)
+    assert Reliability.merge(parts).ece == pytest.approx(reliability(confidence, right).ece, abs=1e-12)
     assert reliability(confidence[order], right[order]).ece == pytest.approx(
         reliability(confidence, right).ece, abs=1e-12
     )

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from sc3d.metrics import Confusion, JudgedPixels, depth_edge_band, total
+from sc3d.metrics import Confusion, EvaluationPixels, depth_edge_band, total
 
 
 def test_hand_made_matrix():
     truth = np.uint8([1, 1, 1, 1, 2, 2, 3, 3, 0, 0])
     predicted = np.uint8([1, 1, 2, 0, 2, 1, 3, 3, 1, 0])  # the last two pixels are not judged
-    confusion = Confusion.of(truth, predicted, 5)
+    confusion = Confusion.from_labels(truth, predicted, 5)
     expected = np.zeros((5, 5), int)
     expected[1, 1], expected[1, 2], expected[1, 0], expected[2, 2], expected[2, 1], expected[3, 3] = (
         2,
@@ -38,7 +38,7 @@ def test_against_scikit_learn():
     predicted = np.where(rng.uniform(size=truth.shape) < 0.7, truth, rng.integers(1, 5, truth.shape)).astype(
         np.uint8
     )
-    parts = [Confusion.of(truth[rows], predicted[rows], 5) for rows in (slice(0, 20), slice(20, 50))]
+    parts = [Confusion.from_labels(truth[rows], predicted[rows], 5) for rows in (slice(0, 20), slice(20, 50))]
     confusion = total(parts, 5)
     flat = truth.ravel(), predicted.ravel()
     np.testing.assert_array_equal(confusion.counts[1:, 1:], metrics.confusion_matrix(*flat))
@@ -49,9 +49,9 @@ def test_against_scikit_learn():
 
 def test_perfect_prediction_is_exactly_one_and_no_truth_is_nan():
     truth = np.random.default_rng(0).integers(0, 4, (30, 30)).astype(np.uint8)
-    perfect = Confusion.of(truth, truth, 4)
+    perfect = Confusion.from_labels(truth, truth, 4)
     assert perfect.accuracy == perfect.mean_iou == perfect.coverage == 1.0
-    assert np.isnan(Confusion.of(np.zeros((3, 3), np.uint8), truth[:3, :3], 4).accuracy)
+    assert np.isnan(Confusion.from_labels(np.zeros((3, 3), np.uint8), truth[:3, :3], 4).accuracy)
 
 
 def test_band_follows_a_depth_step():
@@ -75,7 +75,7 @@ def test_judged_pixels_equal_the_confusion_of_images():
                 rng.uniform(size=shape) < 0.3,
             )
         )
-    pixels = JudgedPixels.joined([JudgedPixels.of(*photo) for photo in photos])
+    pixels = EvaluationPixels.concatenate([EvaluationPixels.from_photo(*photo) for photo in photos])
     near, elsewhere = pixels.confusions(pixels.look_up(label), 4)
     images = [
         (truth, np.where(rows >= 0, label[rows], 0).astype(np.uint8), band) for truth, rows, band in photos
@@ -83,7 +83,7 @@ def test_judged_pixels_equal_the_confusion_of_images():
     for confusion, inside in ((near, True), (elsewhere, False)):
         expected = total(
             (
-                Confusion.of(np.where(band == inside, truth, 0), predicted, 4)
+                Confusion.from_labels(np.where(band == inside, truth, 0), predicted, 4)
                 for truth, predicted, band in images
             ),
             4,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from sc3d.exporters.regions import cells_by_number, connected_cells, disk, neighbors, renumbered
-from sc3d.geometry.raster import Grid, highest_points
+from sc3d.geometry.raster import Raster, highest_points
 
 CLOSING, OPENING = 0.6, 0.5  # gaps and strips narrower than about twice this vanish, m
 SMOOTHING = 0.4  # standard deviation of the Gaussian that evens the border out, m
@@ -25,7 +25,7 @@ TOP = 0.98  # quantile of the roof that is its height: the ridge without single 
 
 
 def roof_heights(
-    points: np.ndarray, is_building: np.ndarray, above_ground: np.ndarray, grid: Grid
+    points: np.ndarray, is_building: np.ndarray, above_ground: np.ndarray, grid: Raster
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cells that a roof covers, also under overhanging crowns, and its height there.
 
@@ -64,7 +64,7 @@ def close_roofs(covered: np.ndarray, pixel: float) -> np.ndarray:
     return ndimage.binary_opening(smooth, opening)[margin:-margin, margin:-margin]
 
 
-def split_buildings(covered: np.ndarray, heights: np.ndarray, grid: Grid, min_area: float) -> np.ndarray:
+def split_buildings(covered: np.ndarray, heights: np.ndarray, grid: Raster, min_area: float) -> np.ndarray:
     """(H, W) int32 number of the building in each cell from 1, 0 = none: connected cells without a step
     between them.
 

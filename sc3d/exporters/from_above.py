@@ -11,7 +11,7 @@ import open3d as o3d
 
 from sc3d.exporters.projected_cloud import PlacedCloud
 from sc3d.geometry.neighbors import NeighborIndex
-from sc3d.geometry.raster import Grid, close_gaps, highest_points, spacing_of_all
+from sc3d.geometry.raster import Raster, close_gaps, highest_points, spacing_of_all
 from sc3d.geometry.raycast import Surface
 from sc3d.io.clouds import read_mesh
 from sc3d.scene.labelled_cloud import REACH
@@ -31,7 +31,7 @@ class FromAbove:
         CRS
     """
 
-    grid: Grid
+    grid: Raster
     points: np.ndarray
     highest: np.ndarray
     surface: Surface | None
@@ -40,7 +40,7 @@ class FromAbove:
     reach: float
 
     @classmethod
-    def build(cls, scene: Scene, placed: PlacedCloud, grid: Grid) -> FromAbove:
+    def build(cls, scene: Scene, placed: PlacedCloud, grid: Raster) -> FromAbove:
         """The scene's mesh where there is one; the highest point of each cell where it has holes or does not
         exist.
         """

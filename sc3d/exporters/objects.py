@@ -15,7 +15,7 @@ from sc3d.exporters.regions import cells_by_number
 from sc3d.exporters.terrain import ground_height
 from sc3d.exporters.trees import canopy_height, split_crowns
 from sc3d.exporters.vector_files import MapObject, has_geopackage, shapely, write_geojson, write_geopackage
-from sc3d.geometry.raster import Grid, spacing_of_all
+from sc3d.geometry.raster import Raster, spacing_of_all
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
@@ -67,7 +67,7 @@ def find_objects(placed: PlacedCloud, table: ClassTable, settings: Export) -> di
     kinds = split_kinds(placed.labels.label, table)
     points = placed.points * placed.placement.unit  # all lengths below are meters
     pixel = max(CELL * spacing_of_all(points), MIN_CELL)
-    grid = Grid.around(points, pixel)
+    grid = Raster.around(points, pixel)
     ground = ground_height(points, kinds.ground, grid)
     above = points[:, 2] >= ground.ravel()[grid.flat_cells(points)] + settings.min_height
     covered, roofs = roof_heights(points, kinds.building, above, grid)

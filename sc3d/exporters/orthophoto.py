@@ -11,7 +11,7 @@ from tqdm import tqdm
 from sc3d.exporters.from_above import FromAbove
 from sc3d.exporters.packages import load
 from sc3d.exporters.projected_cloud import PlacedCloud, read_placed_cloud
-from sc3d.geometry.raster import Grid, spacing_of_all
+from sc3d.geometry.raster import Raster, spacing_of_all
 from sc3d.io.atomic import atomic_path
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
@@ -41,7 +41,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
         settings.pixel_size
         or round_to_digit(spacing_of_all(placed.points) * unit * (1 if scene.mesh.exists() else 2))
     ) / unit
-    grid = Grid.around(placed.points, pixel)
+    grid = Raster.around(placed.points, pixel)
     above = FromAbove.build(scene, placed, grid)
     table = scene.class_table()
     color, classes, names, height = outputs(scene, settings)
@@ -122,7 +122,7 @@ def _colors(placed: PlacedCloud, rows: np.ndarray) -> np.ndarray:
     return image
 
 
-def _open(file: Path, placed: PlacedCloud, grid: Grid, **profile: object):
+def _open(file: Path, placed: PlacedCloud, grid: Raster, **profile: object):
     """Rasterio's writer."""
     transform = transforms.from_origin(grid.left, grid.top, grid.pixel, grid.pixel)
     crs = placed.placement.crs

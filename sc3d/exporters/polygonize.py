@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from sc3d.exporters.packages import load
-from sc3d.geometry.raster import Grid
+from sc3d.geometry.raster import Raster
 
 features, transforms, shapely = load("rasterio.features"), load("rasterio.transform"), load("shapely")
 
@@ -16,7 +16,7 @@ AGREEMENT = 0.9  # IoU that a rectangular outline must have with the traced one,
 Side = tuple[int, float, float]  # axis that is constant along it (0 = x), its value there, its length
 
 
-def trace(regions: np.ndarray, grid: Grid) -> dict[int, shapely.Polygon]:
+def trace(regions: np.ndarray, grid: Raster) -> dict[int, shapely.Polygon]:
     """The outline of each region, in the coordinates of the grid; of regions in several pieces that touch at
     corners at most, the largest piece.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from sc3d.geometry.raster import Grid, interpolate
+from sc3d.geometry.raster import Raster, interpolate
 
 CELL = 2.0  # side of the blocks whose median is the ground, m
 # ground that stands out of the lowest of this surrounding by more than STEP is a mislabelled roof or crown, m
@@ -14,13 +14,13 @@ STEP = 1.5
 SUPPORT = 0.25  # blocks with less than this share of the usual number of ground points rest on strays
 
 
-def ground_height(points: np.ndarray, is_ground: np.ndarray, grid: Grid) -> np.ndarray:
+def ground_height(points: np.ndarray, is_ground: np.ndarray, grid: Raster) -> np.ndarray:
     """(H, W) float64 height of the ground at the cell centers of `grid`, m: block medians, interpolated
     across gaps.
 
     points: (N, 3) CRS in m; is_ground: (N,) bool, at least one True
     """
-    blocks = Grid.around(_corners(grid), CELL)
+    blocks = Raster.around(_corners(grid), CELL)
     ground = points[is_ground]
     cells = blocks.flat_cells(ground)
     count = np.bincount(cells, minlength=blocks.height * blocks.width).reshape(blocks.shape)
@@ -54,7 +54,7 @@ def _stands_out(medians: np.ndarray, known: np.ndarray) -> np.ndarray:
     return known & (medians > opened + STEP)
 
 
-def _corners(grid: Grid) -> np.ndarray:
+def _corners(grid: Raster) -> np.ndarray:
     return np.array(
         [[grid.left, grid.top], [grid.left + grid.width * grid.pixel, grid.top - grid.height * grid.pixel]]
     )

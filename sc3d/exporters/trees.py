@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from sc3d.exporters.regions import disk, renumbered
-from sc3d.geometry.raster import Grid, close_gaps, highest_points
+from sc3d.geometry.raster import Raster, close_gaps, highest_points
 
 GAP = 0.5  # gaps of the canopy narrower than about twice this are filled, m
 SMOOTHING = 0.4  # standard deviation of the Gaussian that joins the lobes of a crown, m
@@ -14,7 +14,7 @@ UNDER = 0.5  # tree points this far below the top of their cell are not canopy, 
 MIN_CROWN = 2.0  # m2
 
 
-def canopy_height(points: np.ndarray, is_tree: np.ndarray, ground: np.ndarray, grid: Grid) -> np.ndarray:
+def canopy_height(points: np.ndarray, is_tree: np.ndarray, ground: np.ndarray, grid: Raster) -> np.ndarray:
     """(H, W) float64 height of the canopy above the ground, m; NaN where nothing or something else is on top.
 
     points: (N, 3) m; is_tree: (N,) bool; ground: (H, W) z of the ground, m
@@ -25,7 +25,7 @@ def canopy_height(points: np.ndarray, is_tree: np.ndarray, ground: np.ndarray, g
     return np.where(rows >= 0, points[rows, 2] - ground, np.nan)
 
 
-def split_crowns(canopy: np.ndarray, grid: Grid, min_height: float) -> np.ndarray:
+def split_crowns(canopy: np.ndarray, grid: Raster, min_height: float) -> np.ndarray:
     """(H, W) int32 number of the tree in each cell, 0 = none: the watershed of the smoothed canopy around its
     tops.
 

@@ -21,7 +21,7 @@ NUM_RADII = 400  # samples along the image diagonal on which a lens is compared 
 
 
 @dataclass(frozen=True)
-class Lens:
+class DistortionModel:
     """A lens model.
 
     width, height: px; focal: (fx, fy) px; principal: (cx, cy) px; skew: px per unit of y
@@ -62,7 +62,7 @@ class Lens:
         return np.polynomial.polynomial.polyval(radius**2, (1.0, *self.radial))
 
 
-def to_camera(lens: Lens, tolerance: float, where: str) -> pycolmap.Camera:
+def to_camera(distortion: DistortionModel, tolerance: float, where: str) -> pycolmap.Camera:
     """COLMAP camera of a lens, of the simplest model that holds it.
 
     tolerance: largest error, px, that may come from what no COLMAP model has. InputError beyond it; `where`:
@@ -70,80 +70,90 @@ def to_camera(lens: Lens, tolerance: float, where: str) -> pycolmap.Camera:
     """
     values = np.array(
         [
-            lens.width,
-            lens.height,
-            *lens.focal,
-            *lens.principal,
-            *lens.radial,
-            *lens.tangential,
-            lens.skew,
-            *lens.prism,
+            distortion.width,
+            distortion.height,
+            *distortion.focal,
+            *distortion.principal,
+            *distortion.radial,
+            *distortion.tangential,
+            distortion.skew,
+            *distortion.prism,
         ]
     )
-    if not np.isfinite(values).all() or min(lens.width, lens.height, *lens.focal) <= 0:
+    if not np.isfinite(values).all() or min(distortion.width, distortion.height, *distortion.focal) <= 0:
         raise InputError(f"{where}: size and focal length must be positive, all parameters finite numbers")
-    if max(lens.width, lens.height) > MAX_SIDE or lens.width * lens.height > MAX_PIXELS:
+    if (
+        max(distortion.width, distortion.height) > MAX_SIDE
+        or distortion.width * distortion.height > MAX_PIXELS
+    ):
         raise InputError(
-            f"{where} is {lens.width}x{lens.height}: sizes up to {MAX_PIXELS // 10**6} megapixels are possible"
+            f"{where} is {distortion.width}x{distortion.height}: sizes up to {MAX_PIXELS // 10**6} megapixels are possible"
         )
-    lens = replace(lens, radial=tuple(np.trim_zeros(lens.radial, "b")))
-    lost = abs(lens.skew) * max(lens.principal[1], lens.height - lens.principal[1]) / lens.focal[1]
+    distortion = replace(distortion, radial=tuple(np.trim_zeros(distortion.radial, "b")))
+    lost = (
+        abs(distortion.skew)
+        * max(distortion.principal[1], distortion.height - distortion.principal[1])
+        / distortion.focal[1]
+    )
     if lost > tolerance:
         raise InputError(
-            f"{where}: pixels that are not rectangular (skew {lens.skew:.3g} px) have no COLMAP model; leaving that out costs up to {lost:.2g} px: "
+            f"{where}: pixels that are not rectangular (skew {distortion.skew:.3g} px) have no COLMAP model; leaving that out costs up to {lost:.2g} px: "
             f"optimize the cameras without it, export undistorted photos, or allow it with --tolerance {_ceiling(lost)}"
         )
-    model, params = (_fisheye if lens.fisheye else _perspective)(lens, tolerance, where)
+    model, params = (_fisheye if distortion.fisheye else _perspective)(distortion, tolerance, where)
     return pycolmap.Camera(
-        model=model, width=lens.width, height=lens.height, params=[*lens.focal, *lens.principal, *params]
+        model=model,
+        width=distortion.width,
+        height=distortion.height,
+        params=[*distortion.focal, *distortion.principal, *params],
     )
 
 
-def _perspective(lens: Lens, tolerance: float, where: str) -> tuple[str, list[float]]:
-    if any(lens.prism):
+def _perspective(distortion: DistortionModel, tolerance: float, where: str) -> tuple[str, list[float]]:
+    if any(distortion.prism):
         raise InputError(
             f"{where}: a thin prism on a perspective lens has no COLMAP model: export undistorted photos"
         )
-    if not lens.radial and not any(lens.tangential):
+    if not distortion.radial and not any(distortion.tangential):
         return "PINHOLE", []
-    radial = [*lens.radial, 0.0, 0.0, 0.0]
-    if len(lens.radial) <= 2:
-        return "OPENCV", [*radial[:2], *lens.tangential]
-    rational = [*radial[2:3], 0.0, 0.0, 0.0] if len(lens.radial) == 3 else None
+    radial = [*distortion.radial, 0.0, 0.0, 0.0]
+    if len(distortion.radial) <= 2:
+        return "OPENCV", [*radial[:2], *distortion.tangential]
+    rational = [*radial[2:3], 0.0, 0.0, 0.0] if len(distortion.radial) == 3 else None
     if rational is None:
-        radial, rational = _rational(lens, tolerance, where)
-    return "FULL_OPENCV", [*radial[:2], *lens.tangential, *rational]
+        radial, rational = _rational(distortion, tolerance, where)
+    return "FULL_OPENCV", [*radial[:2], *distortion.tangential, *rational]
 
 
-def _rational(lens: Lens, tolerance: float, where: str) -> tuple[list[float], list[float]]:
+def _rational(distortion: DistortionModel, tolerance: float, where: str) -> tuple[list[float], list[float]]:
     """FULL_OPENCV's k1, k2 and k3..k6 for a polynomial of higher degree: (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1
     + k4 r^2 + k5 r^4 + k6 r^6).
     """
-    radius = lens.radii()
-    factor, powers = lens.factor(radius), (radius[:, None] / radius[-1]) ** [2, 4, 6]
+    radius = distortion.radii()
+    factor, powers = distortion.factor(radius), (radius[:, None] / radius[-1]) ** [2, 4, 6]
     weight = radius[:, None] * np.hstack([powers, -factor[:, None] * powers])
     found, *_ = np.linalg.lstsq(weight, radius * (factor - 1), rcond=1e-14)
     found = found / np.tile(radius[-1] ** np.array([2, 4, 6]), 2)
     squares = radius**2
     top, bottom = (np.polynomial.polynomial.polyval(squares, (1.0, *part)) for part in (found[:3], found[3:]))
-    lost = float(np.max(np.abs(radius * (top / bottom - factor))) * max(lens.focal))
+    lost = float(np.max(np.abs(radius * (top / bottom - factor))) * max(distortion.focal))
     if not lost <= tolerance:
         raise InputError(
-            f"{where}: a radial polynomial up to r^{2 * len(lens.radial)} has no COLMAP model, and the nearest one is up to {lost:.2g} px off: "
+            f"{where}: a radial polynomial up to r^{2 * len(distortion.radial)} has no COLMAP model, and the nearest one is up to {lost:.2g} px off: "
             f"optimize the cameras without k4, export undistorted photos, or allow it with --tolerance {_ceiling(lost)}"
         )
     return list(found[:2]), list(found[2:])
 
 
-def _fisheye(lens: Lens, tolerance: float, where: str) -> tuple[str, list[float]]:
-    radial = [*lens.radial, *6 * [0.0]]
-    if len(lens.radial) <= 4 and not any(lens.tangential) and not any(lens.prism):
+def _fisheye(distortion: DistortionModel, tolerance: float, where: str) -> tuple[str, list[float]]:
+    radial = [*distortion.radial, *6 * [0.0]]
+    if len(distortion.radial) <= 4 and not any(distortion.tangential) and not any(distortion.prism):
         return "OPENCV_FISHEYE", radial[:4]
-    if len(lens.radial) <= 4:
-        return "THIN_PRISM_FISHEYE", [*radial[:2], *lens.tangential, *radial[2:4], *lens.prism]
-    if len(lens.radial) > 6 or any(lens.tangential) or any(lens.prism):
+    if len(distortion.radial) <= 4:
+        return "THIN_PRISM_FISHEYE", [*radial[:2], *distortion.tangential, *radial[2:4], *distortion.prism]
+    if len(distortion.radial) > 6 or any(distortion.tangential) or any(distortion.prism):
         raise InputError(
-            f"{where}: this fisheye (radial terms up to r^{2 * len(lens.radial)} with tangential ones) has no COLMAP model: export undistorted photos"
+            f"{where}: this fisheye (radial terms up to r^{2 * len(distortion.radial)} with tangential ones) has no COLMAP model: export undistorted photos"
         )
     return "RAD_TAN_THIN_PRISM_FISHEYE", [*radial[:6], *6 * [0.0]]
 

@@ -19,7 +19,7 @@ MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.
 
 
 @dataclass(frozen=True)
-class Grid:
+class Raster:
     """`height` x `width` cells with sides of `pixel` m; row 0 is the northernmost, column 0 the westernmost.
     left, top: outer edges, CRS, m.
     """
@@ -31,7 +31,7 @@ class Grid:
     width: int
 
     @classmethod
-    def around(cls, points: np.ndarray, pixel: float) -> Grid:
+    def around(cls, points: np.ndarray, pixel: float) -> Raster:
         """The smallest grid that holds the (N, >= 2) points, CRS; edges are multiples of `pixel`, so that
         grids of neighboring scenes align.
 
@@ -92,7 +92,7 @@ def spacing_of_all(points: np.ndarray) -> float:
     return float(f"{point_spacing(distances) or 1.0:.3g}")
 
 
-def highest_points(grid: Grid, points: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
+def highest_points(grid: Raster, points: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
     """(H, W) int64 row of the highest point in each cell; -1 = none. Equal heights are decided by x, then y,
     not by the order of the points.
 

@@ -29,7 +29,7 @@ FLAT = 0.75
 FIXED = 1 << 20  # products of unit normals as integers
 
 
-class VoxelField:
+class LabelGrid:
     """Counts of C channels for every voxel side.
 
     grid: VoxelBlockGrid with attribute `votes` (blocks, 8, 8, 8, SIDES * C) int32
@@ -47,12 +47,12 @@ class VoxelField:
         )
 
     @classmethod
-    def around(cls, points: np.ndarray, voxel_size: float, num_channels: int) -> VoxelField:
+    def around(cls, points: np.ndarray, voxel_size: float, num_channels: int) -> LabelGrid:
         """An empty field with all blocks that hold one of the (N, 3) points."""
-        return cls.over(sort_by_voxel(points, voxel_size), num_channels)
+        return cls.from_voxels(sort_by_voxel(points, voxel_size), num_channels)
 
     @classmethod
-    def over(cls, sorting: VoxelOrder, num_channels: int) -> VoxelField:
+    def from_voxels(cls, sorting: VoxelOrder, num_channels: int) -> LabelGrid:
         """An empty field with all blocks of points that are sorted already."""
         keys = sorting.keys // VOXELS
         blocks = _unpack(keys[np.flatnonzero(np.diff(keys, prepend=-1))])
@@ -100,7 +100,7 @@ class VoxelField:
             else votes[:0]
         )
 
-    def merge(self, other: VoxelField) -> None:
+    def merge(self, other: LabelGrid) -> None:
         """Add the counts of another field of the same origin, voxel size and channels."""
         if (other.voxel_size, other.num_channels) != (self.voxel_size, self.num_channels) or (
             other.origin != self.origin

@@ -20,7 +20,7 @@ import pyproj
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.geometry.distortion import Lens, to_camera
+from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.georeferencing.alignment import Similarity, fit_similarity
 from sc3d.georeferencing.georeference import Georeference, crs_to_geodetic, from_origin, geodetic_to_enu
 from sc3d.importers.project import Project, rigid
@@ -118,7 +118,7 @@ def _calibration(sensor: ElementTree.Element) -> ElementTree.Element | None:
     )
 
 
-def _lens(sensor: ElementTree.Element, path: Path) -> Lens:
+def _lens(sensor: ElementTree.Element, path: Path) -> DistortionModel:
     where, calibration = f"{path}, sensor {sensor.get('label')!r}", _calibration(sensor)
     kind = calibration.get("type") or sensor.get("type", "frame")
     if kind != "frame" and kind not in FISHEYE:
@@ -144,7 +144,7 @@ def _lens(sensor: ElementTree.Element, path: Path) -> Lens:
         if "f" in values
         else (values["cx"], values["cy"])
     )
-    return Lens(
+    return DistortionModel(
         width,
         height,
         (focal + stretch, focal),

@@ -14,7 +14,7 @@ import pycolmap
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.geometry.distortion import Lens, to_camera
+from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.importers.project import Project, rigid
 from sc3d.io.clouds import read_cloud
 from sc3d.io.images import image_size
@@ -50,9 +50,9 @@ def read(path: Path, settings: Import) -> Project:
         matrix = _matrix(frame.get("transform_matrix"), where)
         world_from_cam = original[:3, :3] @ matrix[:3, :3] * OPENGL
         center = original[:3, :3] @ (matrix[:3, 3] / scale) + original[:3, 3]
-        lens = _lens(content, frame, file.parent / name, where)
-        camera = cameras.setdefault(lens, None) or to_camera(lens, settings.tolerance, where)
-        cameras[lens] = camera
+        distortion = _lens(content, frame, file.parent / name, where)
+        camera = cameras.setdefault(distortion, None) or to_camera(distortion, settings.tolerance, where)
+        cameras[distortion] = camera
         views.append(View(_tidy(name), camera, rigid(world_from_cam.T, center, where)))
     points, colors = _points(file.parent, content, original, scale)
     return Project(
@@ -65,7 +65,7 @@ def read(path: Path, settings: Import) -> Project:
     )
 
 
-def _lens(content: dict, frame: dict, photo: Path, where: str) -> Lens:
+def _lens(content: dict, frame: dict, photo: Path, where: str) -> DistortionModel:
     """Parameters of a frame: those at the top of the file count first, as in nerfstudio."""
 
     def number(key: str, default: float | None = None) -> float | None:
@@ -92,7 +92,7 @@ def _lens(content: dict, frame: dict, photo: Path, where: str) -> Lens:
         listed if listed is not None else [number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
     )
     fisheye = model == "OPENCV_FISHEYE"
-    return Lens(
+    return DistortionModel(
         int(width),
         int(height),
         (focal, number("fl_y", focal)),

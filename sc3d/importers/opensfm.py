@@ -19,7 +19,7 @@ import pycolmap
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.geometry.distortion import Lens, to_camera
+from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.georeferencing.control_points import parse_crs
 from sc3d.georeferencing.georeference import Georeference, from_origin
 from sc3d.importers.project import Project, rigid
@@ -116,7 +116,7 @@ def _folder(path: Path) -> Path | None:
     )
 
 
-def _lens(camera: dict, where: str) -> Lens:
+def _lens(camera: dict, where: str) -> DistortionModel:
     kind = camera.get("projection_type", "perspective")
     if kind not in PERSPECTIVE | FISHEYE:
         raise InputError(
@@ -145,7 +145,7 @@ def _lens(camera: dict, where: str) -> Lens:
         raise InputError(
             f"{where}: a thin prism of the fourth order has no COLMAP model: undistort the photos first"
         )
-    return Lens(
+    return DistortionModel(
         width,
         height,
         tuple(focal),

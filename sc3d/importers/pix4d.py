@@ -15,7 +15,7 @@ import pyproj
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.geometry.distortion import Lens, to_camera
+from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.georeferencing.georeference import Georeference
 from sc3d.importers.project import Project, rigid
 from sc3d.settings.reconstruction import Import
@@ -54,13 +54,13 @@ def read(path: Path, settings: Import) -> Project:
         raise InputError(
             f"{file} is cut off or of another layout: {LINES} lines per photo are expected after the header, {len(body)} lines are there"
         )
-    cameras: dict[Lens, object] = {}
+    cameras: dict[DistortionModel, object] = {}
     views = []
     for start in range(0, len(body), LINES):
-        name, lens, rotation, center = _block(body[start : start + LINES], file)
-        if lens not in cameras:
-            cameras[lens] = to_camera(lens, settings.tolerance, f"{file}, {name}")
-        views.append(View(name, cameras[lens], rigid(rotation, center, f"{file}, {name}")))
+        name, distortion, rotation, center = _block(body[start : start + LINES], file)
+        if distortion not in cameras:
+            cameras[distortion] = to_camera(distortion, settings.tolerance, f"{file}, {name}")
+        views.append(View(name, cameras[distortion], rigid(rotation, center, f"{file}, {name}")))
     return Project("pix4d", views, georeference=_georeference(file), notes={"read": file.name})
 
 
@@ -88,7 +88,7 @@ def _header_length(lines: list[tuple[int, str]], file: Path) -> int:
     return found[0] + 1
 
 
-def _block(lines: list[tuple[int, str]], file: Path) -> tuple[str, Lens, np.ndarray, np.ndarray]:
+def _block(lines: list[tuple[int, str]], file: Path) -> tuple[str, DistortionModel, np.ndarray, np.ndarray]:
     """Name, lens, rotation (3, 3) and center (3,) of a photo."""
     name, *size = lines[0][1].rsplit(maxsplit=2)
     try:
@@ -114,7 +114,7 @@ def _block(lines: list[tuple[int, str]], file: Path) -> tuple[str, Lens, np.ndar
             f"{file}, line {lines[0][0]}: name, width and height, then K [3x3], distortion [3] and [2], position [3] and rotation [3x3] "
             "are expected"
         ) from None
-    lens = Lens(
+    distortion = DistortionModel(
         width,
         height,
         (float(matrix[0, 0]), float(matrix[1, 1])),
@@ -123,7 +123,7 @@ def _block(lines: list[tuple[int, str]], file: Path) -> tuple[str, Lens, np.ndar
         tuple(tangential.tolist()),
         skew=float(matrix[0, 1]),
     )
-    return name, lens, rotation, center
+    return name, distortion, rotation, center
 
 
 def _place_files(file: Path) -> tuple[Path, Path]:

@@ -17,9 +17,9 @@ from tqdm import tqdm
 
 from sc3d.geometry.cameras import View, may_see
 from sc3d.geometry.raycast import RayTarget, first_surface
-from sc3d.geometry.voxels import VoxelField, voxel_origin
-from sc3d.labelling.voting import Ballot, open_ballot
-from sc3d.labelling.voting_kernels import SCALE, Picture, Rules
+from sc3d.geometry.voxels import LabelGrid, voxel_origin
+from sc3d.labelling.voting import VoteAccumulator, open_accumulator
+from sc3d.labelling.voting_kernels import SCALE, Observation, VoteWeighting
 from sc3d.scene.labels import LOCKED, SEED, UNLOCKED, UNSEEN, Labels
 from sc3d.settings.labels import Label
 
@@ -51,10 +51,10 @@ class Extent:
     middle: np.ndarray
 
     @classmethod
-    def of(cls, points: np.ndarray) -> Extent:
+    def from_points(cls, points: np.ndarray) -> Extent:
         """points: (N, 3) world."""
         low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
-        return cls(low, high, middle_of(count_steps(points, low, high), low, high))
+        return cls(low, high, histogram_median(count_steps(points, low, high), low, high))
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Cloud:
 
     @property
     def extent(self) -> Extent:
-        return self.whole or Extent.of(self.points)
+        return self.whole or Extent.from_points(self.points)
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Fusion:
     """
 
     labels: Labels
-    field: VoxelField
+    field: LabelGrid
     cells: np.ndarray
 
     @property
@@ -110,13 +110,13 @@ def fuse(
     if settings.method == "paper":
         settings = replace(settings, **AS_PRINTED)
     extent = cloud.extent
-    ballot, field = open_ballot(
+    ballot, field = open_accumulator(
         cloud, voxel_origin(extent.low, settings.voxel_size), settings.voxel_size, num_ids
     )
-    rules = _rules(extent.middle, views, settings)
+    rules = _weighting(extent.middle, views, settings)
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     views = [view for view in views if may_see(view, low, high)]
-    pictures = _pictures(views, read_mask, surface if settings.depth_filter else None, settings)
+    pictures = _observations(views, read_mask, surface if settings.depth_filter else None, settings)
     for view, picture in tqdm(pictures, desc="voting", unit="view", total=len(views), disable=None):
         ballot.cast(view, picture, rules)
     labels = _decide(ballot, settings)
@@ -142,19 +142,19 @@ def count_steps(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.nda
     )
 
 
-def middle_of(counts: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def histogram_median(counts: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """(3,) median position from the counts of `count_steps`."""
     below = np.cumsum(counts, axis=1)
     step = (below < (below[:, -1:] + 1) // 2).sum(axis=1)
     return low + (step + 0.5) / MIDDLE_STEPS * (high - low)
 
 
-def _rules(middle: np.ndarray, views: list[View], settings: Label) -> Rules:
+def _weighting(middle: np.ndarray, views: list[View], settings: Label) -> VoteWeighting:
     reference_depth = (
         float(np.median([np.linalg.norm(view.center - middle) for view in views])) if views else 1.0
     )
     equal = settings.method in ("direct", "majority")
-    return Rules(
+    return VoteWeighting(
         settings.voxel_size,
         reference_depth,
         settings.depth_excess,
@@ -165,19 +165,19 @@ def _rules(middle: np.ndarray, views: list[View], settings: Label) -> Rules:
     )
 
 
-def _pictures(
+def _observations(
     views: list[View], read_mask: Callable[[View], Mask], surface: RayTarget | None, settings: Label
-) -> Iterator[tuple[View, Picture]]:
+) -> Iterator[tuple[View, Observation]]:
     """Views in the order of their names, at the size of their masks, with what they say; the next one is
     prepared meanwhile.
     """
     ordered = sorted(views, key=lambda view: view.name)
 
-    def prepare(view: View) -> tuple[View, Picture]:
+    def prepare(view: View) -> tuple[View, Observation]:
         mask, confidence = read_mask(view)
         sized = view.resized(mask.shape[1], mask.shape[0])
         ranges = np.empty((0, 0), np.float32) if surface is None else first_surface(surface, sized).range
-        return sized, picture_of(
+        return sized, observe(
             mask, confidence if settings.use_confidence else None, edge_distance(mask), ranges, settings
         )
 
@@ -192,9 +192,9 @@ def _pictures(
                 yield ready
 
 
-def picture_of(
+def observe(
     mask: np.ndarray, confidence: np.ndarray | None, edge: np.ndarray, ranges: np.ndarray, settings: Label
-) -> Picture:
+) -> Observation:
     """Weight of each mask pixel: confidence x distance to the mask's edges.
 
     mask: (H, W) uint8; confidence: (H, W) uint8 or None; edge: (H, W) float32 px; ranges: (H, W) float32 or
@@ -203,7 +203,7 @@ def picture_of(
     weights = np.ones(mask.shape, np.float32) if confidence is None else confidence * np.float32(1 / 255)
     if settings.edge_width > 0:
         weigh_distance(edge, distance_weights(settings.edge_width), weights)
-    return Picture(mask, weights, edge >= settings.edge_width, ranges)
+    return Observation(mask, weights, edge >= settings.edge_width, ranges)
 
 
 def distance_weights(width: float) -> np.ndarray:
@@ -245,7 +245,7 @@ def edge_distance(mask: np.ndarray) -> np.ndarray:
     return cv2.distanceTransform((~differs).astype(np.uint8), cv2.DIST_L2, 5) + np.float32(0.5)
 
 
-def _decide(ballot: Ballot, settings: Label) -> Labels:
+def _decide(ballot: VoteAccumulator, settings: Label) -> Labels:
     """Winner, conflict, reset, lock and unlock per cell, once all views have voted; then per point."""
     num_views = ballot.to_points(ballot.votes[:, 0])
     if settings.method == "direct":

@@ -33,7 +33,7 @@ class Masks:
     views: list[View]
 
     @classmethod
-    def of(cls, scene: Scene, confidence: Path | None) -> Masks:
+    def load(cls, scene: Scene, confidence: Path | None) -> Masks:
         """Masks of a scene, and confidence maps in a folder if it exists, all checked; InputError for what
         does not fit.
         """

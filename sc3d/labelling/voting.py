@@ -14,15 +14,22 @@ import numba
 import numpy as np
 
 from sc3d.geometry.cameras import View, opencv_parameters, project
-from sc3d.geometry.voxels import SIDES, VOXELS, VoxelField, VoxelOrder, normal_sides, sort_by_voxel
+from sc3d.geometry.voxels import SIDES, VOXELS, LabelGrid, VoxelOrder, normal_sides, sort_by_voxel
 from sc3d.labelling.density import voxel_shares
 from sc3d.labelling.verification import Places, VoteLog, neighbor_blocks, verify
-from sc3d.labelling.voting_kernels import SCALE, Lens, Picture, Rules, SortedCloud, cast_votes
+from sc3d.labelling.voting_kernels import (
+    SCALE,
+    CameraParameters,
+    Observation,
+    SortedCloud,
+    VoteWeighting,
+    cast_votes,
+)
 
 CHUNK = 500_000  # points projected by pycolmap at a time
 
 
-class Said(NamedTuple):
+class ViewVotes(NamedTuple):
     """What one view says about each cell: (K,) uint8 label with the most weight, 0 = nothing; (K,) uint16
     that weight, fixed point.
     """
@@ -32,11 +39,11 @@ class Said(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Ballot:
+class VoteAccumulator:
     """Votes of all views. Channel 0 of the votes counts views, because label 0 never votes.
 
     cloud: the points; order: (N,) rows of the sorted points in the given cloud; field_cells: (K,) int64 row
-        of each cell in `VoxelField.votes`
+        of each cell in `LabelGrid.votes`
     block_keys: (B,) int64 packed positions of the blocks, rising
     votes, strict: (K, num_ids) int32, the second without mask edges, grazing views and doubtful depth
     overlay: (N,) uint8 label of the last view that saw a point, sorted; log: the votes view by view
@@ -51,12 +58,12 @@ class Ballot:
     overlay: np.ndarray
     log: VoteLog
 
-    def cast(self, view: View, picture: Picture, rules: Rules) -> None:
+    def cast(self, view: View, picture: Observation, rules: VoteWeighting) -> None:
         """Add one view: each cell gets the mean of its sightings."""
-        said = Said(np.zeros(len(self.votes), np.uint8), np.zeros(len(self.votes), np.uint16))
+        said = ViewVotes(np.zeros(len(self.votes), np.uint8), np.zeros(len(self.votes), np.uint16))
         cast_votes(
             self.cloud,
-            lens_of(view, self.cloud.points),
+            camera_parameters(view, self.cloud.points),
             picture,
             rules,
             self.votes,
@@ -90,13 +97,13 @@ class Points(Protocol):
     density: np.ndarray | None
 
 
-def open_ballot(
+def open_accumulator(
     given: Points, origin: np.ndarray, voxel_size: float, num_ids: int
-) -> tuple[Ballot, VoxelField]:
+) -> tuple[VoteAccumulator, LabelGrid]:
     """Sort the points into cells of a grid with its zero at `origin` (3,) world; no votes yet."""
     points, normals, density = given.points, given.normals, given.density
     sorting = sort_by_voxel(points, voxel_size, origin)
-    field = VoxelField.over(sorting, num_ids)
+    field = LabelGrid.from_voxels(sorting, num_ids)
     order, cells, field_cells, facing = _cells(sorting, normals, field)
     blocks = np.flatnonzero(np.diff(field_cells // (VOXELS * SIDES), prepend=-1))
     blocks = np.append(blocks, len(field_cells))
@@ -109,7 +116,7 @@ def open_ballot(
     votes = np.zeros((len(field_cells), num_ids), np.int32)
     weights = np.empty(0, np.uint16) if density is None else voxel_shares(density, sorting)[order]
     cloud = SortedCloud(ordered, turned, weights, cells, blocks, facing, centers, radii)
-    return Ballot(
+    return VoteAccumulator(
         cloud,
         order,
         field_cells,
@@ -121,7 +128,7 @@ def open_ballot(
     ), field
 
 
-def lens_of(view: View, points: np.ndarray) -> Lens:
+def camera_parameters(view: View, points: np.ndarray) -> CameraParameters:
     """A view for kernels; `points` (N, 3) are projected here if the camera's model needs pycolmap."""
     parameters = opencv_parameters(view.camera)
     pixels = np.empty((0, 2))
@@ -132,7 +139,7 @@ def lens_of(view: View, points: np.ndarray) -> Lens:
                 [project(view, points[start : start + CHUNK])[0] for start in range(0, len(points), CHUNK)]
             ),
         )
-    return Lens(
+    return CameraParameters(
         view.cam_from_world,
         view.center,
         view.cone_cosine,
@@ -145,7 +152,7 @@ def lens_of(view: View, points: np.ndarray) -> Lens:
 
 
 def _cells(
-    sorting: VoxelOrder, normals: np.ndarray | None, field: VoxelField
+    sorting: VoxelOrder, normals: np.ndarray | None, field: LabelGrid
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Order of the points by cell, first point of each cell and, per cell, its row in the field's votes and
     whether its points must face the camera.

@@ -40,7 +40,7 @@ class SortedCloud(NamedTuple):
     radii: np.ndarray
 
 
-class Lens(NamedTuple):
+class CameraParameters(NamedTuple):
     """A view for kernels.
 
     cam_from_world: (4, 4); center: (3,) world; cone, frustum: as in `View`; width, height: px
@@ -58,7 +58,7 @@ class Lens(NamedTuple):
     pixels: np.ndarray
 
 
-class Picture(NamedTuple):
+class Observation(NamedTuple):
     """What a view says, one value per pixel, (H, W).
 
     labels: uint8, 0 = does not vote; weights: float32 in [0, 1]; strict: bool, may take part in the second
@@ -72,7 +72,7 @@ class Picture(NamedTuple):
     ranges: np.ndarray
 
 
-class Rules(NamedTuple):
+class VoteWeighting(NamedTuple):
     """How a sighting is weighed: which factors count (the others are 1), and the depth at which the range
     factor is 1; `equal` = all weigh 1;
     `second` = strict sightings are also voted on apart."""
@@ -87,9 +87,9 @@ class Rules(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def to_camera(lens, x, y, z):
+def to_camera(camera, x, y, z):
     """Camera frame of a world position."""
-    pose = lens.cam_from_world
+    pose = camera.cam_from_world
     return (
         pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],
         pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3],
@@ -110,40 +110,40 @@ def to_pixel(parameters, x, y, z):
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _in_frustum(lens, center, radius):
+def _in_frustum(camera, center, radius):
     """Whether a sphere may reach into the pyramid that holds the image."""
-    x, y, z = to_camera(lens, center[0], center[1], center[2])
+    x, y, z = to_camera(camera, center[0], center[1], center[2])
     inside = True
     for side in range(4):
-        inside &= lens.frustum[side, 0] * x + lens.frustum[side, 1] * y + lens.frustum[
+        inside &= camera.frustum[side, 0] * x + camera.frustum[side, 1] * y + camera.frustum[
             side, 2
         ] * z <= radius + 1e-9 * abs(z)
     return inside
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _see(cloud, lens, picture, rules, cell, point):
+def _visibility(cloud, camera, picture, rules, cell, point):
     """Row (-1 = not seen), column, weight and whether the sighting is strict, of one point."""
     nothing = -1, -1, 0.0, False
     x, y, z = cloud.points[point, 0], cloud.points[point, 1], cloud.points[point, 2]
-    left, top, depth = to_camera(lens, x, y, z)
+    left, top, depth = to_camera(camera, x, y, z)
     distance = np.sqrt(left * left + top * top + depth * depth)
-    if not (distance > 0 and depth >= (lens.cone - CONE_MARGIN) * distance):
+    if not (distance > 0 and depth >= (camera.cone - CONE_MARGIN) * distance):
         return nothing
     occluding, cosine = picture.ranges.size > 0, 1.0
     if cloud.normals.shape[0]:
         nx, ny, nz = cloud.normals[point, 0], cloud.normals[point, 1], cloud.normals[point, 2]
         cosine = (
-            nx * (lens.center[0] - x) + ny * (lens.center[1] - y) + nz * (lens.center[2] - z)
+            nx * (camera.center[0] - x) + ny * (camera.center[1] - y) + nz * (camera.center[2] - z)
         ) / distance
         if occluding and cosine <= 0 and cloud.facing[cell]:
             return nothing
         cosine = abs(cosine)
-    if lens.pixels.shape[0]:
-        u, v = lens.pixels[point, 0], lens.pixels[point, 1]
+    if camera.pixels.shape[0]:
+        u, v = camera.pixels[point, 0], camera.pixels[point, 1]
     else:
-        u, v = to_pixel(lens.parameters, left, top, depth)
-    if not (u >= 0 and v >= 0 and u < lens.width and v < lens.height):
+        u, v = to_pixel(camera.parameters, left, top, depth)
+    if not (u >= 0 and v >= 0 and u < camera.width and v < camera.height):
         return nothing
     row, column, excess = int(v), int(u), 0.0
     if occluding:
@@ -167,17 +167,17 @@ def _see(cloud, lens, picture, rules, cell, point):
 
 
 @numba.njit(parallel=True, cache=True, error_model="numpy")
-def cast_votes(cloud, lens, picture, rules, votes, strict, overlay, said_labels, said_weights):
+def cast_votes(cloud, camera, picture, rules, votes, strict, overlay, said_labels, said_weights):
     """Arrays as in Ballot."""
     num_ids = votes.shape[1]
     for block in numba.prange(len(cloud.blocks) - 1):
-        if not _in_frustum(lens, cloud.centers[block], cloud.radii[block]):
+        if not _in_frustum(camera, cloud.centers[block], cloud.radii[block]):
             continue
         sums = np.zeros((2, num_ids), np.int64)  # row 1: strict sightings only
         for cell in range(cloud.blocks[block], cloud.blocks[block + 1]):
             count = strict_count = 0
             for point in range(cloud.cells[cell], cloud.cells[cell + 1]):
-                row, column, weight, is_strict = _see(cloud, lens, picture, rules, cell, point)
+                row, column, weight, is_strict = _visibility(cloud, camera, picture, rules, cell, point)
                 label = picture.labels[row, column] if row >= 0 else 0
                 if label == 0:
                     continue

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from sc3d.propagation.quantile_sketch import Counts
+from sc3d.propagation.quantile_sketch import QuantileSketch
 
 COLOR_BINS, RELIEF_BINS = 24, 12  # per feature; 24^3 and 12^4 cells
 COLOR_BLUR, RELIEF_BLUR = 1.0, 0.7  # standard deviation, bins
@@ -29,11 +29,11 @@ MIN_SKILL = 0.5  # share of the errors of "always the commonest class" that they
 FOLD_BLOCKS = 8  # blocks along the longest side of the cloud; every other one is held out, as on a chessboard
 
 # per group of features, (cells, C) int64 examples of each class; lessons of parts add up
-Lesson = tuple[np.ndarray, ...]
+AppearanceStatistics = tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True)
-class Cells:
+class Histogram:
     """The histogram cell of each point: cell (N,) int32, of prod(shape) cells; blur: standard deviation in
     bins.
     """
@@ -43,7 +43,7 @@ class Cells:
     blur: float
 
     @classmethod
-    def of(cls, features: np.ndarray, edges: list[np.ndarray], blur: float) -> Cells:
+    def from_features(cls, features: np.ndarray, edges: list[np.ndarray], blur: float) -> Histogram:
         """features: (N, F); edges: per feature the inner borders of its bins."""
         cell = np.zeros(len(features), np.int32)
         for values, borders in zip(features.T, edges, strict=True):
@@ -73,7 +73,7 @@ class Cells:
         return np.log(smoothed / smoothed.sum(axis=1, keepdims=True))
 
 
-def edges_of(counts: list[Counts], bins: int) -> list[np.ndarray]:
+def edges_of(counts: list[QuantileSketch], bins: int) -> list[np.ndarray]:
     """Inner borders of `bins` bins per feature, its quantiles over all points, so that unit and scale do not
     matter.
     """
@@ -81,45 +81,47 @@ def edges_of(counts: list[Counts], bins: int) -> list[np.ndarray]:
 
 
 @dataclass(frozen=True)
-class Raters:
+class AppearanceModel:
     """Groups of features that are taken as independent of one another given the class."""
 
-    groups: tuple[Cells, ...]
+    groups: tuple[Histogram, ...]
 
     @classmethod
-    def of(cls, relief: np.ndarray, colors: np.ndarray | None) -> Raters:
+    def from_features(cls, relief: np.ndarray, colors: np.ndarray | None) -> AppearanceModel:
         """Of a whole cloud. relief: (N, 4) of `relief_features`; colors: (N, 3) uint8 or None."""
-        return cls.over(relief, colors, feature_counts(relief, colors))
+        return cls.from_sketches(relief, colors, feature_counts(relief, colors))
 
     @classmethod
-    def over(cls, relief: np.ndarray, colors: np.ndarray | None, counts: list[Counts]) -> Raters:
+    def from_sketches(
+        cls, relief: np.ndarray, colors: np.ndarray | None, counts: list[QuantileSketch]
+    ) -> AppearanceModel:
         """The same for a part of a cloud; counts: `feature_counts` of the whole."""
         known = relief.shape[1]
-        groups = (Cells.of(relief, edges_of(counts[:known], RELIEF_BINS), RELIEF_BLUR),)
+        groups = (Histogram.from_features(relief, edges_of(counts[:known], RELIEF_BINS), RELIEF_BLUR),)
         return cls(
             groups
             if colors is None
-            else (Cells.of(colors, edges_of(counts[known:], COLOR_BINS), COLOR_BLUR), *groups)
+            else (Histogram.from_features(colors, edges_of(counts[known:], COLOR_BINS), COLOR_BLUR), *groups)
         )
 
-    def lesson(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> Lesson:
+    def statistics(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> AppearanceStatistics:
         """What the examples (N,) bool of label (N,) uint8 teach."""
         return tuple(group.count(label, examples, num_classes) for group in self.groups)
 
-    def rate(self, lesson: Lesson, label: np.ndarray) -> np.ndarray | None:
+    def log_likelihood(self, statistics: AppearanceStatistics, label: np.ndarray) -> np.ndarray | None:
         """(N, C) float32 log-probability of the classes as color and relief see them; None where there is
         too little to learn from.
 
         label: (N,) uint8. Points of a class without enough examples get zeros: the raters do not contradict
             what they do not know.
         """
-        counts = lesson[0].sum(axis=0)
+        counts = statistics[0].sum(axis=0)
         known = counts >= MIN_EXAMPLES
         if known.sum() < 2:
             return None
         shares = np.log(np.maximum(counts, 1) / counts[known].sum())
         result = np.zeros((len(label), len(counts)), np.float32)
-        for group, examples in zip(self.groups, lesson, strict=True):
+        for group, examples in zip(self.groups, statistics, strict=True):
             table = group.table(examples * known)
             # one by one: as a whole it would be copied, with millions of points
             for column in range(len(counts)):
@@ -131,21 +133,26 @@ class Raters:
         result[np.append(False, ~known)[label]] = 0
         return np.maximum(result, np.float32(np.log(1e-4)), out=result)
 
-    def learn(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> np.ndarray | None:
-        """`rate` of a whole cloud by its own examples (N,) bool."""
-        return self.rate(self.lesson(label, examples, num_classes), label)
+    def fit(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> np.ndarray | None:
+        """`log_likelihood` of a whole cloud by its own examples (N,) bool."""
+        return self.log_likelihood(self.statistics(label, examples, num_classes), label)
 
-    def errors(self, lesson: Lesson, label: np.ndarray, asked: np.ndarray) -> int | None:
+    def errors(self, statistics: AppearanceStatistics, label: np.ndarray, asked: np.ndarray) -> int | None:
         """How many of the points asked (N,) bool, whose label is taken for true, the lesson rates wrong; None
         if it is too short.
         """
-        rating = self.rate(lesson, label)
+        rating = self.log_likelihood(statistics, label)
         return None if rating is None else int((rating[asked].argmax(axis=1) + 1 != label[asked]).sum())
 
 
-def feature_counts(relief: np.ndarray, colors: np.ndarray | None) -> list[Counts]:
+def feature_counts(relief: np.ndarray, colors: np.ndarray | None) -> list[QuantileSketch]:
     """Counts of each feature: of relief (N, 4), then of colors (N, 3), if there are any."""
-    return [Counts.of(column) for table in (relief, colors) if table is not None for column in table.T]
+    return [
+        QuantileSketch.from_values(column)
+        for table in (relief, colors)
+        if table is not None
+        for column in table.T
+    ]
 
 
 def folds_of(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -154,7 +161,7 @@ def folds_of(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarra
     return cells.sum(axis=1) % 2
 
 
-def skill_of(wrong: list[int | None], counts: np.ndarray) -> float:
+def skill_score(wrong: list[int | None], counts: np.ndarray) -> float:
     """Share of the errors of the best constant answer that the raters avoid on blocks held out; 0 where they
     cannot learn.
 

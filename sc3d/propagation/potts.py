@@ -26,8 +26,8 @@ def mean_field(
     returns: (N, C) float32 belief, rows sum to 1. Each row is summed in a fixed order: the same for any
         number of threads.
     """
-    belief = softmax(log_likelihood) if start is None else np.ascontiguousarray(start, np.float32)
-    other = np.empty_like(belief)
+    marginals = softmax(log_likelihood) if start is None else np.ascontiguousarray(start, np.float32)
+    other = np.empty_like(marginals)
     for _ in range(steps):
         _step(
             graph.starts,
@@ -35,42 +35,42 @@ def mean_field(
             graph.weights,
             log_likelihood,
             np.float32(smoothness),
-            belief,
+            marginals,
             other,
         )
-        belief, other = other, belief
-    return belief
+        marginals, other = other, marginals
+    return marginals
 
 
 def mean_field_sequential(
-    graph: Graph, log_likelihood: np.ndarray, smoothness: float, belief: np.ndarray
+    graph: Graph, log_likelihood: np.ndarray, smoothness: float, marginals: np.ndarray
 ) -> np.ndarray:
     """One sweep that updates one point after another in place: slower twin of a step of `mean_field` whose
     free energy never rises.
     """
-    belief = np.array(belief, np.float32)
-    _sweep(graph.starts, graph.neighbors, graph.weights, log_likelihood, np.float32(smoothness), belief)
-    return belief
+    marginals = np.array(marginals, np.float32)
+    _sweep(graph.starts, graph.neighbors, graph.weights, log_likelihood, np.float32(smoothness), marginals)
+    return marginals
 
 
 def potts_energy(graph: Graph, log_likelihood: np.ndarray, label: np.ndarray, smoothness: float) -> float:
     """The energy of a labelling; each undirected edge counts once. label: (N,) class ids from 1, canonical
     order.
     """
-    belief = np.zeros(log_likelihood.shape, np.float32)
-    belief[np.arange(len(label)), label.astype(np.int64) - 1] = 1
-    return free_energy(graph, log_likelihood, belief, smoothness)  # without entropy they are the same
+    marginals = np.zeros(log_likelihood.shape, np.float32)
+    marginals[np.arange(len(label)), label.astype(np.int64) - 1] = 1
+    return free_energy(graph, log_likelihood, marginals, smoothness)  # without entropy they are the same
 
 
-def free_energy(graph: Graph, log_likelihood: np.ndarray, belief: np.ndarray, smoothness: float) -> float:
+def free_energy(graph: Graph, log_likelihood: np.ndarray, marginals: np.ndarray, smoothness: float) -> float:
     """Expected energy minus entropy of independent beliefs (N, C): what mean field minimizes."""
-    belief = belief.astype(np.float64)
-    cost = -(np.where(belief > 0, log_likelihood, 0) * belief).sum()
-    entropy = -(belief * np.log(np.maximum(belief, 1e-300))).sum()
+    marginals = marginals.astype(np.float64)
+    cost = -(np.where(marginals > 0, log_likelihood, 0) * marginals).sum()
+    entropy = -(marginals * np.log(np.maximum(marginals, 1e-300))).sum()
     rows = np.repeat(np.arange(len(graph.order)), np.diff(graph.starts))
     once = rows < graph.neighbors
     rows, columns, weights = rows[once], graph.neighbors[once], graph.weights[once].astype(np.float64)
-    cut = (weights * (1 - np.einsum("ec,ec->e", belief[rows], belief[columns]))).sum()
+    cut = (weights * (1 - np.einsum("ec,ec->e", marginals[rows], marginals[columns]))).sum()
     return float(cost + smoothness * cut - entropy)
 
 
@@ -83,14 +83,14 @@ def softmax(values: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, field):
+def _update(starts, neighbors, weights, log_likelihood, smoothness, marginals, i, field):
     """Fills field (C,)."""
     for c in range(len(field)):
         field[c] = 0
     for edge in range(starts[i], starts[i + 1]):
         j, weight = neighbors[edge], weights[edge]
         for c in range(len(field)):
-            field[c] += weight * belief[j, c]
+            field[c] += weight * marginals[j, c]
     highest = np.float32(-np.inf)
     for c in range(len(field)):
         field[c] = log_likelihood[i, c] + smoothness * field[c]
@@ -104,16 +104,16 @@ def _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, f
 
 
 @numba.njit(cache=True, parallel=True)
-def _step(starts, neighbors, weights, log_likelihood, smoothness, belief, result):
+def _step(starts, neighbors, weights, log_likelihood, smoothness, marginals, result):
     """See mean_field."""
     for i in numba.prange(len(starts) - 1):
-        _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, result[i])
+        _update(starts, neighbors, weights, log_likelihood, smoothness, marginals, i, result[i])
 
 
 @numba.njit(cache=True)
-def _sweep(starts, neighbors, weights, log_likelihood, smoothness, belief):
+def _sweep(starts, neighbors, weights, log_likelihood, smoothness, marginals):
     """See mean_field_sequential."""
-    field = np.empty(belief.shape[1], np.float32)
+    field = np.empty(marginals.shape[1], np.float32)
     for i in range(len(starts) - 1):
-        _update(starts, neighbors, weights, log_likelihood, smoothness, belief, i, field)
-        belief[i] = field
+        _update(starts, neighbors, weights, log_likelihood, smoothness, marginals, i, field)
+        marginals[i] = field

@@ -9,9 +9,16 @@ import numba
 import numpy as np
 
 from sc3d.geometry.graph import Graph, build_graph
-from sc3d.propagation.appearance import MIN_EXAMPLES, MIN_SKILL, Lesson, Raters, folds_of, skill_of
+from sc3d.propagation.appearance import (
+    MIN_EXAMPLES,
+    MIN_SKILL,
+    AppearanceModel,
+    AppearanceStatistics,
+    folds_of,
+    skill_score,
+)
 from sc3d.propagation.potts import mean_field, softmax
-from sc3d.propagation.region_growing import grow, vote_nearest
+from sc3d.propagation.region_growing import grow_regions, vote_nearest
 from sc3d.propagation.terrain import relief_features
 from sc3d.scene.labels import LOCKED, PROPAGATED, SEED, UNLOCKED, Labels
 from sc3d.settings.labels import Propagate
@@ -29,7 +36,7 @@ CAUTION, SUPPORT = 0.5, 0.1
 
 
 @dataclass(frozen=True)
-class Evidence:
+class LabelledPoints:
     """What is known of N points, canonical order.
 
     points: (N, 3) world; seeds: labels of fusion; votes: (N, num_ids) float32 or None, column 0 is ignored;
@@ -41,8 +48,8 @@ class Evidence:
     votes: np.ndarray | None
     colors: np.ndarray | None
 
-    def ordered(self, order: np.ndarray) -> Evidence:
-        return Evidence(
+    def ordered(self, order: np.ndarray) -> LabelledPoints:
+        return LabelledPoints(
             self.points[order],
             reordered(self.seeds, order),
             *(None if part is None else part[order] for part in (self.votes, self.colors)),
@@ -101,7 +108,7 @@ def views_to_agree(agreement: np.ndarray) -> int:
     )
 
 
-def tie_breakers(evidence: Evidence, normals: np.ndarray | None) -> tuple[np.ndarray, ...]:
+def tie_breakers(evidence: LabelledPoints, normals: np.ndarray | None) -> tuple[np.ndarray, ...]:
     """Arrays (N,) that tell points of equal position apart, for `build_graph`."""
     seeds = evidence.seeds
     tables = (part for part in (evidence.votes, evidence.colors, normals) if part is not None)
@@ -114,7 +121,7 @@ def tie_breakers(evidence: Evidence, normals: np.ndarray | None) -> tuple[np.nda
     )
 
 
-def complete(evidence: Evidence, normals: np.ndarray | None, settings: Propagate) -> Labels:
+def complete(evidence: LabelledPoints, normals: np.ndarray | None, settings: Propagate) -> Labels:
     """Label the points that have none, on their own neighbor graph. normals: (N, 3) unit, oriented, or None
     = estimated.
     """
@@ -125,7 +132,7 @@ def complete(evidence: Evidence, normals: np.ndarray | None, settings: Propagate
     return propagate(graph, evidence, settings)
 
 
-def propagate(graph: Graph, evidence: Evidence, settings: Propagate) -> Labels:
+def propagate(graph: Graph, evidence: LabelledPoints, settings: Propagate) -> Labels:
     """Label the points that have none; all arrays, given and returned, in the order of the cloud.
 
     geometry, knn: points of state SEED or UNLOCKED keep their label (with verify_seeds: those that look like
@@ -134,12 +141,12 @@ def propagate(graph: Graph, evidence: Evidence, settings: Propagate) -> Labels:
     """
     known = evidence.ordered(graph.order)
     start = known.start
-    learned = _learned(graph, known) if needs_raters(settings) else None
+    learned = _learned(graph, known) if needs_appearance(settings) else None
     if settings.method == "map":
         label, confidence = _map(graph, known, learned, settings)
         label = np.where(reachable(graph, start), label, 0).astype(np.uint8)
     else:
-        start = start if learned is None else verified(start, learned[0].rate(learned[1], start))
+        start = start if learned is None else verified(start, learned[0].log_likelihood(learned[1], start))
         label, confidence = spread(graph, known.points, start, settings)
     if settings.fill and (label == 0).any() and (label > 0).any():
         filled, filled_confidence = vote_nearest(known.points, label, 1)
@@ -150,7 +157,7 @@ def propagate(graph: Graph, evidence: Evidence, settings: Propagate) -> Labels:
     return reordered(final_labels(known.seeds, start, label, confidence, settings), np.argsort(graph.order))
 
 
-def needs_raters(settings: Propagate) -> bool:
+def needs_appearance(settings: Propagate) -> bool:
     return settings.appearance and (settings.method == "map" or settings.verify_seeds)
 
 
@@ -163,7 +170,7 @@ def spread(
     return (
         vote_nearest(points, start, settings.num_neighbors)
         if settings.method == "knn"
-        else grow(graph, start)
+        else grow_regions(graph, start)
     )
 
 
@@ -181,30 +188,30 @@ def final_labels(
     )
 
 
-def _learned(graph: Graph, known: Evidence) -> tuple[Raters, Lesson] | None:
+def _learned(graph: Graph, known: LabelledPoints) -> tuple[AppearanceModel, AppearanceStatistics] | None:
     """Color and relief as raters, and what the agreed points teach, if that does well on agreed points that
     it has not seen.
     """
-    raters, start, examples = (
-        Raters.of(relief_features(graph, known.points), known.colors),
+    appearance, start, examples = (
+        AppearanceModel.from_features(relief_features(graph, known.points), known.colors),
         known.start,
         known.agreed,
     )
     folds = folds_of(known.points, known.points.min(axis=0), known.points.max(axis=0))
-    halves = [raters.lesson(start, examples & (folds == fold), known.num_classes) for fold in (0, 1)]
-    wrong = [raters.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1)]
-    lesson = added(halves)
-    return (raters, lesson) if is_skilled(wrong, lesson) else None
+    halves = [appearance.statistics(start, examples & (folds == fold), known.num_classes) for fold in (0, 1)]
+    wrong = [appearance.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1)]
+    statistics = sum_statistics(halves)
+    return (appearance, statistics) if is_skillful(wrong, statistics) else None
 
 
-def added(lessons: list[Lesson]) -> Lesson:
+def sum_statistics(lessons: list[AppearanceStatistics]) -> AppearanceStatistics:
     """The lesson of all parts."""
     return tuple(sum(parts) for parts in zip(*lessons, strict=True))
 
 
-def is_skilled(wrong: list[int | None], lesson: Lesson) -> bool:
+def is_skillful(wrong: list[int | None], statistics: AppearanceStatistics) -> bool:
     """Whether the raters do well enough; wrong: their errors on each fold held out."""
-    skill = skill_of(wrong, lesson[0].sum(axis=0))
+    skill = skill_score(wrong, statistics[0].sum(axis=0))
     logger.info(
         "color and relief avoid %.0f%% of errors on held-out agreed points%s",
         100 * skill,
@@ -222,26 +229,29 @@ def verified(start: np.ndarray, rating: np.ndarray) -> np.ndarray:
 
 
 def _map(
-    graph: Graph, known: Evidence, learned: tuple[Raters, Lesson] | None, settings: Propagate
+    graph: Graph,
+    known: LabelledPoints,
+    learned: tuple[AppearanceModel, AppearanceStatistics] | None,
+    settings: Propagate,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Labels and confidences of the smallest Potts energy."""
     offered = np.bincount(known.start, minlength=known.num_classes + 1)[1:] > 0
     if learned is None:
-        evidence, belief = unrated_belief(graph, known, offered, settings)
-        return decided(graph, evidence, belief)
-    (raters, lesson), label = learned, known.start
+        evidence, marginals = vote_marginals(graph, known, offered, settings)
+        return decided(graph, evidence, marginals)
+    (appearance, statistics), label = learned, known.start
     for turn in range(max(settings.rounds, 1)):
-        rating = raters.rate(lesson, label)
+        rating = appearance.log_likelihood(statistics, label)
         if turn and rating is None:
             break  # too little is sure; what was learned from agreed points stands
-        evidence, belief = rated_belief(graph, known, offered, rating, settings)
-        label = (belief.argmax(axis=1) + 1).astype(np.uint8)
-        lesson = raters.lesson(label, examples_in(belief, known), known.num_classes)
-    return decided(graph, evidence, belief)
+        evidence, marginals = appearance_marginals(graph, known, offered, rating, settings)
+        label = (marginals.argmax(axis=1) + 1).astype(np.uint8)
+        statistics = appearance.statistics(label, examples_in(marginals, known), known.num_classes)
+    return decided(graph, evidence, marginals)
 
 
-def unrated_belief(
-    graph: Graph, known: Evidence, offered: np.ndarray, settings: Propagate
+def vote_marginals(
+    graph: Graph, known: LabelledPoints, offered: np.ndarray, settings: Propagate
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log-evidence and belief (N, C) from the votes alone; offered: (C,) bool, a class without a single seed
     is not.
@@ -249,15 +259,15 @@ def unrated_belief(
     likelihood = vote_likelihood(known.votes)
     likelihood[:, ~offered] = -np.inf
     # else the votes would take one edge per step to reach points without any
-    grown, _ = grow(graph, known.start)
-    belief = softmax(likelihood)
+    grown, _ = grow_regions(graph, known.start)
+    marginals = softmax(likelihood)
     silent = np.flatnonzero(~known.votes[:, 1:].any(axis=1) & (grown > 0))
-    belief[silent] = np.eye(likelihood.shape[1], dtype=np.float32)[grown[silent] - 1]
-    return likelihood, mean_field(graph, likelihood, settings.smoothness, belief)
+    marginals[silent] = np.eye(likelihood.shape[1], dtype=np.float32)[grown[silent] - 1]
+    return likelihood, mean_field(graph, likelihood, settings.smoothness, marginals)
 
 
-def rated_belief(
-    graph: Graph, known: Evidence, offered: np.ndarray, rating: np.ndarray, settings: Propagate
+def appearance_marginals(
+    graph: Graph, known: LabelledPoints, offered: np.ndarray, rating: np.ndarray, settings: Propagate
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same from votes and raters; rating: (N, C), overwritten."""
     rating += np.float32(TRUST) * vote_likelihood(known.votes)
@@ -265,16 +275,16 @@ def rated_belief(
     return rating, mean_field(graph, rating, settings.smoothness)  # afresh: a sure belief would not move
 
 
-def examples_in(belief: np.ndarray, known: Evidence) -> np.ndarray:
+def examples_in(marginals: np.ndarray, known: LabelledPoints) -> np.ndarray:
     """(N,) bool points that a later round learns from."""
-    return (belief.max(axis=1) > SURE) & (known.seeds.num_views > 0)
+    return (marginals.max(axis=1) > SURE) & (known.seeds.num_views > 0)
 
 
-def decided(graph: Graph, evidence: np.ndarray, belief: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def decided(graph: Graph, evidence: np.ndarray, marginals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N,) uint8 labels and (N,) float32 confidences of a belief (N, C); evidence (N, C) is overwritten."""
-    label = belief.argmax(axis=1) + 1
+    label = marginals.argmax(axis=1) + 1
     evidence *= np.float32(CAUTION)
-    cautious = mean_field(graph, evidence, SUPPORT, belief, steps=1)
+    cautious = mean_field(graph, evidence, SUPPORT, marginals, steps=1)
     return label.astype(np.uint8), cautious[np.arange(len(label)), label - 1]
 
 

@@ -10,20 +10,20 @@ DROPPED = 12  # of the 32 bits of a float32: steps of 1/2048 of a value
 
 
 @dataclass(frozen=True)
-class Counts:
+class QuantileSketch:
     """How many values fall into each step. steps: (S,) int32, rising; counts: (S,) int64."""
 
     steps: np.ndarray
     counts: np.ndarray
 
     @classmethod
-    def of(cls, values: np.ndarray) -> Counts:
+    def from_values(cls, values: np.ndarray) -> QuantileSketch:
         """values: (N,) float32."""
         bits = np.ascontiguousarray(values, np.float32).view(np.int32)
         return cls(*np.unique((bits ^ ((bits >> 31) & 0x7FFFFFFF)) >> DROPPED, return_counts=True))
 
     @classmethod
-    def total(cls, parts: list[Counts]) -> Counts:
+    def merge(cls, parts: list[QuantileSketch]) -> QuantileSketch:
         steps, inverse = np.unique(np.concatenate([part.steps for part in parts]), return_inverse=True)
         counts = np.zeros(len(steps), np.int64)
         np.add.at(counts, inverse.ravel(), np.concatenate([part.counts for part in parts]))

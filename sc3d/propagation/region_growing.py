@@ -11,7 +11,7 @@ from sc3d.geometry.neighbors import NeighborIndex
 MAX_SWEEPS = 20
 
 
-def grow(graph: Graph, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def grow_regions(graph: Graph, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Eq. 9 iterated as a front from the seeds until nothing changes; the seeds keep their label.
 
     Each step labels all points next to the front at once, so the result does not depend on the order of the

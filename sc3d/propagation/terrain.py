@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates, minimum_filter
 
 from sc3d.geometry.graph import Graph
-from sc3d.propagation.quantile_sketch import Counts
+from sc3d.propagation.quantile_sketch import QuantileSketch
 
 CELL = 4.0  # cell of the ground raster, point spacings
 WINDOWS = (9, 33)  # the ground is the lowest point within windows of this many cells
@@ -19,32 +19,32 @@ NUM_FEATURES = 2 + len(WINDOWS)
 
 
 @dataclass(frozen=True)
-class Lean:
+class NormalStatistics:
     """Which way the surfaces of a cloud face. products: (3, 3), sums: (3,) int64 of its unit normals, in
     fixed point; spacings: of its points.
     """
 
     products: np.ndarray
     sums: np.ndarray
-    spacings: Counts
+    spacings: QuantileSketch
 
     @classmethod
-    def of(cls, normals: np.ndarray, spacings: np.ndarray) -> Lean:
+    def from_normals(cls, normals: np.ndarray, spacings: np.ndarray) -> NormalStatistics:
         """normals: (N, 3) float32; spacings: (N,) float32 world units."""
         fixed = np.rint(normals.astype(np.float64) * 1024).astype(np.int64)
-        return cls(fixed.T @ fixed, fixed.sum(axis=0), Counts.of(spacings))
+        return cls(fixed.T @ fixed, fixed.sum(axis=0), QuantileSketch.from_values(spacings))
 
     @classmethod
-    def total(cls, parts: list[Lean]) -> Lean:
+    def merge(cls, parts: list[NormalStatistics]) -> NormalStatistics:
         return cls(
             sum(part.products for part in parts),
             sum(part.sums for part in parts),
-            Counts.total([part.spacings for part in parts]),
+            QuantileSketch.merge([part.spacings for part in parts]),
         )
 
 
 @dataclass(frozen=True)
-class Terrain:
+class GroundModel:
     """A frame in which up is the main direction of the normals, so that no gravity has to be known, and a
     raster over it.
 
@@ -61,7 +61,7 @@ class Terrain:
     shape: tuple[int, int]
 
     @classmethod
-    def over(cls, lean: Lean, low: np.ndarray, high: np.ndarray) -> Terrain:
+    def from_statistics(cls, lean: NormalStatistics, low: np.ndarray, high: np.ndarray) -> GroundModel:
         """low, high: (3,) corners of the whole cloud, world."""
         axes = np.linalg.eigh(lean.products.astype(np.float64))[1][:, ::-1]
         up = axes[:, 0]
@@ -130,5 +130,7 @@ class Terrain:
 
 def relief_features(graph: Graph, points: np.ndarray) -> np.ndarray:
     """(N, 4) float32 features of a whole cloud; points: (N, 3) world, in the order of the graph."""
-    terrain = Terrain.over(Lean.of(graph.normals, graph.spacings), points.min(axis=0), points.max(axis=0))
+    terrain = GroundModel.from_statistics(
+        NormalStatistics.from_normals(graph.normals, graph.spacings), points.min(axis=0), points.max(axis=0)
+    )
     return terrain.features(graph, points, terrain.grounds([terrain.lowest(points)]))

@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 
 from sc3d.io.atomic import atomic_path
-from sc3d.report.data import gather
+from sc3d.report.data import load_report_data
 from sc3d.report.sections import headline, sections, summary_line
 from sc3d.scene.scene import Scene
 
@@ -26,13 +26,13 @@ def write_report(scene: Scene, path: Path) -> None:
     Raises InputError if the scene folder does not exist or a file in it is broken.
     """
     scene.require(hint="")
-    material = gather(scene)
-    parts = [(anchor, title, body) for anchor, title, body in sections(material) if body]
+    data = load_report_data(scene)
+    parts = [(anchor, title, body) for anchor, title, body in sections(data) if body]
     template = string.Template(_resource("page.html"))
     page = template.substitute(
         title=html.escape(scene.path.resolve().name),
-        summary=summary_line(material),
-        headline=headline(material),
+        summary=summary_line(data),
+        headline=headline(data),
         navigation="".join(f'<a href="#{anchor}">{html.escape(title)}</a>' for anchor, title, _ in parts),
         body="\n".join(
             f'<section id="{anchor}"><h2>{html.escape(title)}</h2>\n{body}</section>'

@@ -7,20 +7,20 @@ from html import escape
 import numpy as np
 
 from sc3d.report.charts import css_color, histogram, number, reliability_curve, stacked_bar
-from sc3d.report.data import Material
+from sc3d.report.data import ReportData
 from sc3d.view.colors import STATES, confidence_colors
 
 
-def certainty_section(material: Material) -> str:
+def certainty_section(data: ReportData) -> str:
     """Confidence of the points, whether it can be believed, and how their labels came about."""
-    confidence, states, parts = material.values("confidence"), material.values("state"), []
+    confidence, states, parts = data.values("confidence"), data.values("state"), []
     if confidence is not None:
         colors = confidence_colors((np.arange(20) + 0.5) / 20)
         parts.append(
             f'<div><h3>Confidence</h3><p class="note">Share of the points by confidence; median {np.nanmedian(confidence):.2f}.</p>'
             f"{histogram(confidence, colors)}</div>"
         )
-    parts += _reliability(material)
+    parts += _reliability(data)
     if states is not None and len(states):
         shares = np.bincount(states.astype(np.uint8), minlength=256)[: len(STATES)] / len(states)
         rows = [(state.name, state.color, float(share)) for state, share in zip(STATES, shares, strict=True)]
@@ -35,9 +35,9 @@ def certainty_section(material: Material) -> str:
     return f'<div class="columns">{"".join(parts)}</div>' if parts else ""
 
 
-def _reliability(material: Material) -> list[str]:
+def _reliability(data: ReportData) -> list[str]:
     """The reliability curve as a list of one block; empty without truth."""
-    figures = material.figures("reliability")
+    figures = data.figures("reliability")
     rows = figures.get("bins")
     if (
         not isinstance(rows, list)

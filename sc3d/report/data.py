@@ -38,7 +38,7 @@ _STAGES = (
 
 
 @dataclass(frozen=True)
-class Material:
+class ReportData:
     """Everything a report may show.
 
     cloud: the labelled cloud, else the seeds, else the bare cloud; mesh: the surface
@@ -93,13 +93,13 @@ class Material:
         return found if isinstance(found, dict) else {}
 
 
-def gather(scene: Scene) -> Material:
+def load_report_data(scene: Scene) -> ReportData:
     """Read whatever of a scene exists; InputError for files that exist and are broken."""
     cloud_file = next((path for path in (scene.labelled, scene.seeds, scene.cloud) if path.exists()), None)
     metrics = read_json(scene.metrics) if scene.metrics.exists() else {}
     if not isinstance(metrics, dict):
         raise InputError(f"{scene.metrics} must hold an object: run `sc3d evaluate {scene.path} --overwrite`")
-    return Material(
+    return ReportData(
         scene=scene,
         class_table=scene.class_table() if scene.classes.exists() else None,
         cloud=None if cloud_file is None else read_cloud(cloud_file),

@@ -14,7 +14,7 @@ import numpy as np
 from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View
 from sc3d.io.images import read_image, read_index_image
-from sc3d.report.data import Material
+from sc3d.report.data import ReportData
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.view import screenshot
 from sc3d.view.colors import COLORINGS, color_points
@@ -28,7 +28,7 @@ _PHOTO_SIZE = 640  # px, longest side of a photo in the comparison
 _MAX_POINTS = 1_500_000
 
 
-def cloud_pictures(material: Material) -> dict[tuple[str, str], tuple[str, float]]:
+def cloud_pictures(data: ReportData) -> dict[tuple[str, str], tuple[str, float]]:
     """Data URIs and width/height by (coloring or "mesh", "oblique" or "above"), of what the cloud has; empty
     where no renderer works.
     """
@@ -38,32 +38,32 @@ def cloud_pictures(material: Material) -> dict[tuple[str, str], tuple[str, float
             style = Style(
                 from_above=direction == "above", legend=False, background=BACKGROUND, max_points=_MAX_POINTS
             )
-            if material.cloud is not None:
-                point_image = draw_points(material.points, None, size, style)
-                for by, colors in _colorings(material).items():
+            if data.cloud is not None:
+                point_image = draw_points(data.points, None, size, style)
+                for by, colors in _colorings(data).items():
                     painted = point_image.paint(colors, replace(style, shading=0.0 if by == "photo" else 0.6))
                     pictures[by, direction] = _picture(painted)
-            if material.mesh is not None:
-                pictures["mesh", direction] = _picture(screenshot(material.mesh, None, size, style))
+            if data.mesh is not None:
+                pictures["mesh", direction] = _picture(screenshot(data.mesh, None, size, style))
     except Sc3dError as error:
         logger.warning("the report has no pictures of the cloud: %s", error)
     return pictures
 
 
-def _colorings(material: Material) -> dict[str, np.ndarray]:
+def _colorings(data: ReportData) -> dict[str, np.ndarray]:
     """(N, 3) uint8 RGB by coloring, for the attributes that the cloud has."""
     found = {}
     for by in COLORINGS:
         with suppress(InputError):
-            found[by] = color_points(material.cloud, by, material.class_table)
+            found[by] = color_points(data.cloud, by, data.class_table)
     return found
 
 
-def comparison(material: Material, view: View, labelled: LabelledSurface | None) -> list[tuple[str, str]]:
+def comparison(data: ReportData, view: View, labelled: LabelledSurface | None) -> list[tuple[str, str]]:
     """Captions and data URIs of one photo: the photo, the given mask, the fused labels and the truth, as far
     as they exist.
     """
-    scene, stem = material.scene, Path(view.name).stem
+    scene, stem = data.scene, Path(view.name).stem
     scale = min(1.0, _PHOTO_SIZE / max(view.width, view.height))
     size = max(1, round(view.width * scale)), max(1, round(view.height * scale))
     panels = []
@@ -74,13 +74,13 @@ def comparison(material: Material, view: View, labelled: LabelledSurface | None)
                 jpeg(cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA)),
             )
         )
-    if material.class_table is None:
+    if data.class_table is None:
         return panels
-    palette = material.class_table.palette
+    palette = data.class_table.palette
     for caption, file in (
         ("given mask", scene.masks / f"{stem}.png"),
         ("fused labels", None),
-        ("truth", material.truth / f"{stem}.png"),
+        ("truth", data.truth / f"{stem}.png"),
     ):
         if file is None and labelled is not None:
             labels, _ = labelled.see(view, size)

@@ -8,20 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.geometry.raster import Grid, highest_points, spacing_of_all
+from sc3d.geometry.raster import Raster, highest_points, spacing_of_all
 from sc3d.report.charts import css_color, formatted, number
-from sc3d.report.data import Material
+from sc3d.report.data import ReportData
 
 _CELL = 2.0  # side of the cells that areas are counted in, point spacings
 # file names of `sc3d export --format objects`, and what they hold
 _LAYERS = {"buildings": "buildings", "trees": "trees"}
 
 
-def found_section(material: Material) -> str:
+def found_section(data: ReportData) -> str:
     """Area, points and confidence of each class; number and size of the objects, where `export --format
     objects` counted them.
     """
-    return _class_table(material) + _object_table(material)
+    return _class_table(data) + _object_table(data)
 
 
 def class_areas(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
@@ -30,33 +30,33 @@ def class_areas(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
     points: (N, 3) world, z up; labels: (N,) uint8
     """
-    grid = Grid.around(points, _CELL * spacing_of_all(points))
+    grid = Raster.around(points, _CELL * spacing_of_all(points))
     rows = highest_points(grid, points).ravel()
     return np.bincount(labels[rows[rows >= 0]], minlength=256) * grid.pixel**2
 
 
-def iou_of(material: Material, source: str) -> dict[str, float | None]:
+def iou_of(data: ReportData, source: str) -> dict[str, float | None]:
     """IoU by class name of "labels" or "masks"; empty without metrics."""
-    found = material.figures(source).get("iou")
+    found = data.figures(source).get("iou")
     return {str(name): number(value) for name, value in found.items()} if isinstance(found, dict) else {}
 
 
-def _class_table(material: Material) -> str:
-    counts = material.label_counts
-    if counts is None or material.class_table is None or not len(material.points):
+def _class_table(data: ReportData) -> str:
+    counts = data.label_counts
+    if counts is None or data.class_table is None or not len(data.points):
         return ""
     labels, confidence, iou = (
-        material.values("label"),
-        material.values("confidence"),
-        iou_of(material, "labels"),
+        data.values("label"),
+        data.values("confidence"),
+        iou_of(data, "labels"),
     )
-    areas = class_areas(material.points, labels.astype(np.uint8))
+    areas = class_areas(data.points, labels.astype(np.uint8))
     sums, rows = (
         None if confidence is None else np.bincount(labels, np.nan_to_num(confidence), minlength=256),
         [],
     )
-    for label in [*(entry.id for entry in material.class_table), *([0] if counts[0] else [])]:
-        name = material.class_table.name(label)
+    for label in [*(entry.id for entry in data.class_table), *([0] if counts[0] else [])]:
+        name = data.class_table.name(label)
         mean = "–" if sums is None or not counts[label] else f"{sums[label] / counts[label]:.2f}"
         cells = [
             f"{areas[label]:,.0f}",
@@ -64,7 +64,7 @@ def _class_table(material: Material) -> str:
             f"{counts[label]:,}",
         ] + ([mean] if sums is not None else [])
         cells += [formatted(iou.get(name), ".3f")] if iou else []
-        swatch = f'<i style="background:{css_color(material.class_table.palette[label])}"></i>'
+        swatch = f'<i style="background:{css_color(data.class_table.palette[label])}"></i>'
         rows.append([f"{swatch}{escape(name)}", *cells])
     heads = (
         ["Class", "Area, m²", "Share", "Points"]
@@ -77,14 +77,14 @@ def _class_table(material: Material) -> str:
     )
 
 
-def _object_table(material: Material) -> str:
+def _object_table(data: ReportData) -> str:
     rows = []
     for stem, name in _LAYERS.items():
         objects = next(
             (
                 found
                 for file in (f"{stem}.geojson", f"{stem}_local.geojson")
-                if (found := _read(material.scene.export / file)) is not None
+                if (found := _read(data.scene.export / file)) is not None
             ),
             None,
         )

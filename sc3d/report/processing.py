@@ -6,7 +6,7 @@ import json
 from html import escape
 
 from sc3d.report.charts import formatted, number
-from sc3d.report.data import Material
+from sc3d.report.data import ReportData
 
 _BLOCKS = {
     "settings": "Settings",
@@ -16,12 +16,12 @@ _BLOCKS = {
 }
 
 
-def processing_section(material: Material) -> str:
+def processing_section(data: ReportData) -> str:
     """Time and memory per stage, then every setting and version."""
-    if not material.records:
+    if not data.records:
         return ""
     rows, details = [], []
-    for record in material.records:
+    for record in data.records:
         summary = record.get("summary") if isinstance(record.get("summary"), dict) else {}
         text = "; ".join(
             f"{key} {_plain(value)}" for key, value in summary.items() if not isinstance(value, dict | list)

@@ -16,8 +16,7 @@ from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.labelling.fusion import Cloud, Mask, fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size, read_given_cloud
 from sc3d.metrics import Confusion, total
-from sc3d.propagation import propagate as complete
-from sc3d.propagation.propagate import Evidence
+from sc3d.propagation.propagate import LabelledPoints, complete
 from sc3d.scene.labelled_cloud import REACH, LabelledSurface, point_arrays, read_surface, spacing_of
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
@@ -32,7 +31,7 @@ ReadMask = Callable[[View], Mask]
 
 
 @dataclass(frozen=True)
-class Material:
+class RefinementInputs:
     """A cloud with its surface, and the settings by which masks become labels.
 
     colors: (N, 3) uint8 or None; seen: the surface, whatever labels it has; num_ids: largest class id + 1
@@ -49,7 +48,7 @@ class Material:
         """Labels of all points from the masks of some views."""
         fusion = fuse(self.cloud, views, read, self.seen.surface, self.num_ids, self.label)
         return complete(
-            Evidence(self.cloud.points, fusion.labels, fusion.votes, self.colors),
+            LabelledPoints(self.cloud.points, fusion.labels, fusion.votes, self.colors),
             self.cloud.normals,
             self.propagate,
         )
@@ -64,7 +63,7 @@ class Material:
         ).astype(np.float32)
 
 
-def material_of(scene: Scene, masks: Masks) -> Material:
+def load_refinement_inputs(scene: Scene, masks: Masks) -> RefinementInputs:
     """What refinement needs of a scene, with the default settings of `label` and `propagate`."""
     cloud = read_given_cloud(scene, None)
     points, normals = point_arrays(cloud, np.array([view.center for view in masks.views]))
@@ -76,7 +75,7 @@ def material_of(scene: Scene, masks: Masks) -> Material:
         REACH * spacing_of(points),
     )
     colors = cloud.point.colors.numpy() if "colors" in cloud.point else None
-    return Material(
+    return RefinementInputs(
         Cloud(points, normals),
         colors,
         seen,
@@ -93,7 +92,7 @@ class Refinement:
 
     before: float
     after: float
-    material: Material
+    inputs: RefinementInputs
     labels: Labels
 
     @property
@@ -102,28 +101,30 @@ class Refinement:
 
     def confidence(self, view: View, read: ReadMask) -> np.ndarray:
         """(H, W) uint8 new confidence of a mask."""
-        return _doubted(self.material, self.labels, view, read)[1]
+        return _doubted(self.inputs, self.labels, view, read)[1]
 
 
-def refine(material: Material, views: list[View], read: ReadMask) -> Refinement:
+def refine(inputs: RefinementInputs, views: list[View], read: ReadMask) -> Refinement:
     """Fuse, lower the confidence of what contradicts, fuse again: once without every 4th photo, to see
     whether it helps there, and once with all.
     """
     ordered = sorted(views, key=lambda view: view.name)
     asked = ordered[EVERY // 2 :: EVERY]
     kept = [view for view in ordered if view not in asked]
-    first = material.labels(kept, read)
-    second = material.labels(kept, lambda view: _doubted(material, first, view, read))
-    before, after = (_agreement(material, labels, asked, read) for labels in (first, second))
+    first = inputs.labels(kept, read)
+    second = inputs.labels(kept, lambda view: _doubted(inputs, first, view, read))
+    before, after = (_agreement(inputs, labels, asked, read) for labels in (first, second))
     logger.info(
         "photos left out: mIoU of their masks with the fused labels %.2f %%, with doubted masks %.2f %%",
         100 * before,
         100 * after,
     )
-    return Refinement(before, after, material, material.labels(ordered, read) if after > before else first)
+    return Refinement(before, after, inputs, inputs.labels(ordered, read) if after > before else first)
 
 
-def doubt(mask: np.ndarray, confidence: np.ndarray | None, fused: np.ndarray, sure: np.ndarray) -> np.ndarray:
+def downweight_conflicts(
+    mask: np.ndarray, confidence: np.ndarray | None, fused: np.ndarray, sure: np.ndarray
+) -> np.ndarray:
     """(H, W) uint8 confidence c (1 - p) where the fused label is another than the mask's, c elsewhere.
 
     mask, fused: (H, W) uint8 ids, 0 = no label; confidence c: (H, W) uint8, None = full; sure: (H, W)
@@ -134,14 +135,16 @@ def doubt(mask: np.ndarray, confidence: np.ndarray | None, fused: np.ndarray, su
     return np.where(contradicted, np.rint(given * (1 - np.clip(sure, 0, 1))), given).astype(np.uint8)
 
 
-def _doubted(material: Material, labels: Labels, view: View, read: ReadMask) -> Mask:
+def _doubted(inputs: RefinementInputs, labels: Labels, view: View, read: ReadMask) -> Mask:
     mask, confidence = read(view)
-    return mask, doubt(mask, confidence, *material.render(labels, view, mask.shape[::-1]))
+    return mask, downweight_conflicts(mask, confidence, *inputs.render(labels, view, mask.shape[::-1]))
 
 
-def _agreement(material: Material, labels: Labels, views: list[View], read: ReadMask) -> float:
+def _agreement(inputs: RefinementInputs, labels: Labels, views: list[View], read: ReadMask) -> float:
     parts = []
     for view in tqdm(views, desc="photos left out", unit="photo", disable=None):
         mask = read(view)[0]
-        parts.append(Confusion.of(mask, material.render(labels, view, mask.shape[::-1])[0], material.num_ids))
-    return total(parts, material.num_ids).mean_iou
+        parts.append(
+            Confusion.from_labels(mask, inputs.render(labels, view, mask.shape[::-1])[0], inputs.num_ids)
+        )
+    return total(parts, inputs.num_ids).mean_iou

@@ -27,7 +27,7 @@ from sc3d.splatting.dataset import TrainingData, scene_data
 from sc3d.splatting.evaluation import held_out_scores
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.train import TrainResult, train
-from sc3d.tiling.executor import Tasks
+from sc3d.tiling.executor import Executor
 
 GPU = {"GPU": 1}  # what a worker must offer to get a block, with --device cuda
 
@@ -45,7 +45,7 @@ class BlockJob:
     progress: bool = True
 
 
-def train_blocks(job: BlockJob, data: TrainingData, tasks: Tasks) -> tuple[TrainResult, dict[str, object]]:
+def train_blocks(job: BlockJob, data: TrainingData, tasks: Executor) -> tuple[TrainResult, dict[str, object]]:
     """Train all blocks and put them together.
 
     returns: the result as `train` has it, with "block" in the rows of the log, the last of which is about

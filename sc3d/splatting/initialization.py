@@ -50,7 +50,7 @@ class _Layer:
     high: float
 
     @classmethod
-    def of(cls, points: np.ndarray, views: list[View]) -> _Layer | None:
+    def from_points(cls, points: np.ndarray, views: list[View]) -> _Layer | None:
         """The layer of the sparse points, across the mean viewing direction; None if a camera is not above
         it: then it is no flight.
         """
@@ -86,7 +86,7 @@ def fill_points(
     )
     step = max(4.0, np.sqrt(num_pixels / max(budget, 1)))
     grays = [_small_gray(data, index) for index in range(len(data.views))]
-    layer = _Layer.of(np.asarray(data.points, np.float64), data.views)
+    layer = _Layer.from_points(np.asarray(data.points, np.float64), data.views)
     found, colors, sizes = [], [], []
     for index, view in enumerate(data.views):
         sight = _sight(data, index, step)

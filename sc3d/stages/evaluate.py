@@ -12,12 +12,12 @@ from sc3d.geometry.cameras import View
 from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.images import read_index_image
 from sc3d.io.json_files import write_json
-from sc3d.metrics import Confusion, JudgedPixels, Reliability, depth_edge_band, total
+from sc3d.metrics import Confusion, EvaluationPixels, Reliability, depth_edge_band, total
 from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Evaluate
-from sc3d.tiling.evaluate import BYTES, TiledSurface, look_by_tiles, read_labels
-from sc3d.tiling.executor import open_tasks
+from sc3d.tiling.evaluate import BYTES, TiledSurface, find_points_by_tiles, read_labels
+from sc3d.tiling.executor import open_executor
 from sc3d.tiling.memory import TRIANGLE, fits, mesh_triangles, num_points
 
 SOURCES = ("labels", "masks", "labels_near_edges", "labels_elsewhere")  # order of the figures
@@ -51,8 +51,8 @@ def run(scene: Scene, settings: Evaluate) -> dict[str, object]:
     else:
         cloud = CloudFile.open(path)
         labels = read_labels(cloud)
-        with open_tasks(settings) as tasks:
-            surface = look_by_tiles(scene, settings, cloud, tasks)
+        with open_executor(settings) as tasks:
+            surface = find_points_by_tiles(scene, settings, cloud, tasks)
     views = [view for view in scene.model.views if view.name in truth_files]
     per_photo, beliefs = {}, []
     for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
@@ -76,7 +76,7 @@ def run(scene: Scene, settings: Evaluate) -> dict[str, object]:
         name: {key: confusion.summary(class_table) for key, confusion in confusions.items()}
         for name, confusions in per_photo.items()
     }
-    believed = Reliability.total(beliefs).summary() if beliefs else {}
+    believed = Reliability.merge(beliefs).summary() if beliefs else {}
     metrics = {
         "photos": [view.name for view in views],
         "classes": [entry.name for entry in class_table],
@@ -89,13 +89,13 @@ def run(scene: Scene, settings: Evaluate) -> dict[str, object]:
 
 def _judged(
     surface: LabelledSurface | TiledSurface, view: View, truth: np.ndarray, band: float
-) -> JudgedPixels:
+) -> EvaluationPixels:
     """The pixels of a photo that have truth, and the cloud point that each shows."""
     rows, first = surface.rows(view, truth.shape[::-1], truth > 0)
-    return JudgedPixels.of(truth, rows, depth_edge_band(first.range, band))
+    return EvaluationPixels.from_photo(truth, rows, depth_edge_band(first.range, band))
 
 
-def _confusions(pixels: JudgedPixels, label: np.ndarray, num_ids: int) -> dict[str, Confusion]:
+def _confusions(pixels: EvaluationPixels, label: np.ndarray, num_ids: int) -> dict[str, Confusion]:
     near, elsewhere = pixels.confusions(pixels.look_up(label), num_ids)
     return {"labels": near + elsewhere, "labels_near_edges": near, "labels_elsewhere": elsewhere}
 
@@ -104,7 +104,7 @@ def _masks(truth: np.ndarray, mask: np.ndarray | None, num_ids: int) -> dict[str
     if mask is None:
         return {}
     return {
-        "masks": Confusion.of(
+        "masks": Confusion.from_labels(
             truth, cv2.resize(mask, truth.shape[::-1], interpolation=cv2.INTER_NEAREST), num_ids
         )
     }

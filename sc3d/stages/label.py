@@ -17,7 +17,7 @@ from sc3d.scene.labelled_cloud import point_arrays, read_surface, with_labels
 from sc3d.scene.labels import STATE_NAMES
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
-from sc3d.tiling.executor import open_tasks
+from sc3d.tiling.executor import open_executor
 from sc3d.tiling.label import BYTES, label_tiles
 from sc3d.tiling.memory import TRIANGLE, fits, mesh_triangles, num_points
 
@@ -41,11 +41,11 @@ def outputs(scene: Scene, settings: Label) -> list[Path]:
 def run(scene: Scene, settings: Label) -> dict[str, object]:
     source = settings.cloud or scene.cloud
     if not _fits(scene, source, settings):
-        with open_tasks(settings) as tasks:
+        with open_executor(settings) as tasks:
             counts, settings, num_views = label_tiles(scene, settings, CloudFile.open(source), tasks)
         return _summary(counts, settings.voxel_size, num_views)
     masks, cloud = (
-        Masks.of(scene, best_confidence(scene) if settings.use_confidence else None),
+        Masks.load(scene, best_confidence(scene) if settings.use_confidence else None),
         read_given_cloud(scene, settings.cloud),
     )
     views = masks.views

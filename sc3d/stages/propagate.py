@@ -9,13 +9,12 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.clouds import write_geometry
-from sc3d.propagation import propagate as complete
-from sc3d.propagation.propagate import Evidence
+from sc3d.propagation.propagate import LabelledPoints, complete
 from sc3d.scene.labelled_cloud import read_labelled, read_votes, with_labels
 from sc3d.scene.labels import PROPAGATED
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
-from sc3d.tiling.executor import open_tasks
+from sc3d.tiling.executor import open_executor
 from sc3d.tiling.memory import fits, num_points
 from sc3d.tiling.propagate import BYTES, Summary, propagate_tiles
 
@@ -32,7 +31,7 @@ def run(scene: Scene, settings: Propagate) -> dict[str, object]:
     path = settings.seeds or scene.seeds
     count = num_points(path)
     if count is not None and not fits(count * BYTES, settings):
-        with open_tasks(settings) as tasks:
+        with open_executor(settings) as tasks:
             return _summary(propagate_tiles(scene, settings, CloudFile.open(path), tasks))
     cloud, seeds = read_labelled(path, "label")
     votes = read_votes(cloud)
@@ -46,7 +45,9 @@ def run(scene: Scene, settings: Propagate) -> dict[str, object]:
         )
     points = cloud.point.positions.numpy().astype(np.float64)
     normals = cloud.point.normals.numpy()
-    evidence = Evidence(points, seeds, votes, cloud.point.colors.numpy() if "colors" in cloud.point else None)
+    evidence = LabelledPoints(
+        points, seeds, votes, cloud.point.colors.numpy() if "colors" in cloud.point else None
+    )
     labels = complete(evidence, normals, settings)
     write_geometry(settings.output or scene.labelled, with_labels(cloud, normals, labels))
     labelled = labels.label > 0

@@ -134,14 +134,14 @@ def with_prompts(class_table: ClassTable, prompts: tuple[str, ...]) -> ClassTabl
 def _refine(scene: Scene, settings: Segment) -> dict[str, object]:
     """Lower the confidence of doubted masks, if that helps."""
     from sc3d.labelling.inputs import Masks
-    from sc3d.segmentation.mask_refinement import material_of, refine
+    from sc3d.segmentation.mask_refinement import load_refinement_inputs, refine
 
     if settings.backend != "files" or settings.masks is not None:
         raise InputError(
             "--refine works on the masks that are in the scene: make them first, then run `sc3d segment SCENE --refine`"
         )
-    masks = Masks.of(scene, scene.confidence)
-    refinement = refine(material_of(scene, masks), masks.views, masks.read)
+    masks = Masks.load(scene, scene.confidence)
+    refinement = refine(load_refinement_inputs(scene, masks), masks.views, masks.read)
     if refinement.helps:
         with atomic_path(scene.confidence_refined) as folder:
             folder.mkdir()

@@ -15,7 +15,7 @@ from sc3d.splatting.blocks import split_blocks
 from sc3d.splatting.dataset import TrainingData, scene_data
 from sc3d.splatting.device import pick_device
 from sc3d.splatting.train import TrainResult, train, write_log
-from sc3d.tiling.executor import open_tasks
+from sc3d.tiling.executor import open_executor
 from sc3d.view.contact_sheet import write_training_sheet
 
 
@@ -69,7 +69,7 @@ def _train_blocks(
     blocks = tuple(split_blocks(data.points, settings.blocks))
     here = not settings.workers and not settings.cluster
     job = BlockJob(scene.path.absolute(), settings.training, blocks, folder.absolute(), progress=here)
-    with open_tasks(settings) as tasks:
+    with open_executor(settings) as tasks:
         return train_blocks(job, data, tasks)
 
 

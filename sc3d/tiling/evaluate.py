@@ -20,18 +20,18 @@ from sc3d.scene.labelled_cloud import REACH
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Evaluate
-from sc3d.tiling.executor import Tasks
+from sc3d.tiling.executor import Executor
 from sc3d.tiling.label import sample_spacing
-from sc3d.tiling.memory import Parts, max_points, memory_of
+from sc3d.tiling.memory import WorkFolder, max_points, memory_of
 from sc3d.tiling.ranges import RangeMaps
-from sc3d.tiling.store import Results, Survey, TileStore
+from sc3d.tiling.store import CloudStatistics, Results, TileStore
 from sc3d.tiling.surfaces import RangeJob, compute_ranges, split_mesh, split_surfels, views_of
 
 BYTES = 260  # of a point while pixels look for the nearest one
 
 
 @dataclass(frozen=True)
-class LookJob:
+class EvaluateJob:
     """What the task of a tile needs to know. truth: file of the truth mask of each view; reach: largest
     distance of a pixel's point, world units
     """
@@ -49,8 +49,8 @@ class LookJob:
 class TiledSurface:
     """Stands for `labelled.LabelledSurface` where only pixels with truth are asked for."""
 
-    job: LookJob
-    parts: Parts
+    job: EvaluateJob
+    parts: WorkFolder
 
     def rows(self, view: View, size: tuple[int, int], wanted: np.ndarray) -> tuple[np.ndarray, FirstSurface]:
         """(H, W) int64 row of the cloud at each wanted pixel, -1 = nothing near; the first surface. size:
@@ -65,17 +65,17 @@ class TiledSurface:
         return np.where(wanted, rows.reshape(size[::-1]), -1), first_surface(job.maps, view.resized(*size))
 
 
-def look_by_tiles(scene: Scene, settings: Evaluate, cloud: CloudFile, tasks: Tasks) -> TiledSurface:
+def find_points_by_tiles(scene: Scene, settings: Evaluate, cloud: CloudFile, tasks: Executor) -> TiledSurface:
     """Find the cloud's point at all pixels that have truth, tile by tile."""
     truth = scene.mask_files(settings.truth or scene.truth, scene.class_table())
     views = [view for view in scene.model.views if view.name in truth]
-    parts = Parts(
+    parts = WorkFolder(
         settings.output or scene.metrics,
         "evaluate",
         [scene.sparse, scene.mesh, settings.truth or scene.truth, cloud.path],
         settings,
     )
-    survey = Survey.of(cloud)
+    survey = CloudStatistics.from_cloud(cloud)
     store = TileStore.build(
         cloud, survey.grid(max_points(settings, BYTES), REACH * survey.spacing), parts.subfolder("tiles")
     )
@@ -91,7 +91,7 @@ def look_by_tiles(scene: Scene, settings: Evaluate, cloud: CloudFile, tasks: Tas
         RangeJob(scene.path, mesh, maps, {view.name: image_size(truth[view.name]) for view in views}), tasks
     )
     results = Results(parts.subfolder("results"), store)
-    job = LookJob(
+    job = EvaluateJob(
         scene.path,
         {view.name: truth[view.name] for view in views},
         survey.extent.low,
@@ -100,11 +100,11 @@ def look_by_tiles(scene: Scene, settings: Evaluate, cloud: CloudFile, tasks: Tas
         maps,
         REACH * spacing,
     )
-    tasks.run("looking", partial(look_at_tile, job), store.tiles)
+    tasks.run("looking", partial(find_points_in_tile, job), store.tiles)
     return TiledSurface(job, parts)
 
 
-def look_at_tile(job: LookJob, tile: int) -> None:
+def find_points_in_tile(job: EvaluateJob, tile: int) -> None:
     """Pixels whose first surface lies in the tile, and the nearest point of each: (2, K) int64 pixel and row
     of the cloud, for every view.
     """

@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 RETRIES = 3  # of a task whose worker is lost; more, and the task itself is what kills it
 
 
-class Tasks(Protocol):
+class Executor(Protocol):
     """Runs a function on items; the results come in the order of the items. needs: what a Dask worker must
     offer for one task, such as {"GPU": 1}
     """
@@ -35,7 +35,7 @@ class Tasks(Protocol):
     ) -> list: ...
 
 
-class Here:
+class SerialExecutor:
     """One after another in this process."""
 
     def run(
@@ -44,7 +44,7 @@ class Here:
         return [function(item) for item in tqdm(items, desc=name, disable=None)]
 
 
-class OnDask:
+class DaskExecutor:
     """On the workers of a Dask cluster."""
 
     def __init__(self, client: object) -> None:
@@ -77,12 +77,12 @@ class OnDask:
 
 
 @contextmanager
-def open_tasks(resources: Workers) -> Iterator[Tasks]:
+def open_executor(resources: Workers) -> Iterator[Executor]:
     """Here, or the workers that the options ask for. InputError if Dask is missing or the scheduler does not
     answer.
     """
     if not resources.cluster and resources.workers < 1:
-        yield Here()
+        yield SerialExecutor()
         return
     try:
         from distributed import Client, LocalCluster
@@ -95,7 +95,7 @@ def open_tasks(resources: Workers) -> Iterator[Tasks]:
         except (OSError, ValueError) as error:
             raise InputError(f"no Dask scheduler answers at {resources.cluster}: {error}") from None
         with client, client.as_current():
-            yield OnDask(client)
+            yield DaskExecutor(client)
         return
     threads = max(1, (os.cpu_count() or 1) // resources.workers)
     environment = {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
@@ -112,7 +112,7 @@ def open_tasks(resources: Workers) -> Iterator[Tasks]:
     os.environ.update(environment)
     try:
         with cluster() as local, Client(local, set_as_default=False) as client, client.as_current():
-            yield OnDask(client)
+            yield DaskExecutor(client)
     finally:
         for name, value in before.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})

@@ -21,10 +21,10 @@ from sc3d.labelling.inputs import FOOTPRINT_SAMPLE, Masks, best_confidence, poin
 from sc3d.scene.labelled_cloud import SPACING_NEIGHBORS, SPACING_SAMPLE, VOTES, unit_normals
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
-from sc3d.tiling.executor import Tasks
-from sc3d.tiling.memory import Parts, max_points, memory_of
+from sc3d.tiling.executor import Executor
+from sc3d.tiling.memory import WorkFolder, max_points, memory_of
 from sc3d.tiling.ranges import RangeMaps
-from sc3d.tiling.store import Results, Survey, TileStore
+from sc3d.tiling.store import CloudStatistics, Results, TileStore
 from sc3d.tiling.surfaces import RangeJob, compute_ranges, split_mesh, split_surfels
 from sc3d.tiling.voxel_file import write_field
 
@@ -56,7 +56,7 @@ class LabelJob:
 
 
 def label_tiles(
-    scene: Scene, settings: Label, cloud: CloudFile, tasks: Tasks
+    scene: Scene, settings: Label, cloud: CloudFile, tasks: Executor
 ) -> tuple[np.ndarray, Label, int]:
     """Label a cloud tile by tile and write it; returns the number of points in each state, the settings with
     the voxel size, and the number of views.
@@ -66,9 +66,9 @@ def label_tiles(
             "--surface voxels needs the cloud in memory as a whole: take surfels, or allow more with --max-memory"
         )
     confidence = best_confidence(scene) if settings.use_confidence else None
-    masks = Masks.of(scene, confidence)
+    masks = Masks.load(scene, confidence)
     output = settings.output or scene.seeds
-    parts = Parts(
+    parts = WorkFolder(
         output,
         "label",
         [
@@ -81,7 +81,7 @@ def label_tiles(
         ],
         settings,
     )
-    survey = Survey.of(cloud)
+    survey = CloudStatistics.from_cloud(cloud)
     margin = BLOCKS * BLOCK * (settings.voxel_size or VOXEL * survey.spacing)
     store = TileStore.build(cloud, survey.grid(max_points(settings, BYTES), margin), parts.subfolder("tiles"))
     spacing, sample = sample_spacing(store, survey)
@@ -105,7 +105,13 @@ def label_tiles(
 
 
 def _ranges(
-    scene: Scene, masks: Masks, store: TileStore, spacing: float, settings: Label, parts: Parts, tasks: Tasks
+    scene: Scene,
+    masks: Masks,
+    store: TileStore,
+    spacing: float,
+    settings: Label,
+    parts: WorkFolder,
+    tasks: Executor,
 ) -> RangeMaps:
     origin = local_origin(masks.views)
     if scene.mesh.exists() and settings.surface == "auto":
@@ -127,7 +133,7 @@ def _ranges(
     )
 
 
-def sample_spacing(store: TileStore, survey: Survey) -> tuple[float, np.ndarray]:
+def sample_spacing(store: TileStore, survey: CloudStatistics) -> tuple[float, np.ndarray]:
     """Sampling distance as `labelled.spacing_of` has it, and the points (S, 3) by which `default_voxel_size`
     measures mask pixels.
     """
@@ -160,7 +166,7 @@ def label_tile(job: LabelJob, tile: int) -> None:
     scene, store = Scene(job.scene), job.store
     window = store.window(tile, job.margin)
     records = window.gather(store.records)
-    points, masks = positions(records), Masks.of(scene, job.confidence)
+    points, masks = positions(records), Masks.load(scene, job.confidence)
     normals = unit_normals(
         columns(records, ("nx", "ny", "nz")),
         points,
@@ -205,20 +211,20 @@ def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.nd
 
 def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndarray:
     """The cloud with the labels of its tiles; returns the number of points in each state."""
-    added = [
+    sum_statistics = [
         ("label", "u1"),
         ("confidence", "f4"),
         ("state", "u1"),
         ("num_views", "i4"),
         *((f"{VOTES}{label}", "f4") for label in range(num_ids)),
     ]
-    names = {name for name, _ in added} | {"nx", "ny", "nz"}
+    names = {name for name, _ in sum_statistics} | {"nx", "ny", "nz"}
     kept = [
         (name, cloud.dtype[name].str[1:])
         for name in cloud.dtype.names
         if name not in names and not name.startswith(VOTES)
     ]
-    dtype = np.dtype([*kept, ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), *added])
+    dtype = np.dtype([*kept, ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), *sum_statistics])
     counts = np.zeros(8, np.int64)
 
     def chunks():

@@ -64,7 +64,7 @@ def mesh_triangles(path: Path) -> int:
     return face.rows if face is not None else 0
 
 
-class Parts:
+class WorkFolder:
     """A folder for what a stage has finished, beside its output: hidden, named after all that decides its
     content, and removed with the last output.
     """

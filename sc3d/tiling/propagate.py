@@ -21,33 +21,39 @@ from scipy.sparse.csgraph import connected_components
 
 from sc3d.errors import InputError
 from sc3d.io.chunked_clouds import CloudFile, write_ply
-from sc3d.propagation.appearance import MIN_EXAMPLES, Lesson, Raters, feature_counts, folds_of
+from sc3d.propagation.appearance import (
+    MIN_EXAMPLES,
+    AppearanceModel,
+    AppearanceStatistics,
+    feature_counts,
+    folds_of,
+)
 from sc3d.propagation.potts import STEPS
 from sc3d.propagation.propagate import (
-    added,
+    appearance_marginals,
     decided,
     examples_in,
     final_labels,
-    is_skilled,
-    needs_raters,
-    rated_belief,
+    is_skillful,
+    needs_appearance,
     spread,
-    unrated_belief,
+    sum_statistics,
     verified,
     views_to_agree,
+    vote_marginals,
 )
-from sc3d.propagation.quantile_sketch import Counts
+from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.region_growing import vote_nearest
-from sc3d.propagation.terrain import WINDOWS, Lean, Terrain
+from sc3d.propagation.terrain import WINDOWS, GroundModel, NormalStatistics
 from sc3d.scene.labelled_cloud import VOTES
 from sc3d.scene.labels import PROPAGATED
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
-from sc3d.tiling.executor import Tasks
+from sc3d.tiling.executor import Executor
 from sc3d.tiling.label import sample_spacing
-from sc3d.tiling.memory import Parts, max_points
-from sc3d.tiling.propagation_tiles import Part, PropagateJob, cells_of
-from sc3d.tiling.store import Results, Survey, TileStore
+from sc3d.tiling.memory import WorkFolder, max_points
+from sc3d.tiling.propagation_tiles import PropagateJob, TileGraph, cells_of
+from sc3d.tiling.store import CloudStatistics, Results, TileStore
 
 logger = logging.getLogger(__name__)
 
@@ -68,7 +74,7 @@ class Summary:
     confidence: float
 
 
-def propagate_tiles(scene: Scene, settings: Propagate, cloud: CloudFile, tasks: Tasks) -> Summary:
+def propagate_tiles(scene: Scene, settings: Propagate, cloud: CloudFile, tasks: Executor) -> Summary:
     """Complete the labels of a cloud that `label` wrote, and write it."""
     output = settings.output or scene.labelled
     num_ids = sum(name.startswith(VOTES) for name in cloud.dtype.names)
@@ -79,8 +85,8 @@ def propagate_tiles(scene: Scene, settings: Propagate, cloud: CloudFile, tasks: 
     ]
     if missing:
         raise InputError(f"{cloud.path} has no attribute {missing[0]!r}: it was not written by `sc3d label`")
-    parts = Parts(output, "propagate", [cloud.path], settings)
-    survey = Survey.of(cloud)
+    parts = WorkFolder(output, "propagate", [cloud.path], settings)
+    survey = CloudStatistics.from_cloud(cloud)
     grid = survey.grid(max_points(settings, BYTES), HOPS * EDGE * survey.spacing)
     store = TileStore.build(cloud, grid, parts.subfolder("tiles"))
     margin = HOPS * EDGE * sample_spacing(store, survey)[0]
@@ -99,7 +105,7 @@ def propagate_tiles(scene: Scene, settings: Propagate, cloud: CloudFile, tasks: 
     return summary
 
 
-def _solve(job: PropagateJob, tasks: Tasks, path: Path) -> None:
+def _solve(job: PropagateJob, tasks: Executor, path: Path) -> None:
     """All passes; leaves arrays `label`, `confidence` and `state` of every tile."""
     tiles = job.store.tiles
     looks = tasks.run("graph", partial(_graph_task, job), tiles)
@@ -111,77 +117,79 @@ def _solve(job: PropagateJob, tasks: Tasks, path: Path) -> None:
         raise InputError(
             f"{path} has no labelled point to start from: check that masks and cloud belong together, or lower --consensus in label"
         )
-    lesson = (
-        _learn(job, tasks, Lean.total([look.lean for look in looks]), least)
-        if needs_raters(job.settings)
+    statistics = (
+        _learn(job, tasks, NormalStatistics.merge([look.lean for look in looks]), least)
+        if needs_appearance(job.settings)
         else None
     )
     source = "once"
-    if job.settings.method == "map" and lesson is not None:
+    if job.settings.method == "map" and statistics is not None:
         for turn in range(max(job.settings.rounds, 1)):
-            if turn and (lesson[0].sum(axis=0) >= MIN_EXAMPLES).sum() < 2:
+            if turn and (statistics[0].sum(axis=0) >= MIN_EXAMPLES).sum() < 2:
                 break
             source = f"round{turn}"
-            lesson = added(
-                tasks.run(f"round {turn + 1}", partial(_turn_task, job, offered, lesson, turn), tiles)
+            statistics = sum_statistics(
+                tasks.run(f"round {turn + 1}", partial(_turn_task, job, offered, statistics, turn), tiles)
             )
     else:
-        tasks.run("labels", partial(_once_task, job, offered, lesson), tiles)
+        tasks.run("labels", partial(_once_task, job, offered, statistics), tiles)
     reached = _reached(job, tasks) if job.settings.method == "map" else None
-    tasks.run("states", partial(_state_task, job, source, reached, lesson), tiles)
+    tasks.run("states", partial(_state_task, job, source, reached, statistics), tiles)
 
 
 @dataclass(frozen=True)
-class Look:
-    """First look at a tile. seeds: (C,) int64 of each class; agreement: as `Evidence.agreement`; lean: of its
+class TileSummary:
+    """First look at a tile. seeds: (C,) int64 of each class; agreement: as `LabelledPoints.agreement`; lean: of its
     surfaces
     """
 
     seeds: np.ndarray
     agreement: np.ndarray
-    lean: Lean
+    lean: NormalStatistics
 
 
-def _graph_task(job: PropagateJob, tile: int) -> Look:
-    part = Part.load(job, tile)
+def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
+    part = TileGraph.load(job, tile)
     core, start = part.core, part.known.start
-    return Look(
+    return TileSummary(
         np.bincount(start[core], minlength=job.num_ids)[1 : job.num_ids],
         part.known.agreement(core),
-        Lean.of(part.graph.normals[core], part.graph.spacings[core]),
+        NormalStatistics.from_normals(part.graph.normals[core], part.graph.spacings[core]),
     )
 
 
-def _learn(job: PropagateJob, tasks: Tasks, lean: Lean, least: int) -> Lesson | None:
+def _learn(
+    job: PropagateJob, tasks: Executor, lean: NormalStatistics, least: int
+) -> AppearanceStatistics | None:
     """What the agreed points of all tiles teach, if that does well on points held out."""
-    tiles, terrain = job.store.tiles, Terrain.over(lean, job.extent.low, job.extent.high)
+    tiles, terrain = job.store.tiles, GroundModel.from_statistics(lean, job.extent.low, job.extent.high)
     for window, ground in zip(
         WINDOWS, terrain.grounds(tasks.run("ground", partial(_lowest_task, job, terrain), tiles)), strict=True
     ):
         np.save(job.shared / f"ground{window}.npy", ground)
     counts = [
-        Counts.total(list(parts))
+        QuantileSketch.merge(list(parts))
         for parts in zip(*tasks.run("relief", partial(_relief_task, job, terrain), tiles), strict=True)
     ]
     halves = [
-        added(list(parts))
+        sum_statistics(list(parts))
         for parts in zip(
             *tasks.run("examples", partial(_lesson_task, job, counts, least), tiles), strict=True
         )
     ]
     errors = tasks.run("held-out errors", partial(_error_task, job, halves, least), tiles)
     wrong = [None if None in fold else sum(fold) for fold in zip(*errors, strict=True)]
-    lesson = added(halves)
-    return lesson if is_skilled(wrong, lesson) else None
+    statistics = sum_statistics(halves)
+    return statistics if is_skillful(wrong, statistics) else None
 
 
-def _lowest_task(job: PropagateJob, terrain: Terrain, tile: int) -> tuple[np.ndarray, np.ndarray]:
-    part = Part.load(job, tile)
+def _lowest_task(job: PropagateJob, terrain: GroundModel, tile: int) -> tuple[np.ndarray, np.ndarray]:
+    part = TileGraph.load(job, tile)
     return terrain.lowest(part.known.points[part.core])
 
 
-def _relief_task(job: PropagateJob, terrain: Terrain, tile: int) -> list[Counts]:
-    part = Part.load(job, tile)
+def _relief_task(job: PropagateJob, terrain: GroundModel, tile: int) -> list[QuantileSketch]:
+    part = TileGraph.load(job, tile)
     grounds = [np.load(job.shared / f"ground{window}.npy", allow_pickle=False) for window in WINDOWS]
     relief = terrain.features(part.graph, part.known.points, grounds)
     job.results.write(tile, relief=part.own(relief))
@@ -190,40 +198,49 @@ def _relief_task(job: PropagateJob, terrain: Terrain, tile: int) -> list[Counts]
     )
 
 
-def _lesson_task(job: PropagateJob, counts: list[Counts], least: int, tile: int) -> tuple[Lesson, Lesson]:
-    part = Part.load(job, tile)
-    raters = Raters.over(part.own_in_order(job.results.read(tile, "relief")), part.known.colors, counts)
-    job.results.write(tile, cells=part.own(cells_of(raters)))
+def _lesson_task(
+    job: PropagateJob, counts: list[QuantileSketch], least: int, tile: int
+) -> tuple[AppearanceStatistics, AppearanceStatistics]:
+    part = TileGraph.load(job, tile)
+    appearance = AppearanceModel.from_sketches(
+        part.own_in_order(job.results.read(tile, "relief")), part.known.colors, counts
+    )
+    job.results.write(tile, cells=part.own(cells_of(appearance)))
     examples, folds = (
         part.known.agreed_by(least) & part.core,
         folds_of(part.known.points, job.extent.low, job.extent.high),
     )
     return tuple(
-        raters.lesson(part.known.start, examples & (folds == fold), part.known.num_classes) for fold in (0, 1)
+        appearance.statistics(part.known.start, examples & (folds == fold), part.known.num_classes)
+        for fold in (0, 1)
     )
 
 
 def _error_task(
-    job: PropagateJob, halves: list[Lesson], least: int, tile: int
+    job: PropagateJob, halves: list[AppearanceStatistics], least: int, tile: int
 ) -> tuple[int | None, int | None]:
-    part = Part.load(job, tile)
-    raters, start = part.raters(job), part.known.start
+    part = TileGraph.load(job, tile)
+    appearance, start = part.appearance(job), part.known.start
     examples, folds = (
         part.known.agreed_by(least) & part.core,
         folds_of(part.known.points, job.extent.low, job.extent.high),
     )
-    return tuple(raters.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1))
+    return tuple(appearance.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1))
 
 
-def _turn_task(job: PropagateJob, offered: np.ndarray, lesson: Lesson, turn: int, tile: int) -> Lesson:
+def _turn_task(
+    job: PropagateJob, offered: np.ndarray, statistics: AppearanceStatistics, turn: int, tile: int
+) -> AppearanceStatistics:
     """A round of mean field; returns what its result teaches."""
-    part = Part.load(job, tile)
-    raters, known = part.raters(job), part.known
+    part = TileGraph.load(job, tile)
+    appearance, known = part.appearance(job), part.known
     if not job.results.has(tile, f"round{turn}_examples"):
         label = part.around(job, f"round{turn - 1}_label") if turn else known.start
-        evidence, belief = rated_belief(part.graph, known, offered, raters.rate(lesson, label), job.settings)
-        examples = examples_in(belief, known)
-        label, confidence = decided(part.graph, evidence, belief)
+        evidence, marginals = appearance_marginals(
+            part.graph, known, offered, appearance.log_likelihood(statistics, label), job.settings
+        )
+        examples = examples_in(marginals, known)
+        label, confidence = decided(part.graph, evidence, marginals)
         names = (f"round{turn}_label", f"round{turn}_confidence", f"round{turn}_examples")
         job.results.write(
             tile,
@@ -235,33 +252,35 @@ def _turn_task(job: PropagateJob, offered: np.ndarray, lesson: Lesson, turn: int
     label, examples = (
         part.own_in_order(job.results.read(tile, f"round{turn}_{name}")) for name in ("label", "examples")
     )
-    return raters.lesson(label, examples & part.core, known.num_classes)
+    return appearance.statistics(label, examples & part.core, known.num_classes)
 
 
-def _once_task(job: PropagateJob, offered: np.ndarray, lesson: Lesson | None, tile: int) -> None:
+def _once_task(
+    job: PropagateJob, offered: np.ndarray, statistics: AppearanceStatistics | None, tile: int
+) -> None:
     """map without raters, geometry or knn, within the margin."""
-    part = Part.load(job, tile)
+    part = TileGraph.load(job, tile)
     if job.settings.method == "map":
         label, confidence = decided(
-            part.graph, *unrated_belief(part.graph, part.known, offered, job.settings)
+            part.graph, *vote_marginals(part.graph, part.known, offered, job.settings)
         )
     else:
-        start = _start(job, part, lesson)
+        start = _start(job, part, statistics)
         label, confidence = spread(part.graph, part.known.points, start, job.settings)
     job.results.write(tile, once_label=part.own(label), once_confidence=part.own(confidence))
 
 
-def _start(job: PropagateJob, part: Part, lesson: Lesson | None) -> np.ndarray:
+def _start(job: PropagateJob, part: TileGraph, statistics: AppearanceStatistics | None) -> np.ndarray:
     """The labels of the seeds; for geometry and knn without those that look like another class."""
     start = part.known.start
     return (
         start
-        if lesson is None or job.settings.method == "map"
-        else verified(start, part.raters(job).rate(lesson, start))
+        if statistics is None or job.settings.method == "map"
+        else verified(start, part.appearance(job).log_likelihood(statistics, start))
     )
 
 
-def _reached(job: PropagateJob, tasks: Tasks) -> dict[int, np.ndarray]:
+def _reached(job: PropagateJob, tasks: Executor) -> dict[int, np.ndarray]:
     """Per tile, (K,) bool: the connected groups of its points from which some path, through whatever tiles,
     leads to a seed.
     """
@@ -284,7 +303,7 @@ def _component_task(job: PropagateJob, tile: int) -> int:
     """Number the connected groups of a part's points over the edges of the tile's own points; returns how
     many there are.
     """
-    part = Part.load(job, tile)
+    part = TileGraph.load(job, tile)
     graph, count = part.graph, len(part.core)
     rows = np.repeat(part.core, np.diff(graph.starts))
     starts = np.append(0, np.cumsum(np.where(part.core, np.diff(graph.starts), 0)))
@@ -300,7 +319,7 @@ def _link_task(job: PropagateJob, first: dict[int, int], tile: int) -> tuple[np.
     """(L, 2) pairs of groups, numbered over all tiles, that share a point, and (S,) groups of the tile that
     hold a seed.
     """
-    part = Part.load(job, tile)
+    part = TileGraph.load(job, tile)
     mine = job.results.read(tile, "all_groups").astype(np.int64) + first[tile]
     others = part.window.gather(
         lambda other: job.results.read(other, "group", mapped=True).astype(np.int64) + first[other]
@@ -310,9 +329,13 @@ def _link_task(job: PropagateJob, first: dict[int, int], tile: int) -> tuple[np.
 
 
 def _state_task(
-    job: PropagateJob, source: str, reached: dict[int, np.ndarray] | None, lesson: Lesson | None, tile: int
+    job: PropagateJob,
+    source: str,
+    reached: dict[int, np.ndarray] | None,
+    statistics: AppearanceStatistics | None,
+    tile: int,
 ) -> None:
-    part = Part.load(job, tile)
+    part = TileGraph.load(job, tile)
     label, confidence = (part.around(job, f"{source}_{name}") for name in ("label", "confidence"))
     if reached is not None:
         groups = part.window.gather(
@@ -325,7 +348,7 @@ def _state_task(
             np.where(label == 0, filled, label),
             np.where(label == 0, 0.5 * filled_confidence, confidence),
         )
-    final = final_labels(part.known.seeds, _start(job, part, lesson), label, confidence, job.settings)
+    final = final_labels(part.known.seeds, _start(job, part, statistics), label, confidence, job.settings)
     job.results.write(
         tile, label=part.own(final.label), confidence=part.own(final.confidence), state=part.own(final.state)
     )

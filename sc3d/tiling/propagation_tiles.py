@@ -12,13 +12,20 @@ import numpy as np
 from sc3d.geometry.graph import Graph, build_graph
 from sc3d.io.chunked_clouds import columns, positions
 from sc3d.labelling.fusion import Extent
-from sc3d.propagation.appearance import COLOR_BINS, COLOR_BLUR, RELIEF_BINS, RELIEF_BLUR, Cells, Raters
-from sc3d.propagation.propagate import Evidence, tie_breakers
+from sc3d.propagation.appearance import (
+    COLOR_BINS,
+    COLOR_BLUR,
+    RELIEF_BINS,
+    RELIEF_BLUR,
+    AppearanceModel,
+    Histogram,
+)
+from sc3d.propagation.propagate import LabelledPoints, tie_breakers
 from sc3d.propagation.terrain import NUM_FEATURES
 from sc3d.scene.labelled_cloud import VOTES
 from sc3d.scene.labels import Labels
 from sc3d.settings.labels import Propagate
-from sc3d.tiling.store import Results, TileStore, Window
+from sc3d.tiling.store import Results, TileStore, TileWithHalo
 
 GRAPH = tuple(field.name for field in fields(Graph))
 # of Evidence, in the order of the graph
@@ -45,23 +52,25 @@ class PropagateJob:
 
 
 @dataclass(frozen=True)
-class Part:
+class TileGraph:
     """A tile with its margin, in the canonical order of its graph. core: (N,) bool points of the tile itself"""
 
     tile: int
-    window: Window
+    window: TileWithHalo
     graph: Graph
-    known: Evidence
+    known: LabelledPoints
     core: np.ndarray
 
     @classmethod
-    def load(cls, job: PropagateJob, tile: int) -> Part:
+    def load(cls, job: PropagateJob, tile: int) -> TileGraph:
         """The graph is built at the first time and kept in files, of which a pass reads what it looks at."""
         window = job.store.window(tile, job.margin)
         if not job.results.has(tile, f"part_{KNOWN[-1]}"):
             _build(job, tile, window)
         graph, known = Graph(*_mapped(job, tile, GRAPH)), _mapped(job, tile, KNOWN)
-        evidence = Evidence(known[0], Labels(*known[2:-1]), known[1], known[-1] if job.colored else None)
+        evidence = LabelledPoints(
+            known[0], Labels(*known[2:-1]), known[1], known[-1] if job.colored else None
+        )
         return cls(tile, window, graph, evidence, window.core[graph.order])
 
     def own(self, values: np.ndarray) -> np.ndarray:
@@ -80,25 +89,25 @@ class Part:
         result[self.window.core] = values
         return result[self.graph.order]
 
-    def raters(self, job: PropagateJob) -> Raters:
+    def appearance(self, job: PropagateJob) -> AppearanceModel:
         """Histogram cells of all points of the part."""
         return raters_of(self.around(job, "cells"))
 
 
-def raters_of(cells: np.ndarray) -> Raters:
+def raters_of(cells: np.ndarray) -> AppearanceModel:
     """Raters from the cells (N, G) int32 that `cells_of` gives."""
-    relief = Cells(cells[:, -1], (RELIEF_BINS,) * NUM_FEATURES, RELIEF_BLUR)
-    return Raters(
-        (relief,) if cells.shape[1] == 1 else (Cells(cells[:, 0], (COLOR_BINS,) * 3, COLOR_BLUR), relief)
+    relief = Histogram(cells[:, -1], (RELIEF_BINS,) * NUM_FEATURES, RELIEF_BLUR)
+    return AppearanceModel(
+        (relief,) if cells.shape[1] == 1 else (Histogram(cells[:, 0], (COLOR_BINS,) * 3, COLOR_BLUR), relief)
     )
 
 
-def cells_of(raters: Raters) -> np.ndarray:
+def cells_of(appearance: AppearanceModel) -> np.ndarray:
     """(N, G) int32 cell of each point in each group."""
-    return np.stack([group.cell for group in raters.groups], axis=1)
+    return np.stack([group.cell for group in appearance.groups], axis=1)
 
 
-def _build(job: PropagateJob, tile: int, window: Window) -> None:
+def _build(job: PropagateJob, tile: int, window: TileWithHalo) -> None:
     evidence, normals = _evidence(job, window)
     colors, box = evidence.colors if job.settings.color else None, (job.extent.low, job.extent.high)
     graph = build_graph(
@@ -119,7 +128,7 @@ def _mapped(job: PropagateJob, tile: int, names: tuple[str, ...]) -> list[np.nda
     return [np.asarray(job.results.read(tile, f"part_{name}", mapped=True)) for name in names]
 
 
-def _evidence(job: PropagateJob, window: Window) -> tuple[Evidence, np.ndarray]:
+def _evidence(job: PropagateJob, window: TileWithHalo) -> tuple[LabelledPoints, np.ndarray]:
     """What is known of the window's points, by row, and their normals."""
     records = window.gather(job.store.records)
     labels = Labels(
@@ -134,6 +143,6 @@ def _evidence(job: PropagateJob, window: Window) -> tuple[Evidence, np.ndarray]:
         )
     )
     votes = columns(records, [f"{VOTES}{label}" for label in range(job.num_ids)])
-    return Evidence(positions(records), labels, votes, columns(records, ("red", "green", "blue"))), columns(
-        records, ("nx", "ny", "nz")
-    )
+    return LabelledPoints(
+        positions(records), labels, votes, columns(records, ("red", "green", "blue"))
+    ), columns(records, ("nx", "ny", "nz"))

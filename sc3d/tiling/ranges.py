@@ -19,7 +19,7 @@ from sc3d.geometry.raycast import Surface
 from sc3d.io.atomic import atomic_path
 from sc3d.io.chunked_clouds import CHUNK, positions
 from sc3d.io.ply import check_ply
-from sc3d.tiling.store import Grid
+from sc3d.tiling.store import TileGrid
 
 SLACK = 1e-5  # of the box around a part, and of a range: rays that only just reach it are cast
 
@@ -36,7 +36,7 @@ class MeshParts:
 
     @classmethod
     def split(
-        cls, triangles: Iterable[np.ndarray], grid: Grid, folder: Path, origin: np.ndarray
+        cls, triangles: Iterable[np.ndarray], grid: TileGrid, folder: Path, origin: np.ndarray
     ) -> MeshParts:
         """triangles: chunks (T, 3, 3) float64 world. Each triangle goes to the tile of its first corner.
         Parts that are there already are taken as they are.

@@ -16,14 +16,14 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
 from sc3d.io.chunked_clouds import CHUNK, CloudFile, positions
-from sc3d.labelling.fusion import MIDDLE_STEPS, Extent, count_steps, middle_of
+from sc3d.labelling.fusion import MIDDLE_STEPS, Extent, count_steps, histogram_median
 
 RASTER = 512  # cells per side in which points are counted, to choose the tiles
 MAX_TILES = 4096
 
 
 @dataclass(frozen=True)
-class Grid:
+class TileGrid:
     """Square tiles. low: (2,) corner of the first; size: side, world units; shape: tiles along both axes;
     axes: the two world axes of the ground plane.
     """
@@ -74,7 +74,7 @@ class Grid:
 
 
 @dataclass(frozen=True)
-class Survey:
+class CloudStatistics:
     """What one pass over a cloud tells: its box and median, and points per cell of a raster over the ground
     plane (RASTER, RASTER) int64.
     """
@@ -84,19 +84,21 @@ class Survey:
     counts: np.ndarray
 
     @classmethod
-    def of(cls, cloud: CloudFile) -> Survey:
+    def from_cloud(cls, cloud: CloudFile) -> CloudStatistics:
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for _, records in cloud.chunks():
             points = positions(records)
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
         axes = tuple(sorted(np.argsort(high - low, kind="stable")[1:].tolist()))
         steps, counts = np.zeros((3, MIDDLE_STEPS), np.int64), np.zeros(RASTER * RASTER, np.int64)
-        fine = Grid(low[list(axes)], float((high - low).max()) / RASTER or 1.0, (RASTER, RASTER), axes)
+        fine = TileGrid(low[list(axes)], float((high - low).max()) / RASTER or 1.0, (RASTER, RASTER), axes)
         for _, records in cloud.chunks():
             points = positions(records)
             steps += count_steps(points, low, high)
             counts += np.bincount(fine.tile_of(points), minlength=RASTER * RASTER)
-        return cls(Extent(low, high, middle_of(steps, low, high)), axes, counts.reshape(RASTER, RASTER))
+        return cls(
+            Extent(low, high, histogram_median(steps, low, high)), axes, counts.reshape(RASTER, RASTER)
+        )
 
     @property
     def spacing(self) -> float:
@@ -106,7 +108,7 @@ class Survey:
         side = float((self.extent.high - self.extent.low)[list(self.axes)].max()) / RASTER
         return side * float(np.sqrt((self.counts > 0).sum() / max(self.counts.sum(), 1)))
 
-    def grid(self, max_points: int, margin: float = 0.0) -> Grid:
+    def grid(self, max_points: int, margin: float = 0.0) -> TileGrid:
         """The largest tiles such that none holds more than about `max_points`, the margin around it (world
         units) included.
 
@@ -138,11 +140,11 @@ class Survey:
         return _square_grid(self.extent, self.axes, parts)
 
 
-def _square_grid(extent: Extent, axes: tuple[int, int], parts: int) -> Grid:
+def _square_grid(extent: Extent, axes: tuple[int, int], parts: int) -> TileGrid:
     """So many tiles along the longer side; along the shorter, as many as are needed."""
     sides = (extent.high - extent.low)[list(axes)]
     size = float(sides.max()) / parts or 1.0
-    return Grid(
+    return TileGrid(
         extent.low[list(axes)],
         size,
         tuple(int(count) for count in np.clip(np.ceil(sides / size - 1e-9), 1, parts)),
@@ -151,7 +153,7 @@ def _square_grid(extent: Extent, axes: tuple[int, int], parts: int) -> Grid:
 
 
 @dataclass(frozen=True)
-class Window:
+class TileWithHalo:
     """A tile and the points around it, by row. parts: (tile, which of its points) in turn; order: (N,) that
     sorts them; rows: (N,) int64 sorted rows in the
     cloud; core: (N,) bool, points of the tile itself."""
@@ -173,12 +175,12 @@ class TileStore:
     """
 
     folder: Path
-    grid: Grid
+    grid: TileGrid
     dtype: np.dtype
     counts: dict[int, int]
 
     @classmethod
-    def build(cls, cloud: CloudFile, grid: Grid, folder: Path) -> TileStore:
+    def build(cls, cloud: CloudFile, grid: TileGrid, folder: Path) -> TileStore:
         """Sort a cloud into tiles. A store that is there already is taken as it is: the folder's name says
         what it holds.
         """
@@ -219,7 +221,7 @@ class TileStore:
     def rows(self, tile: int) -> np.ndarray:
         return np.memmap(self.folder / f"{tile}.row", np.int64, "r")
 
-    def window(self, tile: int, margin: float) -> Window:
+    def window(self, tile: int, margin: float) -> TileWithHalo:
         """The points of a tile, and those less than `margin` (world units) around it; which these are is
         remembered in a file.
         """
@@ -242,7 +244,7 @@ class TileStore:
         order = np.argsort(rows)
         core = np.zeros(len(rows), bool)
         core[: self.counts[tile]] = True
-        return Window(parts, order, rows[order], core[order])
+        return TileWithHalo(parts, order, rows[order], core[order])
 
 
 def _append(path: Path, values: np.ndarray) -> None:
@@ -269,7 +271,7 @@ class Results:
     def read(self, tile: int, name: str, mapped: bool = False) -> np.ndarray:
         return np.load(self._path(tile, name), mmap_mode="r" if mapped else None, allow_pickle=False)
 
-    def around(self, window: Window, name: str) -> np.ndarray:
+    def around(self, window: TileWithHalo, name: str) -> np.ndarray:
         """Values of the window's points."""
         return window.gather(lambda tile: self.read(tile, name, mapped=True))
 

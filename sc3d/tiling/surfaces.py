@@ -13,10 +13,10 @@ from sc3d.geometry.cameras import View
 from sc3d.geometry.raycast import surfels
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.scene.scene import Scene
-from sc3d.tiling.executor import Tasks
+from sc3d.tiling.executor import Executor
 from sc3d.tiling.memory import BASE, TRIANGLE
 from sc3d.tiling.ranges import MeshParts, RangeMaps, read_triangles, write_ranges
-from sc3d.tiling.store import Survey, TileStore
+from sc3d.tiling.store import CloudStatistics, TileStore
 
 GROUP = 16  # views whose ranges are held at once
 SURFEL_MARGIN = 8.0  # of a tile, in point spacings: room for the neighbors of its points
@@ -34,7 +34,7 @@ class RangeJob:
     sizes: dict[str, tuple[int, int]]
 
 
-def compute_ranges(job: RangeJob, tasks: Tasks) -> RangeMaps:
+def compute_ranges(job: RangeJob, tasks: Executor) -> RangeMaps:
     """Ranges of all views in `job.sizes`; those that are there already are kept."""
     names = [
         name for name in _by_place(job) if not (job.maps.folder / f"{job.maps.numbers[name]}.npy").exists()
@@ -73,7 +73,7 @@ def split_mesh(path: Path, folder: Path, origin: np.ndarray, memory: int) -> Mes
     """Parts of a mesh file small enough for `memory` bytes."""
     vertices = CloudFile.open(path)
     # about two triangles for each vertex
-    grid = Survey.of(vertices).grid(max((memory - BASE) // TRIANGLE // 2, 1000))
+    grid = CloudStatistics.from_cloud(vertices).grid(max((memory - BASE) // TRIANGLE // 2, 1000))
     return MeshParts.split(read_triangles(path), grid, folder, origin)
 
 

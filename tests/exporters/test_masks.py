@@ -74,10 +74,10 @@ def test_doubt_is_the_product_of_confidence_and_contradiction():
     sure = np.float32([[0.9, 0.75, 1, 0], [0.5, 1.0, 1, 0.2]])
     confidence = np.uint8([[100, 200, 50, 7], [100, 100, 100, 10]])
     np.testing.assert_array_equal(
-        refinement.doubt(mask, confidence, fused, sure), [[100, 50, 50, 7], [50, 0, 100, 8]]
+        refinement.downweight_conflicts(mask, confidence, fused, sure), [[100, 50, 50, 7], [50, 0, 100, 8]]
     )
     np.testing.assert_array_equal(
-        refinement.doubt(mask, None, fused, sure), [[255, 64, 255, 255], [128, 0, 255, 204]]
+        refinement.downweight_conflicts(mask, None, fused, sure), [[255, 64, 255, 255], [128, 0, 255, 204]]
     )
 
 
@@ -110,10 +110,10 @@ def test_agreement_is_measured_on_photos_left_out(scene):
     from sc3d.scene.scene import Scene
 
     opened = Scene(scene)
-    masks = Masks.of(opened, None)
+    masks = Masks.load(opened, None)
     asked = []
     result = refinement.refine(
-        refinement.material_of(opened, masks),
+        refinement.load_refinement_inputs(opened, masks),
         masks.views,
         lambda view: asked.append(view.name) or masks.read(view),
     )

@@ -17,7 +17,7 @@ from sc3d.exporters.polygonize import main_direction, simplified, squared, trace
 from sc3d.exporters.regions import cells_by_number, connected_cells, renumbered
 from sc3d.exporters.terrain import block_medians, ground_height
 from sc3d.exporters.trees import climb, split_crowns
-from sc3d.geometry.raster import Grid
+from sc3d.geometry.raster import Raster
 from sc3d.settings.outputs import Export
 from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.cloud import truth_cloud
@@ -26,7 +26,7 @@ from tests.builders import LABELLED_CLASSES as CLASSES
 from tests.builders import labelled_cloud, write_scene
 from tests.exporters.site_truth import compare_buildings, footprint, match_trees, trees
 
-GRID = Grid(0.0, 30.0, 0.25, 120, 160)  # 40 x 30 m
+GRID = Raster(0.0, 30.0, 0.25, 120, 160)  # 40 x 30 m
 UTM = {"epsg": 32615, "offset": [576000.0, 5188000.0, 200.0]}
 
 
@@ -199,7 +199,7 @@ def test_connected_cells_against_scipy():
     )
 
 
-def box(grid: Grid, x0: float, y0: float, x1: float, y1: float) -> np.ndarray:
+def box(grid: Raster, x0: float, y0: float, x1: float, y1: float) -> np.ndarray:
     x, y = grid.centers().T
     return ((x > x0) & (x < x1) & (y > y0) & (y < y1)).reshape(grid.shape)
 

@@ -11,7 +11,7 @@ from scipy import ndimage
 from sc3d.errors import InputError, MissingPackageError
 from sc3d.exporters import orthophoto, packages
 from sc3d.geometry import raster as grids
-from sc3d.geometry.raster import Grid
+from sc3d.geometry.raster import Raster
 from sc3d.settings.outputs import Export
 from tests.builders import LABELLED_CLASSES as CLASSES
 from tests.builders import labelled_cloud, write_scene
@@ -190,7 +190,7 @@ def test_missing_package_says_how_to_get_it(monkeypatch):
 def test_highest_points_against_a_loop():
     rng = np.random.default_rng(2)
     points = np.c_[rng.uniform(0, 5, (400, 2)), rng.integers(0, 3, 400)]
-    grid = Grid.around(points, 0.7)
+    grid = Raster.around(points, 0.7)
     best = {}
     for row, cell in enumerate(grid.flat_cells(points)):
         if cell not in best or (points[row, 2], points[row, 0]) > (
@@ -205,8 +205,8 @@ def test_highest_points_against_a_loop():
 
 def test_grids_of_neighbors_share_their_lines():
     first, second = (
-        Grid.around(np.array([[576000.03, 5188000.0, 0], [576010.0, 5188010.0, 0]]), 0.3),
-        Grid.around(np.array([[576011.0, 5188007.7, 0]]), 0.3),
+        Raster.around(np.array([[576000.03, 5188000.0, 0], [576010.0, 5188010.0, 0]]), 0.3),
+        Raster.around(np.array([[576011.0, 5188007.7, 0]]), 0.3),
     )
     steps = np.array([second.left - first.left, second.top - first.top]) / 0.3
     assert np.abs(steps - np.round(steps)).max() < 1e-6

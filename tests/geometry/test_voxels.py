@@ -4,7 +4,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from sc3d.geometry.voxels import SIDES, VoxelField, normal_sides, sort_by_voxel
+from sc3d.geometry.voxels import SIDES, LabelGrid, normal_sides, sort_by_voxel
 
 
 @pytest.fixture
@@ -13,7 +13,7 @@ def points():
 
 
 def test_find_groups_points_exactly_by_voxel(points):
-    field = VoxelField.around(points, 0.2, 4)
+    field = LabelGrid.around(points, 0.2, 4)
     cells = field.find(points)
     keys = np.floor((points - field.origin) / 0.2).astype(int)
     by_key, by_cell = {}, {}
@@ -25,14 +25,14 @@ def test_find_groups_points_exactly_by_voxel(points):
 
 
 def test_cells_are_the_voxels_that_open3d_calls_by_the_same_index(points):
-    field = VoxelField.around(points, 0.2, 4)
+    field = LabelGrid.around(points, 0.2, 4)
     coordinates, indices = field.grid.voxel_coordinates_and_flattened_indices()
     centers = field.origin + coordinates.numpy().astype(np.float64) + 0.1
     np.testing.assert_array_equal(field.find(centers), indices.numpy() * SIDES)
 
 
 def test_merge_adds_and_save_round_trips(points, tmp_path):
-    one, other = VoxelField.around(points, 0.2, 4), VoxelField.around(points, 0.2, 4)
+    one, other = LabelGrid.around(points, 0.2, 4), LabelGrid.around(points, 0.2, 4)
     rng = np.random.default_rng(1)
     for field, chosen in ((one, points[:3000]), (other, points[2000:])):
         np.add.at(field.votes, (field.find(chosen), rng.integers(0, 4, len(chosen))), 1)
@@ -42,17 +42,17 @@ def test_merge_adds_and_save_round_trips(points, tmp_path):
     assert one.votes.sum() == 3000 + 3000
     one.save(tmp_path / "votes.npz")
     loaded = o3d.t.geometry.VoxelBlockGrid.load(str(tmp_path / "votes.npz"))
-    again = VoxelField(loaded, 0.2, one.origin, 4)
+    again = LabelGrid(loaded, 0.2, one.origin, 4)
     np.testing.assert_array_equal(again.votes[again.find(points)], expected)
     with pytest.raises(ValueError):
-        one.merge(VoxelField.around(points, 0.3, 4))
+        one.merge(LabelGrid.around(points, 0.3, 4))
 
 
 def test_merge_brings_blocks_that_were_not_there():
     near, far = np.zeros((1, 3)), np.full((1, 3), 50.0)
-    both = VoxelField.around(np.concatenate([near, far]), 0.5, 2)
-    one = VoxelField(VoxelField.around(near, 0.5, 2).grid, 0.5, both.origin, 2)
-    other = VoxelField.around(np.concatenate([near, far]), 0.5, 2)
+    both = LabelGrid.around(np.concatenate([near, far]), 0.5, 2)
+    one = LabelGrid(LabelGrid.around(near, 0.5, 2).grid, 0.5, both.origin, 2)
+    other = LabelGrid.around(np.concatenate([near, far]), 0.5, 2)
     other.votes[other.find(far), 1] = 7
     assert one.find(far)[0] == -1
     one.merge(other)

@@ -18,7 +18,7 @@ from PIL import Image
 from sc3d.cli import main
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, look_at, project
-from sc3d.geometry.distortion import Lens, to_camera
+from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.georeferencing.georeference import Georeference, from_origin, read_georeference, write_georeference
 from sc3d.importers.model import guess_observations
 from sc3d.importers.opensfm import _lens as opensfm_lens
@@ -96,7 +96,7 @@ def same_projections(
 
 def metashape_xml(
     views: list[View],
-    lens: dict,
+    distortion: dict,
     reference: str = "",
     transform: tuple | None = None,
     extra: str = "",
@@ -105,7 +105,7 @@ def metashape_xml(
     """Cameras as Metashape exports them; `transform`: rotation, translation and scale to geocentric (or
     local) coordinates.
     """
-    inner = "".join(f"<{name}>{value!r}</{name}>" for name, value in lens.items())
+    inner = "".join(f"<{name}>{value!r}</{name}>" for name, value in distortion.items())
     rotation, translation, scale = transform or (np.eye(3), np.zeros(3), 1.0)
     cameras = []
     for row, view in enumerate(views):
@@ -503,23 +503,28 @@ DSC00002.JPG 6000 4000
 
 
 class TestLenses:
-    LENS = Lens(4000, 3000, (3700.0, 3701.0), (2011.0, 1472.0), (-0.09, -0.076, 0.116), (0.0003, -0.0001))
+    LENS = DistortionModel(
+        4000, 3000, (3700.0, 3701.0), (2011.0, 1472.0), (-0.09, -0.076, 0.116), (0.0003, -0.0001)
+    )
 
-    def lens_project(self, lens: Lens, points: np.ndarray) -> np.ndarray:
+    def lens_project(self, distortion: DistortionModel, points: np.ndarray) -> np.ndarray:
         """Metashape's formula in plain numpy (tangential terms under OpenCV's names)."""
         x, y = (points[:, :2] / points[:, 2:]).T
-        if lens.fisheye:
+        if distortion.fisheye:
             radius = np.hypot(x, y)
             x, y = np.arctan(radius) / radius * [x, y]
         r2 = x**2 + y**2
-        factor = sum(k * r2 ** (n + 1) for n, k in enumerate(lens.radial)) + 1
-        p1, p2 = lens.tangential
+        factor = sum(k * r2 ** (n + 1) for n, k in enumerate(distortion.radial)) + 1
+        p1, p2 = distortion.tangential
         u, v = (
             x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
             y * factor + 2 * p2 * x * y + p1 * (r2 + 2 * y**2),
         )
         return np.stack(
-            [lens.focal[0] * u + lens.skew * v + lens.principal[0], lens.focal[1] * v + lens.principal[1]],
+            [
+                distortion.focal[0] * u + distortion.skew * v + distortion.principal[0],
+                distortion.focal[1] * v + distortion.principal[1],
+            ],
             axis=1,
         )
 
@@ -545,11 +550,11 @@ class TestLenses:
         ],
     )
     def test_every_lens_projects_as_its_formula(self, changes, model):
-        lens = replace(self.LENS, **changes)
-        camera = to_camera(lens, 0.01, "test")
+        distortion = replace(self.LENS, **changes)
+        camera = to_camera(distortion, 0.01, "test")
         assert camera.model_name == model
         np.testing.assert_allclose(
-            camera.img_from_cam(self.points()), self.lens_project(lens, self.points()), atol=0.01
+            camera.img_from_cam(self.points()), self.lens_project(distortion, self.points()), atol=0.01
         )
 
     @pytest.mark.parametrize(
@@ -568,14 +573,16 @@ class TestLenses:
             to_camera(replace(self.LENS, **changes), 0.01, "test")
 
     def test_tolerance_in_the_message_is_enough(self):
-        lens = replace(self.LENS, skew=-0.306)
+        distortion = replace(self.LENS, skew=-0.306)
         with pytest.raises(InputError) as caught:
-            to_camera(lens, 0.01, "test")
+            to_camera(distortion, 0.01, "test")
         tolerance = float(str(caught.value).split("--tolerance ")[1])
         assert 0.1 < tolerance < 0.2
-        camera = to_camera(lens, tolerance, "test")
+        camera = to_camera(distortion, tolerance, "test")
         assert (
-            np.abs(camera.img_from_cam(self.points(0.4)) - self.lens_project(lens, self.points(0.4))).max()
+            np.abs(
+                camera.img_from_cam(self.points(0.4)) - self.lens_project(distortion, self.points(0.4))
+            ).max()
             < tolerance
         )
 

@@ -7,7 +7,7 @@ import pytest
 
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.geometry.raycast import Surface
-from sc3d.labelling.fusion import Cloud, edge_distance, fuse, picture_of
+from sc3d.labelling.fusion import Cloud, edge_distance, fuse, observe
 from sc3d.scene.labels import LOCKED, SEED, UNLOCKED, UNSEEN
 from sc3d.settings.labels import Label
 
@@ -209,11 +209,11 @@ def test_pixel_weights_follow_the_distance_to_mask_edges():
     ranges = np.full((40, 60), 50.0, np.float32)
     confidence = np.full((40, 60), 204, np.uint8)
     edge = edge_distance(mask)
-    picture = picture_of(mask, confidence, edge, ranges, Label(edge_width=1.5))
+    picture = observe(mask, confidence, edge, ranges, Label(edge_width=1.5))
     assert edge[5, 29] == edge[5, 30] == 0.5 and edge[5, 20] == pytest.approx(9.5, abs=0.2)
     np.testing.assert_allclose(picture.weights, 0.8 * (1 - np.exp(-edge / 1.5)), atol=0.01)
     assert (picture.strict == (edge >= 1.5)).all()
-    assert (picture_of(mask, None, edge, ranges, Label(edge_width=0)).weights == 1).all()
+    assert (observe(mask, None, edge, ranges, Label(edge_width=0)).weights == 1).all()
 
 
 def test_a_second_vote_of_a_single_view_unlocks_nothing():

@@ -12,9 +12,9 @@ from sc3d.geometry.cameras import View, look_at, project
 from sc3d.geometry.raycast import Surface, first_surface, see_points
 from sc3d.geometry.voxels import sort_by_voxel, voxel_origin
 from sc3d.labelling.density import FULL, GaussianField, gaussian_density, kernel_density, voxel_shares
-from sc3d.labelling.fusion import Cloud, edge_distance, fuse, picture_of
-from sc3d.labelling.voting import lens_of, open_ballot
-from sc3d.labelling.voting_kernels import GRAZING, MIN_WEIGHT, SCALE, Rules, to_camera, to_pixel
+from sc3d.labelling.fusion import Cloud, edge_distance, fuse, observe
+from sc3d.labelling.voting import camera_parameters, open_accumulator
+from sc3d.labelling.voting_kernels import GRAZING, MIN_WEIGHT, SCALE, VoteWeighting, to_camera, to_pixel
 from sc3d.scene.labels import LOCKED
 from sc3d.settings.labels import Label
 
@@ -79,7 +79,7 @@ def noise_masks(views: list[View], seed: int = 1) -> dict:
 
 def slow_votes(cloud: Cloud, views: list[View], masks: dict, surface: Surface, settings: Label) -> np.ndarray:
     """(N, 5) votes of each point's cell, from `see_points` and numpy."""
-    ballot, _ = open_ballot(
+    ballot, _ = open_accumulator(
         cloud, voxel_origin(cloud.points.min(axis=0), settings.voxel_size), settings.voxel_size, 5
     )
     cells = ballot.to_points(np.arange(len(ballot.votes)))
@@ -89,7 +89,7 @@ def slow_votes(cloud: Cloud, views: list[View], masks: dict, surface: Surface, s
     for view in views:
         mask, confidence = masks[view.name]
         first = first_surface(surface, view)
-        weights = picture_of(mask, confidence, edge_distance(mask), first.range, settings).weights
+        weights = observe(mask, confidence, edge_distance(mask), first.range, settings).weights
         sums, counts = np.zeros((len(votes), 5), np.int64), np.zeros(len(votes), np.int64)
         for turn in (1, -1):  # see_points drops what faces away; scattered voxels take it as well
             seen = see_points(view, cloud.points, turn * cloud.normals, first, settings.voxel_size)
@@ -131,12 +131,12 @@ def test_kernel_projects_like_pycolmap(model):
     )
     view = View("a", camera, look_at(np.array([4.0, -3, 6]), np.zeros(3)))
     points = np.random.default_rng(0).normal(0, 3, (2000, 3))
-    lens = lens_of(view, points)
-    assert not lens.pixels.size
+    camera = camera_parameters(view, points)
+    assert not camera.pixels.size
     expected, _ = project(view, points)
     known = np.isfinite(expected[:, 0])
     found = np.array(
-        [to_pixel.py_func(lens.parameters, *to_camera.py_func(lens, *point)) for point in points[known]]
+        [to_pixel.py_func(camera.parameters, *to_camera.py_func(camera, *point)) for point in points[known]]
     )
     assert known.sum() > 1000 and np.abs(found - expected[known]).max() < 1e-9
 
@@ -227,13 +227,13 @@ def test_every_weight_is_a_switch(switch):
 
 def test_grazing_sightings_take_no_part_in_the_second_vote():
     (cloud, surface), views = world(), views_of("PINHOLE", 1)
-    ballot, _ = open_ballot(cloud, voxel_origin(cloud.points.min(axis=0), 0.25), 0.25, 5)
+    ballot, _ = open_accumulator(cloud, voxel_origin(cloud.points.min(axis=0), 0.25), 0.25, 5)
     mask = np.ones((120, 160), np.uint8)
     first = first_surface(surface, views[0])
     ballot.cast(
         views[0],
-        picture_of(mask, None, edge_distance(mask), first.range, Label()),
-        Rules(0.25, 9.0, True, True, True, False, True),
+        observe(mask, None, edge_distance(mask), first.range, Label()),
+        VoteWeighting(0.25, 9.0, True, True, True, False, True),
     )
     cosine = np.abs(np.einsum("ij,ij->i", cloud.normals, views[0].center - cloud.points)) / np.linalg.norm(
         views[0].center - cloud.points, axis=1

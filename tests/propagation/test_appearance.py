@@ -5,8 +5,8 @@ import pytest
 
 from sc3d.geometry.graph import build_graph
 from sc3d.propagation import propagate
-from sc3d.propagation.appearance import Raters
-from sc3d.propagation.propagate import Evidence
+from sc3d.propagation.appearance import AppearanceModel
+from sc3d.propagation.propagate import LabelledPoints
 from sc3d.propagation.terrain import relief_features
 from sc3d.scene.labels import SEED, UNSEEN, Labels
 from sc3d.settings.labels import Propagate
@@ -29,7 +29,7 @@ def village(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     return points, np.tile(np.float32([0, 0, 1]), (len(flat), 1)), colors, truth
 
 
-def evidence_of(points: np.ndarray, colors: np.ndarray, label: np.ndarray) -> Evidence:
+def evidence_of(points: np.ndarray, colors: np.ndarray, label: np.ndarray) -> LabelledPoints:
     votes = np.zeros((len(label), 4), np.float32)
     votes[np.arange(len(label)), label] = 1.5
     votes[:, 0] = 0
@@ -40,7 +40,7 @@ def evidence_of(points: np.ndarray, colors: np.ndarray, label: np.ndarray) -> Ev
         np.where(seen, SEED, UNSEEN).astype(np.uint8),
         np.where(seen, 5, 0).astype(np.int32),
     )
-    return Evidence(points, seeds, votes, colors)
+    return LabelledPoints(points, seeds, votes, colors)
 
 
 def swollen(points: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -88,7 +88,7 @@ def test_errors_that_all_views_share_are_cured_and_only_by_the_raters(scene):
     truth, label = scene[3], scene[4]
     before = (label != truth).mean()
     with_raters, without = (
-        (solve(scene, Propagate(appearance=learn)).label != truth).mean() for learn in (True, False)
+        (solve(scene, Propagate(appearance=fit)).label != truth).mean() for fit in (True, False)
     )
     assert before > 0.05 and without > 0.9 * before and with_raters < 0.1 * before
     for method in ("geometry", "knn"):
@@ -118,8 +118,8 @@ def test_product_of_raters_by_hand_on_two_independent_features():
     relief[:, 0] = first
     colors = np.zeros((len(label), 3), np.uint8)
     colors[:, 0] = 255 * second
-    raters = Raters.of(relief, colors)
-    rating = raters.learn(label, np.ones(len(label), bool), 2)
+    appearance = AppearanceModel.from_features(relief, colors)
+    rating = appearance.fit(label, np.ones(len(label), bool), 2)
     odds = (0.7 * np.where(first, 0.2, 0.8) * np.where(second, 0.3, 0.7)) / (
         0.3 * np.where(first, 0.6, 0.4) * np.where(second, 0.9, 0.1)
     )
@@ -131,10 +131,10 @@ def test_a_class_with_few_examples_is_left_to_the_votes():
     rng = np.random.default_rng(0)
     label = np.repeat([1, 2, 3], [2000, 2000, 40]).astype(np.uint8)
     relief = rng.normal(size=(len(label), 4)).astype(np.float32) + label[:, None]
-    rating = Raters.of(relief, None).learn(label, np.ones(len(label), bool), 3)
+    rating = AppearanceModel.from_features(relief, None).fit(label, np.ones(len(label), bool), 3)
     assert np.ptp(rating[:4000, 2]) == 0 and np.exp(rating[0, 2]) == pytest.approx(0.05)
     assert (rating[4000:] == 0).all()
-    assert Raters.of(relief, None).learn(label, label == 1, 3) is None
+    assert AppearanceModel.from_features(relief, None).fit(label, label == 1, 3) is None
 
 
 @pytest.mark.parametrize("method", ["map", "geometry", "knn"])

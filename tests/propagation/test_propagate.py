@@ -12,8 +12,8 @@ from sc3d.geometry.graph import Graph, build_graph, similarity
 from sc3d.geometry.neighbors import NeighborIndex, curvature
 from sc3d.propagation import propagate
 from sc3d.propagation.potts import free_energy, mean_field, mean_field_sequential, potts_energy, softmax
-from sc3d.propagation.propagate import Evidence, tie_breakers
-from sc3d.propagation.region_growing import grow, vote_nearest
+from sc3d.propagation.propagate import LabelledPoints, tie_breakers
+from sc3d.propagation.region_growing import grow_regions, vote_nearest
 from sc3d.scene.labels import LOCKED, PROPAGATED, SEED, UNSEEN, Labels
 from sc3d.settings.labels import Propagate
 
@@ -51,7 +51,7 @@ def test_one_seed_fills_its_plane_and_not_the_sheet_above(method):
     label[0], label[-1] = 1, 2
     graph = build_graph(points, up(points), 16)
     result = propagate(
-        graph, Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method=method)
+        graph, LabelledPoints(points, seeds_of(label), votes_of(label), None), Propagate(method=method)
     )
     if method != "knn":  # votes by distance alone cannot know the sheets
         assert (result.label[: len(low)] == 1).all() and (result.label[len(low) :] == 2).all()
@@ -66,7 +66,7 @@ def test_a_gap_stops_labels_unless_filled(method):
     label[5] = 3
     graph = build_graph(points, up(points), 16)
     result = propagate(
-        graph, Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method=method)
+        graph, LabelledPoints(points, seeds_of(label), votes_of(label), None), Propagate(method=method)
     )
     half = len(points) // 2
     assert (
@@ -75,7 +75,9 @@ def test_a_gap_stops_labels_unless_filled(method):
         and (result.state[half:] == UNSEEN).all()
     )
     filled = propagate(
-        graph, Evidence(points, seeds_of(label), votes_of(label), None), Propagate(method=method, fill=True)
+        graph,
+        LabelledPoints(points, seeds_of(label), votes_of(label), None),
+        Propagate(method=method, fill=True),
     )
     assert (filled.label == 3).all() and (filled.state[half:] == PROPAGATED).all()
 
@@ -91,7 +93,7 @@ def test_geometry_prefers_the_similar_surface_at_a_crease():
     )
     truth = np.concatenate([np.full(len(floor), 1), np.full(len(wall), 2)])
     graph = build_graph(points, normals, 16)
-    grown = grow(graph, label[graph.order])[0][np.argsort(graph.order)]
+    grown = grow_regions(graph, label[graph.order])[0][np.argsort(graph.order)]
     voted, _ = vote_nearest(points, label, 16)
     assert (grown == truth).mean() > 0.99
     assert (grown == truth).mean() >= (voted == truth).mean()
@@ -118,13 +120,13 @@ def test_point_order_does_not_matter(method):
     order = rng.permutation(len(points))
     first = propagate(
         build_graph(points, up(points), 16),
-        Evidence(points, seeds_of(label), votes_of(label), None),
+        LabelledPoints(points, seeds_of(label), votes_of(label), None),
         Propagate(method=method),
     )
     moved = points[order]
     second = propagate(
         build_graph(moved, up(moved), 16),
-        Evidence(moved, seeds_of(label[order]), votes_of(label[order]), None),
+        LabelledPoints(moved, seeds_of(label[order]), votes_of(label[order]), None),
         Propagate(method=method),
     )
     np.testing.assert_array_equal(first.label[order], second.label)
@@ -164,20 +166,20 @@ def test_energy_counts_each_edge_once_and_mean_field_is_near_the_brute_force_min
     np.testing.assert_allclose(
         [potts_energy(graph, unary, every[row], 1.0) for row in sample], energies[sample], rtol=1e-5
     )
-    belief = mean_field(graph, unary, 1.0)
-    assert potts_energy(graph, unary, belief.argmax(axis=1) + 1, 1.0) <= np.quantile(energies, 0.005)
-    np.testing.assert_allclose(belief.sum(axis=1), 1, rtol=1e-5)
+    marginals = mean_field(graph, unary, 1.0)
+    assert potts_energy(graph, unary, marginals.argmax(axis=1) + 1, 1.0) <= np.quantile(energies, 0.005)
+    np.testing.assert_allclose(marginals.sum(axis=1), 1, rtol=1e-5)
 
 
 @pytest.mark.parametrize("smoothness", [0.3, 1.0, 5.0])
 def test_free_energy_never_rises_in_sequential_sweeps(smoothness):
     for seed in range(5):
         _, graph, unary = random_problem(seed, 40)
-        belief = softmax(unary)
-        energies = [free_energy(graph, unary, belief, smoothness)]
+        marginals = softmax(unary)
+        energies = [free_energy(graph, unary, marginals, smoothness)]
         for _ in range(15):
-            belief = mean_field_sequential(graph, unary, smoothness, belief)
-            energies.append(free_energy(graph, unary, belief, smoothness))
+            marginals = mean_field_sequential(graph, unary, smoothness, marginals)
+            energies.append(free_energy(graph, unary, marginals, smoothness))
         assert (np.diff(energies) <= 1e-4).all() and energies[-1] < energies[0]
 
 
@@ -197,7 +199,7 @@ def test_map_corrects_a_wrong_seed_that_its_surroundings_contradict():
     votes[820] = [0, 0.6, 0.4, 0, 0]
     result = propagate(
         build_graph(points, up(points), 16),
-        Evidence(points, seeds_of(label), votes, None),
+        LabelledPoints(points, seeds_of(label), votes, None),
         Propagate(method="map"),
     )
     assert result.label[820] == 2 and result.state[820] == PROPAGATED and result.state[0] == SEED
@@ -212,7 +214,9 @@ def test_locked_points_are_completed_and_seeds_keep_their_label():
     seeds = replace(seeds_of(label), state=state)
     for method in ("knn", "geometry"):
         result = propagate(
-            build_graph(points, up(points), 16), Evidence(points, seeds, None, None), Propagate(method=method)
+            build_graph(points, up(points), 16),
+            LabelledPoints(points, seeds, None, None),
+            Propagate(method=method),
         )
         assert (
             (result.label[300:340] == 2).all()
@@ -226,7 +230,7 @@ def test_two_points_and_no_neighbors():
     label = np.uint8([1, 0])
     result = propagate(
         build_graph(points, None, 16),
-        Evidence(points, seeds_of(label), votes_of(label), None),
+        LabelledPoints(points, seeds_of(label), votes_of(label), None),
         Propagate(method="geometry"),
     )
     assert result.label[0] == 1
@@ -256,7 +260,7 @@ def test_coinciding_points_are_told_apart_by_what_they_carry():
     label = np.where(rng.uniform(size=len(points)) < 0.2, rng.integers(1, 4, len(points)), 0).astype(np.uint8)
     results = []
     for order in (np.arange(len(points)), rng.permutation(len(points))):
-        evidence = Evidence(points[order], seeds_of(label[order]), votes_of(label[order]), None)
+        evidence = LabelledPoints(points[order], seeds_of(label[order]), votes_of(label[order]), None)
         graph = build_graph(evidence.points, up(points), 16, None, tie_breakers(evidence, None))
         results.append(propagate(graph, evidence, Propagate()).label[np.argsort(order)])
     np.testing.assert_array_equal(*(np.sort(result.reshape(-1, 2), axis=1) for result in results))
@@ -277,7 +281,7 @@ def test_one_or_two_threads_give_the_same_bits():
                     *(
                         propagate(
                             graph,
-                            Evidence(points, seeds_of(label), votes_of(label), None),
+                            LabelledPoints(points, seeds_of(label), votes_of(label), None),
                             Propagate(method=method),
                         ).confidence
                         for method in ("map", "geometry")
@@ -301,7 +305,7 @@ def test_sheets_two_voxels_apart_keep_their_labels(method):
     label = np.where(rng.uniform(size=len(points)) < 0.02, truth, 0).astype(np.uint8)
     result = propagate(
         build_graph(points, up(points), 16),
-        Evidence(points, seeds_of(label), votes_of(label), None),
+        LabelledPoints(points, seeds_of(label), votes_of(label), None),
         Propagate(method=method),
     )
     np.testing.assert_array_equal(result.label, truth)

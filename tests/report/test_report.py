@@ -23,7 +23,7 @@ from sc3d.io.json_files import write_json
 from sc3d.report import write_report
 from sc3d.report.certainty import certainty_section
 from sc3d.report.charts import flight_map, histogram, paired_bars, reliability_curve
-from sc3d.report.data import Material, gather
+from sc3d.report.data import ReportData, load_report_data
 from sc3d.report.images import comparison, ground_picture
 from sc3d.report.objects import class_areas, found_section
 from sc3d.report.processing import processing_section
@@ -253,17 +253,17 @@ def test_images_decode_and_show_the_scene(page):
 
 
 def test_fused_labels_match_the_truth_in_the_photo(toy):
-    material = gather(toy)
-    view = material.views[0]
-    labelled = LabelledSurface.build(material.cloud, material.views, toy.mesh)
-    panels = dict(comparison(material, view, labelled))
+    data = load_report_data(toy)
+    view = data.views[0]
+    labelled = LabelledSurface.build(data.cloud, data.views, toy.mesh)
+    panels = dict(comparison(data, view, labelled))
     assert list(panels) == ["photo", "given mask", "fused labels", "truth"]
     fused, truth = (decode(panels[name].split(",")[1]) for name in ("fused labels", "truth"))
     assert (fused == truth).all(axis=2).mean() > 0.95
 
 
 def test_same_stage_run_counts_once(toy):
-    records = gather(toy).records
+    records = load_report_data(toy).records
     assert [record["stage"] for record in records] == ["reconstruct", "label"]
     assert records[1]["outputs"] == ["seeds.ply", "votes.npz"]
 
@@ -304,12 +304,12 @@ def test_labels_without_truth_give_no_accuracy(toy, tmp_path):
     scene = Scene(tmp_path)
     for path in (toy.labelled, toy.classes):
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    material = gather(scene)
-    assert "accuracy" not in headline(material).lower() and "IoU" not in headline(material)
-    assert "100.0%" in headline(material)
-    assert quality_section(material) == "" and processing_section(material) == ""
-    assert "IoU" not in found_section(material) and "8,000 points in 2 classes." in summary_line(material)
-    assert "seed" in certainty_section(material)
+    data = load_report_data(scene)
+    assert "accuracy" not in headline(data).lower() and "IoU" not in headline(data)
+    assert "100.0%" in headline(data)
+    assert quality_section(data) == "" and processing_section(data) == ""
+    assert "IoU" not in found_section(data) and "8,000 points in 2 classes." in summary_line(data)
+    assert "seed" in certainty_section(data)
 
 
 def test_scene_that_does_not_exist(tmp_path):
@@ -414,8 +414,8 @@ def test_no_renderer_leaves_out_the_pictures(toy, tmp_path, monkeypatch):
 
 
 def test_sidecar_floats_and_paths_are_readable(toy):
-    assert json.dumps(gather(toy).records[1]["settings"])
-    assert "<dd>0.8</dd>" in processing_section(gather(toy))
+    assert json.dumps(load_report_data(toy).records[1]["settings"])
+    assert "<dd>0.8</dd>" in processing_section(load_report_data(toy))
 
 
 def test_areas_are_those_of_the_highest_surface():
@@ -441,7 +441,7 @@ def test_counted_objects_are_in_the_report(tmp_path):
         json.dumps({"type": "FeatureCollection", "features": features})
     )
     (tmp_path / "export" / "buildings.geojson").write_text("[1]")
-    table = found_section(Material(Scene(tmp_path)))
+    table = found_section(ReportData(Scene(tmp_path)))
     assert "buildings" not in table and all(
         f"<td>{value}</td>" in table for value in ("3", "180", "60", "6.0", "9.0")
     )

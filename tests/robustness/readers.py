@@ -205,12 +205,12 @@ def _build_sidecars(folder: Path) -> None:
 
 
 def _read_sidecars(folder: Path) -> object:
-    from sc3d.report.data import gather
+    from sc3d.report.data import load_report_data
     from sc3d.runner import _finished
     from sc3d.scene.scene import Scene
 
     record = {"stage": "label", "settings": {"consensus": 0.66}, "inputs": {"cloud.ply": "00"}}
-    return _finished(record, [folder / "seeds.ply"]), gather(Scene(folder)).records
+    return _finished(record, [folder / "seeds.ply"]), load_report_data(Scene(folder)).records
 
 
 def _read_weights(folder: Path) -> object:

@@ -29,9 +29,9 @@ from sc3d.tiling import evaluate as tiled_evaluate
 from sc3d.tiling import label as tiled_label
 from sc3d.tiling import memory as plan
 from sc3d.tiling import propagate as tiled_propagate
-from sc3d.tiling.memory import Parts, memory_of
+from sc3d.tiling.memory import WorkFolder, memory_of
 from sc3d.tiling.ranges import MeshParts, RangeMaps, read_triangles, write_ranges
-from sc3d.tiling.store import Survey, TileStore
+from sc3d.tiling.store import CloudStatistics, TileStore
 
 POINTS = 60_000
 TILES = 25_000  # points of a tile with its margin
@@ -106,7 +106,7 @@ def test_labels_and_votes_by_tile_are_those_of_the_whole_to_the_bit(site, small_
 
 def test_there_are_several_tiles_of_the_size_asked_for(site):
     cloud = CloudFile.open(site / "cloud.ply")
-    grid = Survey.of(cloud).grid(TILES, 18.0)
+    grid = CloudStatistics.from_cloud(cloud).grid(TILES, 18.0)
     assert grid.shape[0] * grid.shape[1] >= 9
     points = read_cloud(site / "cloud.ply").point.positions.numpy()
     held = [grid.within(points, tile, 18.0).sum() for tile in range(grid.shape[0] * grid.shape[1])]
@@ -207,7 +207,7 @@ def test_ranges_over_parts_of_a_mesh_are_those_of_the_whole(site, tmp_path):
 
     views = Scene(site).model.views
     origin, triangles = local_origin(views), np.concatenate(list(read_triangles(site / "mesh.ply")))
-    grid = Survey.of(CloudFile.open(site / "mesh.ply")).grid(2_000)
+    grid = CloudStatistics.from_cloud(CloudFile.open(site / "mesh.ply")).grid(2_000)
     parts = MeshParts.split([triangles[:5000], triangles[5000:]], grid, tmp_path, origin)
     assert len(parts.boxes) > 4
     maps = RangeMaps(tmp_path, {view.name: number for number, view in enumerate(views)})
@@ -312,7 +312,7 @@ class CloudFileTiles:
     @staticmethod
     def of(site: Path) -> list[int]:
         cloud = CloudFile.open(site / "cloud.ply")
-        survey = Survey.of(cloud)
+        survey = CloudStatistics.from_cloud(cloud)
         grid = survey.grid(TILES, tiled_label.BLOCKS * tiled_label.BLOCK * tiled_label.VOXEL * survey.spacing)
         return np.unique(grid.tile_of(read_cloud(site / "cloud.ply").point.positions.numpy())).tolist()
 
@@ -320,16 +320,18 @@ class CloudFileTiles:
 def test_parts_of_other_inputs_are_not_taken(tmp_path):
     source = tmp_path / "cloud.ply"
     source.write_text("one")
-    first = Parts(tmp_path / "out.ply", "label", [source], Label())
+    first = WorkFolder(tmp_path / "out.ply", "label", [source], Label())
     first.subfolder("tiles")
     assert (
-        Parts(tmp_path / "out.ply", "label", [source], replace(Label(), workers=3, max_memory="9G")).folder
+        WorkFolder(
+            tmp_path / "out.ply", "label", [source], replace(Label(), workers=3, max_memory="9G")
+        ).folder
         == first.folder
     )
-    assert Parts(tmp_path / "out.ply", "label", [source], Label(consensus=0.9)).folder != first.folder
+    assert WorkFolder(tmp_path / "out.ply", "label", [source], Label(consensus=0.9)).folder != first.folder
     assert not first.folder.exists()  # of no use any more
     source.write_text("other")
-    assert Parts(tmp_path / "out.ply", "label", [source], Label()).folder != first.folder
+    assert WorkFolder(tmp_path / "out.ply", "label", [source], Label()).folder != first.folder
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
@@ -353,7 +355,7 @@ def test_las_is_read_in_chunks(tmp_path, monkeypatch, suffix):
 def test_a_store_gives_back_every_point_once_and_the_margin(site, tmp_path):
     cloud = CloudFile.open(site / "cloud.ply")
     points = read_cloud(site / "cloud.ply").point.positions.numpy()
-    store = TileStore.build(cloud, Survey.of(cloud).grid(TILES, 18.0), tmp_path)
+    store = TileStore.build(cloud, CloudStatistics.from_cloud(cloud).grid(TILES, 18.0), tmp_path)
     np.testing.assert_array_equal(
         np.sort(np.concatenate([store.rows(tile) for tile in store.tiles])), np.arange(POINTS)
     )

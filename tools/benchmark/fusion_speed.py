@@ -21,8 +21,7 @@ from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.provenance import peak_memory_mb, reset_peak_memory, versions
 from sc3d.labelling.fusion import Cloud, Fusion, Mask, fuse
 from sc3d.labelling.inputs import Masks
-from sc3d.propagation import propagate as complete
-from sc3d.propagation.propagate import Evidence
+from sc3d.propagation.propagate import LabelledPoints, complete
 from sc3d.scene.labelled_cloud import point_arrays, read_surface, spacing_of
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
@@ -74,7 +73,7 @@ def run_fusion_speed(command: BenchmarkFusionSpeed) -> None:
     scene = Scene(command.scene)
     hint = "the benchmark needs cloud.ply, mesh.ply and masks; `sc3d benchmark tables` makes such scenes"
     scene.require(scene.cloud, scene.mesh, scene.masks, scene.classes, hint=hint)
-    load, masks = os.getloadavg()[0], Masks.of(scene, scene.confidence)
+    load, masks = os.getloadavg()[0], Masks.load(scene, scene.confidence)
     workload = _workload(scene, masks, command.points[0])
     _label_and_propagate(_cut(workload, 2000, 2))  # compiles
     compared = min(40, len(masks.views))
@@ -143,7 +142,7 @@ def _label(workload: Workload) -> Fusion:
 
 
 def _propagate(workload: Workload, fusion: Fusion) -> Labels:
-    evidence = Evidence(workload.cloud.points, fusion.labels, fusion.votes, workload.colors)
+    evidence = LabelledPoints(workload.cloud.points, fusion.labels, fusion.votes, workload.colors)
     return complete(evidence, workload.cloud.normals, Propagate(method="map"))
 
 

@@ -21,7 +21,7 @@ from sc3d.io.clouds import read_cloud
 from sc3d.io.images import read_index_image, write_image
 from sc3d.labelling.fusion import Cloud
 from sc3d.labelling.inputs import Masks, point_density
-from sc3d.metrics import Confusion, JudgedPixels, depth_edge_band
+from sc3d.metrics import Confusion, EvaluationPixels, depth_edge_band
 from sc3d.scene.labelled_cloud import REACH, point_arrays, read_surface, spacing_of
 from sc3d.scene.scene import Scene
 from sc3d.settings.synthesize import Synthesize
@@ -57,7 +57,7 @@ class Place:
     colors: np.ndarray | None
     truth: np.ndarray | None
     surface: Surface
-    judged: JudgedPixels
+    judged: EvaluationPixels
     photos: list[View]
 
     @property
@@ -127,7 +127,7 @@ def load_place(scene: Scene, every: int) -> Place:
         sized = view.resized(*truth.shape[::-1])
         first = first_surface(surface, sized)
         parts.append(
-            JudgedPixels.of(
+            EvaluationPixels.from_photo(
                 truth,
                 nearest_points(first, sized, index, reach, truth > 0),
                 depth_edge_band(first.range, BAND),
@@ -137,7 +137,9 @@ def load_place(scene: Scene, every: int) -> Place:
     # else a label in the cloud is somebody's result
     true = scene.cloud.resolve() == (scene.path / "truth.ply").resolve()
     label = cloud.point["label"].numpy().ravel() if true and "label" in cloud.point else None
-    return Place(scene, Cloud(points, normals), colors, label, surface, JudgedPixels.joined(parts), photos)
+    return Place(
+        scene, Cloud(points, normals), colors, label, surface, EvaluationPixels.concatenate(parts), photos
+    )
 
 
 def judge_masks(place: Place, masks: Masks) -> tuple[Confusion, Confusion]:

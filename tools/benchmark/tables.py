@@ -23,8 +23,7 @@ from sc3d.io.provenance import digest, peak_memory_mb, reset_peak_memory, versio
 from sc3d.labelling.fusion import Cloud, Fusion, fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size
 from sc3d.metrics import Confusion
-from sc3d.propagation import propagate as complete
-from sc3d.propagation.propagate import Evidence
+from sc3d.propagation.propagate import LabelledPoints, complete
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label, Propagate
@@ -188,7 +187,7 @@ def _run_variant(place: Place | None, variant: Variant, command: BenchmarkTables
     missing = [row for row in unique_rows() if row.key not in figures]
     if "masks" in figures and not missing:
         return figures
-    masks = Masks.of(variant.scene, variant.scene.confidence)
+    masks = Masks.load(variant.scene, variant.scene.confidence)
     if "masks" not in figures:
         table = variant.scene.class_table()
         figures["masks"] = {"name": MASKS} | _areas(judge_masks(place, masks), table)
@@ -213,7 +212,7 @@ def _run_variant(place: Place | None, variant: Variant, command: BenchmarkTables
     return figures
 
 
-def _run_row(place: Place, given: tuple[Evidence, dict[str, float]], row: Row) -> dict[str, object]:
+def _run_row(place: Place, given: tuple[LabelledPoints, dict[str, float]], row: Row) -> dict[str, object]:
     """given: what fusion left, and what it cost"""
     evidence, before = given
     labels, cost = evidence.seeds, dict.fromkeys(before, 0.0)
@@ -242,7 +241,7 @@ def judge(place: Place, labels: Labels) -> dict[str, dict]:
     table = place.scene.class_table()
     figures = _areas(place.judged.confusions(place.judged.look_up(labels.label), place.num_ids), table)
     if place.truth is not None:
-        figures["points"] = Confusion.of(place.truth, labels.label, place.num_ids).summary(table)
+        figures["points"] = Confusion.from_labels(place.truth, labels.label, place.num_ids).summary(table)
     return figures | {"reliability": place.judged.reliability(labels.label, labels.confidence).summary()}
 
 
@@ -252,10 +251,10 @@ def _areas(confusions: tuple[Confusion, Confusion], table) -> dict[str, dict]:
     return {name: confusion.summary(table) for name, confusion in parts.items()}
 
 
-def _seeds(place: Place, masks: Masks, label: Label) -> tuple[Evidence, dict[str, float]]:
+def _seeds(place: Place, masks: Masks, label: Label) -> tuple[LabelledPoints, dict[str, float]]:
     with _measured() as cost:
         fusion = _fused(place, masks, label)
-    return Evidence(place.cloud.points, fusion.labels, fusion.votes, place.colors), cost
+    return LabelledPoints(place.cloud.points, fusion.labels, fusion.votes, place.colors), cost
 
 
 def _fused(place: Place, masks: Masks, label: Label) -> Fusion:
@@ -265,7 +264,9 @@ def _fused(place: Place, masks: Masks, label: Label) -> Fusion:
     )
 
 
-def _propagated(place: Place, evidence: Evidence, settings: Propagate) -> tuple[Labels, dict[str, float]]:
+def _propagated(
+    place: Place, evidence: LabelledPoints, settings: Propagate
+) -> tuple[Labels, dict[str, float]]:
     """As `sc3d propagate` does it."""
     with _measured() as cost:
         labels = complete(evidence, place.cloud.normals, settings)

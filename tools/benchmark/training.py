@@ -178,7 +178,9 @@ def _trainer(workload: Workload, plain: bool) -> Trainer:
     )
     for name, tensor in workload.gaussians.parameters().items():
         trainer.optimizer.parameters[name].data.copy_(tensor)
-    trainer.optimizer.rates = {name: rate * 1e-6 for name, rate in trainer.optimizer.rates.items()}
+    trainer.optimizer.rates = {
+        name: log_likelihood * 1e-6 for name, log_likelihood in trainer.optimizer.rates.items()
+    }
     trainer.iteration = round(_LATE * _STEPS)
     return trainer
 

@@ -28,7 +28,7 @@ class OrbitPose:
     fov: float
 
     @classmethod
-    def of(cls, view: View, middle: np.ndarray, upright: bool) -> OrbitPose:
+    def from_view(cls, view: View, middle: np.ndarray, upright: bool) -> OrbitPose:
         """middle: (3,) of what is looked at, whose depth the point to turn around has; upright: turn around
         +z unless the view is straight down
         """

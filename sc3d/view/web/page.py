@@ -202,7 +202,9 @@ def _start(server: viser.ViserServer, view: WebView, shown: ShownCloud, views: l
     above = aerial_view(
         np.concatenate([points, *(one.center[None] for one in views)]), _WINDOW, view.from_above
     )
-    home = OrbitPose.of(above, shown.middle, upright=True)
+    home = OrbitPose.from_view(above, shown.middle, upright=True)
     photo = next((one for one in views if one.name == view.photo), None)
-    (home if photo is None else OrbitPose.of(photo, shown.middle, upright=False)).start(server.initial_camera)
+    (home if photo is None else OrbitPose.from_view(photo, shown.middle, upright=False)).start(
+        server.initial_camera
+    )
     return home

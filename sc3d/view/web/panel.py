@@ -166,7 +166,7 @@ class PhotoPanel:
             self._home.move(client)
         elif client is not None and name != _NO_PHOTO:
             self._page.cameras.hide(name)
-            OrbitPose.of(self._views[name], self._page.shown.middle, upright=False).move(client)
+            OrbitPose.from_view(self._views[name], self._page.shown.middle, upright=False).move(client)
 
 
 class PointPanel:

@@ -172,7 +172,7 @@ def home_of(scene: Scene) -> tuple[OrbitPose, ShownCloud]:
         inspector_of(scene).cloud, np.round(np.median(centers, axis=0)), scene.class_table()
     )
     points = np.concatenate([without_outliers(shown.points.astype(np.float64)), centers - shown.origin])
-    return OrbitPose.of(aerial_view(points, (1600, 1000)), shown.middle, upright=True), shown
+    return OrbitPose.from_view(aerial_view(points, (1600, 1000)), shown.middle, upright=True), shown
 
 
 def click_camera(page: object, scene: Scene, name: str) -> None:

@@ -56,16 +56,16 @@ def layer_server() -> Iterator[object]:
 def test_pose_is_that_of_the_view():
     middle = np.array([2.0, 1.0, 0.0])
     view = pinhole_view("a", (400, 300), (500, 500, 200, 150), look_at(np.array([5.0, -30, 20]), middle))
-    pose = OrbitPose.of(view, middle, upright=True)
+    pose = OrbitPose.from_view(view, middle, upright=True)
     assert (
         np.allclose(pose.position, [5, -30, 20])
         and np.allclose(pose.look_at, middle)
         and np.allclose(pose.up, [0, 0, 1])
     )
     assert np.isclose(np.tan(pose.fov / 2), 150 / 500)
-    assert OrbitPose.of(view, middle, upright=False).up @ [0, 0, 1] > 0.5  # the top of the photo
+    assert OrbitPose.from_view(view, middle, upright=False).up @ [0, 0, 1] > 0.5  # the top of the photo
     down = pinhole_view("b", (400, 300), (500, 500, 200, 150), look_at(np.array([0.0, 0, 20]), np.zeros(3)))
-    assert np.allclose(OrbitPose.of(down, np.zeros(3), upright=True).up, [0, 1, 0])
+    assert np.allclose(OrbitPose.from_view(down, np.zeros(3), upright=True).up, [0, 1, 0])
     turned = orientation(view)  # wxyz
     w, x, y, z = turned
     assert np.allclose(
