@@ -100,7 +100,7 @@ def _picture_of_cloud(command: View, scene: Scene, views: list[Camera], photo: C
 
 
 def _open_window(command: View, scene: Scene, views: list[Camera]) -> None:
-    from sc3d.view.display import check_display
+    from sc3d.view.renderers import check_display
 
     check_display()
     from sc3d.view.display_cloud import class_ids

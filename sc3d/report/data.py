@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.geometry.raster import Raster, highest_points, spacing_of_all
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.json_files import read_json
 from sc3d.scene.class_table import ClassTable
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+_CELL = 2.0  # side of the cells that areas are counted in, point spacings
 _STAGES = (
     "synthesize",
     "reconstruct",
@@ -129,3 +131,23 @@ def _read_sidecars(folder: Path) -> list[dict]:
         records.values(),
         key=lambda record: (order.get(record["stage"], len(order)), record["stage"], record["outputs"]),
     )
+
+
+def class_areas(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """(256,) float64 area of each class seen from above, squared world units: cells of the ground plane, by
+    the label of their highest point.
+
+    points: (N, 3) world, z up; labels: (N,) uint8
+    """
+    grid = Raster.around(points, _CELL * spacing_of_all(points))
+    rows = highest_points(grid, points).ravel()
+    return np.bincount(labels[rows[rows >= 0]], minlength=256) * grid.pixel**2
+
+
+def read_features(file: Path) -> list[dict] | None:
+    """Properties of the features of a GeoJSON file; None if it does not exist or is another kind of file."""
+    try:
+        features = json.loads(file.read_text(encoding="utf-8"))["features"]
+        return [feature["properties"] for feature in features if isinstance(feature["properties"], dict)]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None

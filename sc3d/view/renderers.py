@@ -11,6 +11,7 @@ Known failures, and what is done about them (Open3D 0.20):
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import logging
 import os
@@ -20,11 +21,15 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View, pinhole_view
+
+if TYPE_CHECKING:
+    import open3d as o3d
 
 logger = logging.getLogger(__name__)
 
@@ -121,19 +126,20 @@ def _tensor_geometries(drawing: Drawing) -> dict:
         cloud.point.colors = colors
         geometries["cloud"] = cloud
     if drawing.lines is not None and len(drawing.lines):
-        geometries["lines"] = _line_set(drawing)
+        geometries["lines"] = line_set(drawing.lines, drawing.line_color)
     return geometries
 
 
-def _line_set(drawing: Drawing) -> object:
+def line_set(lines: np.ndarray, color: tuple[int, int, int]) -> o3d.geometry.LineSet:
+    """lines: (L, 2, 3) ends; color: RGB uint8."""
     import open3d as o3d
 
-    ends = np.asarray(drawing.lines, np.float64).reshape(-1, 3)
-    lines = o3d.geometry.LineSet(
+    ends = np.asarray(lines, np.float64).reshape(-1, 3)
+    found = o3d.geometry.LineSet(
         o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(np.arange(len(ends)).reshape(-1, 2))
     )
-    lines.paint_uniform_color(np.array(drawing.line_color) / 255.0)
-    return lines
+    found.paint_uniform_color(np.array(color) / 255.0)
+    return found
 
 
 def _render_egl(drawing: Drawing, view: View, background: tuple[int, int, int]) -> np.ndarray:
@@ -207,7 +213,11 @@ def _legacy_geometries(drawing: Drawing) -> list:
     else:
         geometry = o3d.geometry.PointCloud(points)
         geometry.colors = colors
-    return [geometry] + ([_line_set(drawing)] if drawing.lines is not None and len(drawing.lines) else [])
+    return [geometry] + (
+        [line_set(drawing.lines, drawing.line_color)]
+        if drawing.lines is not None and len(drawing.lines)
+        else []
+    )
 
 
 @contextmanager
@@ -227,3 +237,28 @@ def _quiet() -> Iterator[None]:
                 os.close(descriptor)
             chatter.seek(0)
             logger.debug("renderer: %s", chatter.read().decode(errors="replace").strip())
+
+
+def check_display() -> None:
+    """Raise Sc3dError that says what to do where no window can be opened."""
+    if not has_display():
+        raise Sc3dError(
+            "no display to open a window on: `sc3d view SCENE --screenshot FILE` renders a picture without one, --web shows it in a browser"
+        )
+
+
+def has_display() -> bool:
+    """Whether a window can be opened; on Linux an X server (or XWayland) must answer."""
+    if not sys.platform.startswith("linux"):
+        return True
+    if not os.environ.get("DISPLAY"):
+        return False
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError:
+        return False
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    display = x11.XOpenDisplay(None)
+    if display:
+        x11.XCloseDisplay(ctypes.c_void_p(display))
+    return bool(display)

@@ -9,13 +9,14 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
+import open3d as o3d
 
+from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.view.colors import Coloring, color_points, color_scale, legend_entries
-from sc3d.view.display import check_display
 from sc3d.view.display_cloud import ShownCloud
-from sc3d.view.picking import Inspector, PickedPoint, position_at
-from sc3d.view.renderers import vulkan_works
+from sc3d.view.picking import Inspector, PickedPoint, point_on_ray, position_at
+from sc3d.view.renderers import check_display, line_set, vulkan_works
 from sc3d.view.screenshot import LINE_COLOR
 from sc3d.view.viewpoints import frusta, frustum_depth
 
@@ -23,6 +24,8 @@ logger = logging.getLogger(__name__)
 
 _PANEL_EM = 15  # width of the panel, in font heights
 _PICKED_COLOR = (1.0, 0.0, 0.8)
+_F1 = 290  # GLFW's key codes
+_MAX_CLASS_KEYS = 12
 
 
 def show(
@@ -45,16 +48,12 @@ def show(
     if vulkan_works():
         _show_with_panel(shown, lines, inspector, hidden, by)
     else:
-        from sc3d.view.window_keys import show_with_keys
-
-        show_with_keys(shown, lines, inspector, hidden, by)
+        _show_with_keys(shown, lines, inspector, hidden, by)
 
 
 def _show_with_panel(
     shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int], by: Coloring
 ) -> None:
-    import open3d as o3d
-
     application = o3d.visualization.gui.Application.instance
     application.initialize()
     window = _Window(shown, lines, inspector, hidden)
@@ -69,8 +68,6 @@ class _Window:
     """
 
     def __init__(self, shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int]) -> None:
-        import open3d as o3d
-
         self._gui, self._rendering = o3d.visualization.gui, o3d.visualization.rendering
         self._shown, self._inspector, self._hidden = shown, inspector, hidden
         self._material = self._rendering.MaterialRecord()
@@ -93,8 +90,6 @@ class _Window:
 
     def choose(self, by: str) -> None:
         """Color the cloud by an attribute and explain its colors."""
-        import open3d as o3d
-
         self._radio.selected_index = self._shown.colorings.index(by)
         colors = self._shown.colors(by).astype(np.float32) / np.float32(255)
         for label in self._shown.class_counts:
@@ -118,8 +113,6 @@ class _Window:
 
     def _look(self) -> None:
         """From the south, 45 degrees down."""
-        import open3d as o3d
-
         low, high = np.quantile(self._shown.points[:100_000], [0.002, 0.998], axis=0)
         middle, span = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
         bounds = o3d.geometry.AxisAlignedBoundingBox(low.astype(np.float64), high.astype(np.float64))
@@ -150,8 +143,6 @@ class _Window:
         return panel
 
     def _build_legend(self, by: str) -> object:
-        import open3d as o3d
-
         gui, scale = self._gui, color_scale(by)
         legend = gui.Vert(self._em // 4, gui.Margins(0, self._em // 2, 0, self._em // 2))
         entries = legend_entries(by, self._shown.class_table)
@@ -191,18 +182,11 @@ class _Window:
         self._scene.force_redraw()
 
     def _add_cameras(self, lines: np.ndarray) -> None:
-        import open3d as o3d
-
-        ends = lines.reshape(-1, 3)
-        if not len(ends):
+        if not len(lines):
             return
-        line_set = o3d.geometry.LineSet(
-            o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(np.arange(len(ends)).reshape(-1, 2))
-        )
-        line_set.paint_uniform_color(np.array(LINE_COLOR) / 255)
         material = self._rendering.MaterialRecord()
         material.shader, material.line_width = "unlitLine", 2.0
-        self._scene.scene.add_geometry("cameras", line_set, material)
+        self._scene.scene.add_geometry("cameras", line_set(lines, LINE_COLOR), material)
 
     def _resize_points(self, size: float) -> None:
         self._material.point_size = float(size)
@@ -232,8 +216,6 @@ class _Window:
             self._describe(picked)
 
     def _describe(self, picked: PickedPoint) -> None:
-        import open3d as o3d
-
         self._description.text = "\n".join(
             [f"{name}: {value}" for name, value in picked.facts()] + [f"  {name}" for name in picked.photos]
         )
@@ -263,3 +245,99 @@ class _Window:
         area, width = self._window.content_rect, _PANEL_EM * self._em
         self._scene.frame = self._gui.Rect(area.x, area.y, area.width - width, area.height)
         self._panel.frame = self._gui.Rect(area.get_right() - width, area.y, width, area.height)
+
+
+def _show_with_keys(
+    shown: ShownCloud, lines: np.ndarray, inspector: Inspector, hidden: set[int], by: Coloring
+) -> None:
+    """Keys 1 to 5 choose the coloring, F1 to F12 show and hide classes, P describes the point in the middle;
+    the log is the legend.
+
+    lines: (L, 2, 3) ends of the cameras' lines, in the frame of `shown`; hidden: ids of classes that are not
+        shown at the start
+    Raises Sc3dError if no window can be opened.
+    """
+    visualizer = o3d.visualization.VisualizerWithKeyCallback()
+    if not visualizer.create_window("sc3d", 1400, 900):
+        raise Sc3dError(
+            "cannot open a window here: `sc3d view SCENE --screenshot FILE` renders a picture without one"
+        )
+    window = _KeyWindow(visualizer, shown, inspector, hidden, by)
+    if len(lines):
+        visualizer.add_geometry(line_set(lines, LINE_COLOR))
+    for number, name in enumerate(shown.colorings, start=1):
+        visualizer.register_key_callback(ord(str(number)), lambda _, name=name: window.choose(name))
+        legend = ", ".join(
+            f"{entry} rgb{tuple(color)}" for entry, color in legend_entries(name, shown.class_table)
+        )
+        logger.info("key %d: %s%s", number, name, f" ({legend})" if legend else "")
+    if shown.class_table is not None and len(shown.class_counts) > 1:
+        for number, label in enumerate(list(shown.class_counts)[:_MAX_CLASS_KEYS]):
+            visualizer.register_key_callback(_F1 + number, lambda _, label=label: window.toggle(label))
+            logger.info("key F%d: %s on and off", number + 1, shown.class_table.name(label))
+    visualizer.register_key_callback(ord("P"), lambda _: window.describe_middle())
+    logger.info("key P: what is known of the point in the middle of the window")
+    visualizer.run()
+    visualizer.destroy_window()
+    window.forget()
+
+
+class _KeyWindow:
+    """What the keys do."""
+
+    def __init__(
+        self,
+        visualizer: o3d.visualization.VisualizerWithKeyCallback,
+        shown: ShownCloud,
+        inspector: Inspector,
+        hidden: set[int],
+        by: str,
+    ) -> None:
+        self._visualizer, self._shown, self._inspector = visualizer, shown, inspector
+        self._hidden, self._by = hidden, by
+        self._cloud = o3d.geometry.PointCloud()
+        self._fill()
+        visualizer.add_geometry(self._cloud)
+
+    def choose(self, by: str) -> bool:
+        """Color by an attribute."""
+        self._by = by
+        return self._update()
+
+    def toggle(self, label: int) -> bool:
+        """Show or hide a class."""
+        self._hidden ^= {label}
+        return self._update()
+
+    def describe_middle(self) -> bool:
+        """Log what is known of the point in the middle of the window."""
+        camera = self._visualizer.get_view_control().convert_to_pinhole_camera_parameters()
+        world_from_cam = np.linalg.inv(camera.extrinsic)
+        rows = np.flatnonzero(self._visible)
+        size = 2 * self._shown.spacing
+        found = point_on_ray(self._shown.points[rows], world_from_cam[:3, 3], world_from_cam[:3, 2], size)
+        if found is None:
+            logger.info("there is no point in the middle of the window")
+        else:
+            logger.info("%s", self._inspector.look_up(int(self._shown.rows[rows[found]])))
+        return False
+
+    def forget(self) -> None:
+        """Let go of the cloud: the keys keep this object alive, and Open3D takes tensors that outlive the
+        program for leaks and fails.
+        """
+        del self._shown, self._inspector, self._cloud
+
+    @property
+    def _visible(self) -> np.ndarray:
+        return ~np.isin(self._shown.label, sorted(self._hidden))
+
+    def _update(self) -> bool:
+        self._fill()
+        self._visualizer.update_geometry(self._cloud)
+        return False
+
+    def _fill(self) -> None:
+        visible = self._visible
+        self._cloud.points = o3d.utility.Vector3dVector(self._shown.points[visible].astype(np.float64))
+        self._cloud.colors = o3d.utility.Vector3dVector(self._shown.colors(self._by)[visible] / 255.0)

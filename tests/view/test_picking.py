@@ -11,9 +11,8 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, local_origin, look_at, pinhole_view, project
 from sc3d.geometry.raycast import Surface, first_surface, see_points
 from sc3d.scene.class_table import parse_classes
-from sc3d.view.display_cloud import ShownCloud, class_ids, only_classes, with_votes
+from sc3d.view.display_cloud import ShownCloud, class_ids, even_order, only_classes, with_votes
 from sc3d.view.picking import Inspector, photos_that_see, point_on_ray, position_at
-from sc3d.view.progressive_order import even_order
 
 UTM = np.array([512_345.0, 5_187_654.0, 210.0])
 CLASSES = parse_classes(
