@@ -14,14 +14,14 @@ from sc3d.io.images import IMAGE_SUFFIXES, read_image, write_image
 from sc3d.io.json_files import read_json
 from sc3d.runner import sidecar
 from sc3d.scene.scene import Scene
-from sc3d.settings.outputs import View
+from sc3d.settings.outputs import ViewCommand
 
 if TYPE_CHECKING:
     import open3d as o3d
 
-    from sc3d.geometry.cameras import View as Camera
+    from sc3d.geometry.cameras import View
     from sc3d.scene.class_table import ClassTable
-    from sc3d.view.display_splats import ShownSplats
+    from sc3d.view.display_splats import DisplaySplats
     from sc3d.view.picking import Inspector
 
 logger = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 WHITE = (255, 255, 255)  # where there are no splats
 
 
-def main(command: View) -> None:
+def main(command: ViewCommand) -> None:
     scene = Scene(command.scene)
     scene.require(hint="")
     _check(command)
@@ -55,7 +55,7 @@ def main(command: View) -> None:
         _open_window(command, scene, views)
 
 
-def _check(command: View) -> None:
+def _check(command: ViewCommand) -> None:
     """Raise InputError for options that do not fit together, before any work."""
     page = command.web or command.html is not None
     if page and (
@@ -84,7 +84,9 @@ def _check(command: View) -> None:
         raise InputError("--points is a number of points, and --port lies between 0 and 65535")
 
 
-def _picture_of_cloud(command: View, scene: Scene, views: list[Camera], photo: Camera | None) -> np.ndarray:
+def _picture_of_cloud(
+    command: ViewCommand, scene: Scene, views: list[View], photo: View | None
+) -> np.ndarray:
     """(H, W, 3) uint8 RGB"""
     from sc3d.view.display_cloud import class_ids, only_classes
     from sc3d.view.screenshot import Style, screenshot
@@ -99,7 +101,7 @@ def _picture_of_cloud(command: View, scene: Scene, views: list[Camera], photo: C
     return screenshot(cloud, photo, command.size, style, table)
 
 
-def _open_window(command: View, scene: Scene, views: list[Camera]) -> None:
+def _open_window(command: ViewCommand, scene: Scene, views: list[View]) -> None:
     from sc3d.view.renderers import check_display
 
     check_display()
@@ -115,7 +117,7 @@ def _open_window(command: View, scene: Scene, views: list[Camera]) -> None:
     )
 
 
-def _show_page(command: View, scene: Scene, views: list[Camera]) -> None:
+def _show_page(command: ViewCommand, scene: Scene, views: list[View]) -> None:
     """Serve the page or write it."""
     from sc3d.view.colors import can_color, color_points
     from sc3d.view.display_cloud import class_ids
@@ -160,7 +162,7 @@ def _file_of(scene: Scene) -> object:
     return next((path for path in (scene.labelled, scene.seeds, scene.cloud) if path.exists()), None)
 
 
-def _read_cloud(command: View, scene: Scene, votes: bool) -> o3d.t.geometry.PointCloud:
+def _read_cloud(command: ViewCommand, scene: Scene, votes: bool) -> o3d.t.geometry.PointCloud:
     """The cloud to show. votes: with those of seeds.ply, if it has none itself and they can be had."""
     from sc3d.view.colors import can_color
     from sc3d.view.display_cloud import with_votes
@@ -182,7 +184,7 @@ def _class_table(scene: Scene) -> ClassTable | None:
     return scene.class_table() if scene.classes.exists() else None
 
 
-def _inspector(scene: Scene, cloud: o3d.t.geometry.PointCloud, views: list[Camera]) -> Inspector:
+def _inspector(scene: Scene, cloud: o3d.t.geometry.PointCloud, views: list[View]) -> Inspector:
     """Looks points up as `label` saw them: with the voxel size that it wrote down."""
     from sc3d.view.picking import Inspector
 
@@ -192,7 +194,7 @@ def _inspector(scene: Scene, cloud: o3d.t.geometry.PointCloud, views: list[Camer
     return Inspector(cloud, views, _class_table(scene), scene.mesh, voxel_size)
 
 
-def _splats_of_scene(scene: Scene) -> ShownSplats:
+def _splats_of_scene(scene: Scene) -> DisplaySplats:
     """The labelled splats if they have been exported, else those that were trained."""
     from sc3d.view.display_splats import labelled_splats, trained_splats
 
@@ -202,7 +204,7 @@ def _splats_of_scene(scene: Scene) -> ShownSplats:
     return trained_splats(scene)
 
 
-def _splats(command: View, scene: Scene) -> ShownSplats:
+def _splats(command: ViewCommand, scene: Scene) -> DisplaySplats:
     """The splats for a picture or video: gaussians.ply as trained or, for `--splats --by label` and `--by
     confidence`, the labelled ones.
     """
@@ -222,7 +224,7 @@ def _splats(command: View, scene: Scene) -> ShownSplats:
     return trained_splats(scene)
 
 
-def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.ndarray:
+def _picture_of_splats(command: ViewCommand, scene: Scene, photo: View | None) -> np.ndarray:
     """(H, W, 3) uint8 RGB: the splats from the air, or beside a photo; in class colors or by confidence
     where they have labels.
     """
@@ -230,7 +232,7 @@ def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.
     from sc3d.view.captions import add_legend
     from sc3d.view.contact_sheet import half_of, side_by_side
     from sc3d.view.splat_images import compare, rendered
-    from sc3d.view.viewpoints import aerial_view, fitted, without_outliers
+    from sc3d.view.viewpoints import fitted, overview, without_outliers
 
     splats = _splats(command, scene)
     table = scene.class_table() if splats.label is not None and command.by != "photo" else None
@@ -240,7 +242,7 @@ def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.
         seen = gaussians.means[gaussians.opacities > 0.5].numpy()
         points = seen if len(seen) else gaussians.means.numpy()
         image = rendered(
-            gaussians, aerial_view(without_outliers(points), command.size, command.from_above), WHITE
+            gaussians, overview(without_outliers(points), command.size, command.from_above), WHITE
         )
         return image if table is None else add_legend(image, command.by, table, present)
     source = photo.shifted(splats.origin)
@@ -255,7 +257,7 @@ def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.
     return side_by_side((found.photo, found.rendered), (photo.name, f"splats, PSNR {found.psnr:.2f} dB"))
 
 
-def _write_flight(command: View, scene: Scene) -> None:
+def _write_flight(command: ViewCommand, scene: Scene) -> None:
     from tqdm import tqdm
 
     from sc3d.view.flight_video import flight_path, write_video

@@ -19,7 +19,7 @@ import numpy as np
 import pycolmap
 
 from sc3d.errors import InputError
-from sc3d.io.limits import FARTHEST, MAX_PIXELS, MAX_SIDE
+from sc3d.io.limits import FARTHEST, MAX_PIXELS, MAX_SIDE, DamagedFileError
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")  # rigs and frames only in newer models
 LARGEST = 1 << 62  # count of a list: bounded by the size of the file alone
@@ -29,10 +29,6 @@ POINT = np.array([[0, 43, 0, 0, 0], [8, 8, 0, LARGEST, 0]])
 FRAME = np.array([[0, 64, 0, 0, 0], [4, 16, 0, LARGEST, 0]])
 MAX_NAME = 4096  # bytes of a photo name
 NOT_RIGID = 0.01  # largest error of R R^T: text models are rounded
-
-
-class _Damage(ValueError):
-    """Completes "<file> of the COLMAP model in <folder>"."""
 
 
 def load_model(folder: Path) -> pycolmap.Reconstruction:
@@ -114,8 +110,8 @@ def check_counts(folder: Path) -> None:
             continue
         try:
             _check_file(file, walks[name])
-        except (_Damage, struct.error) as error:
-            what = str(error) if isinstance(error, _Damage) else "is cut off"
+        except (DamagedFileError, struct.error) as error:
+            what = str(error) if isinstance(error, DamagedFileError) else "is cut off"
             raise InputError(
                 f"{file.name} of the COLMAP model in {folder} {what}: it is damaged, write or copy it again"
             ) from None
@@ -123,16 +119,16 @@ def check_counts(folder: Path) -> None:
 
 def _check_file(file: Path, walk: Callable[[mmap.mmap, int], int]) -> None:
     if not file.is_file():
-        raise _Damage("is no file")
+        raise DamagedFileError("is no file")
     if file.stat().st_size < 8:
-        raise _Damage("is cut off")
+        raise DamagedFileError("is cut off")
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         count = _read("<Q", data, 0)[0]
         if count > len(data) // 8:  # no record is shorter
-            raise _Damage(f"announces {count} entries in {len(data)} bytes")
+            raise DamagedFileError(f"announces {count} entries in {len(data)} bytes")
         end = walk(data, count)
         if end != len(data):
-            raise _Damage(
+            raise DamagedFileError(
                 "is cut off" if end > len(data) else f"has {len(data) - end} bytes more than it announces"
             )
 
@@ -155,7 +151,7 @@ def _num_params(model: int) -> int:
     try:
         return len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1).params)
     except (ValueError, TypeError):
-        raise _Damage(f"has a camera of the unknown model {model}") from None
+        raise DamagedFileError(f"has a camera of the unknown model {model}") from None
 
 
 def _walk_rigs(data: mmap.mmap, count: int) -> int:
@@ -187,7 +183,7 @@ def _walk_records(data: mmap.mmap, count: int, fields: np.ndarray) -> int:
     end, row = kernels.walk_bytes(view, 8, count, fields, False)
     del view  # it would keep the file mapped
     if end < 0:
-        raise _Damage(f"is cut off in entry {row} of {count}")
+        raise DamagedFileError(f"is cut off in entry {row} of {count}")
     return end
 
 
@@ -197,15 +193,15 @@ def _walk_images(data: mmap.mmap, count: int) -> int:
         _once(_read("<I", data, position)[0], ids, "photo")
         end = data.find(b"\0", position + 64, position + 64 + MAX_NAME)
         if end < 0:
-            raise _Damage(f"has a photo whose name does not end within {MAX_NAME} bytes")
+            raise DamagedFileError(f"has a photo whose name does not end within {MAX_NAME} bytes")
         points = _read("<Q", data, end + 1)[0]
         position = end + 9 + 24 * points
         if position > len(data):
-            raise _Damage(f"is cut off: photo {len(ids)} of {count} announces {points} keypoints")
+            raise DamagedFileError(f"is cut off: photo {len(ids)} of {count} announces {points} keypoints")
     return position
 
 
 def _once(number: int, ids: set[int], what: str) -> None:
     if number in ids:
-        raise _Damage(f"has the {what} {number} twice")
+        raise DamagedFileError(f"has the {what} {number} twice")
     ids.add(number)

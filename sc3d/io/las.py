@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sc3d.errors import InputError
+from sc3d.io.limits import DamagedFileError
 
 HEADER, HEADER_14 = 227, 375  # bytes, of versions up to 1.2 and of 1.4
 VLR, EVLR = 54, 60  # bytes of the header of a record
@@ -27,10 +28,6 @@ RATIO, SLACK = 300, 1 << 20  # LAZ that claims to expand by more is refused: sur
 # points of a chunk that says its number itself; bytes of a chunk larger than its file
 VARIABLE, LARGEST_CHUNK = 2**32 - 1, 64 << 20
 STREAMED = -1  # the chunk table's position is at the end of the file
-
-
-class _Damage(ValueError):
-    """Completes "<file>"."""
 
 
 class _Header(NamedTuple):
@@ -52,8 +49,8 @@ def check_las(path: Path) -> None:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         try:
             _check(data)
-        except (_Damage, struct.error) as error:
-            what = str(error) if isinstance(error, _Damage) else "is cut off"
+        except (DamagedFileError, struct.error) as error:
+            what = str(error) if isinstance(error, DamagedFileError) else "is cut off"
             raise InputError(f"cannot read {path}: it {what}; write or copy it again") from None
 
 
@@ -64,19 +61,21 @@ def _check(data: mmap.mmap) -> None:
     room = len(data) - header.offset
     if header.form < 128:
         if header.count * header.record > room:
-            raise _Damage(f"announces {header.count} points of {header.record} bytes, {room} bytes are there")
+            raise DamagedFileError(
+                f"announces {header.count} points of {header.record} bytes, {room} bytes are there"
+            )
         return
     if header.count * header.record > RATIO * room + SLACK:
-        raise _Damage(f"announces {header.count} points in {room} compressed bytes, which cannot be")
+        raise DamagedFileError(f"announces {header.count} points in {room} compressed bytes, which cannot be")
     if laszip is None:
-        raise _Damage("is compressed, but does not say how")
+        raise DamagedFileError("is compressed, but does not say how")
     if header.count:
         _check_chunks(data, header, laszip)
 
 
 def _read_header(data: mmap.mmap) -> _Header:
     if data[:4] != b"LASF":
-        raise _Damage("is not a LAS file")
+        raise DamagedFileError("is not a LAS file")
     minor = data[25]
     size, offset, num_vlrs, form, record, count = struct.unpack_from("<HIIBHI", data, 94)
     evlrs = (0, 0)
@@ -84,9 +83,9 @@ def _read_header(data: mmap.mmap) -> _Header:
         start, number, count = struct.unpack_from("<QIQ", data, 235)
         evlrs = (start, number)
     if size < (HEADER_14 if minor >= 4 else HEADER) or not size <= offset <= len(data):
-        raise _Damage("has a header of an impossible size")
+        raise DamagedFileError("has a header of an impossible size")
     if form & 63 >= len(POINT_SIZES) or record < POINT_SIZES[form & 63]:
-        raise _Damage(f"has points of an impossible format ({form & 63}, {record} bytes)")
+        raise DamagedFileError(f"has points of an impossible format ({form & 63}, {record} bytes)")
     return _Header(size, offset, num_vlrs, form, record, count, evlrs)
 
 
@@ -94,12 +93,12 @@ def _walk_vlrs(data: mmap.mmap, header: _Header) -> bytes | None:
     """The content of LASzip's record, if there is one."""
     position, found = header.size, None
     if header.num_vlrs * VLR > header.offset - header.size:
-        raise _Damage(f"announces {header.num_vlrs} records in {header.offset - header.size} bytes")
+        raise DamagedFileError(f"announces {header.num_vlrs} records in {header.offset - header.size} bytes")
     for _ in range(header.num_vlrs):
         user, number, length = struct.unpack_from("<16sHH", data, position + 2)
         position += VLR + length
         if position > header.offset:
-            raise _Damage("has a record that reaches into the points")
+            raise DamagedFileError("has a record that reaches into the points")
         if (user, number) == LASZIP:
             found = data[position - length : position]
     return found
@@ -107,11 +106,11 @@ def _walk_vlrs(data: mmap.mmap, header: _Header) -> bytes | None:
 
 def _walk_evlrs(data: mmap.mmap, position: int, count: int) -> None:
     if count and (position < HEADER_14 or count * EVLR > len(data) - position):
-        raise _Damage(f"announces {count} extended records that are not there")
+        raise DamagedFileError(f"announces {count} extended records that are not there")
     for _ in range(count):
         position += EVLR + struct.unpack_from("<Q", data, position + 20)[0]
         if position > len(data):
-            raise _Damage("has an extended record that is cut off")
+            raise DamagedFileError("has an extended record that is cut off")
 
 
 def _check_chunks(data: mmap.mmap, header: _Header, laszip: bytes) -> None:
@@ -125,18 +124,18 @@ def _check_chunks(data: mmap.mmap, header: _Header, laszip: bytes) -> None:
         or one_size
         and not 0 < chunk * header.record <= max(LARGEST_CHUNK, header.count * header.record)
     ):
-        raise _Damage(f"has compressed chunks of {chunk} points, which cannot be")
+        raise DamagedFileError(f"has compressed chunks of {chunk} points, which cannot be")
     if kind not in (POINTWISE, LAYERED) or sum(size for _, size, _ in items) != header.record:
-        raise _Damage("has points that are compressed in an unknown way")
+        raise DamagedFileError("has points that are compressed in an unknown way")
     if any(ITEM_SIZES.get(item, size if item in (0, 14) else 0) != size for item, size, _ in items):
-        raise _Damage("has points that are compressed in an unknown way")
+        raise DamagedFileError("has points that are compressed in an unknown way")
     table = struct.unpack_from("<q", data, header.offset)[0]
     table = struct.unpack_from("<q", data, len(data) - 8)[0] if table == STREAMED else table
     if not header.offset + 8 <= table <= len(data) - 8:
-        raise _Damage("has no table of compressed chunks")
+        raise DamagedFileError("has no table of compressed chunks")
     num_chunks = struct.unpack_from("<I", data, table + 4)[0]
     if num_chunks > header.count or (one_size and num_chunks != -(-header.count // chunk)):
-        raise _Damage(f"announces {num_chunks} compressed chunks for {header.count} points")
+        raise DamagedFileError(f"announces {num_chunks} compressed chunks for {header.count} points")
     if kind == LAYERED:
         _walk_layers(
             data, header, (table, num_chunks), sum(LAYERS.get(item, size) for item, size, _ in items)
@@ -150,6 +149,6 @@ def _walk_layers(data: mmap.mmap, header: _Header, chunks: tuple[int, int], num_
         count, *sizes = struct.unpack_from(f"<I{num_layers}I", data, position + header.record)
         position, total = position + header.record + 4 + 4 * num_layers + sum(sizes), total + count
         if position > table:
-            raise _Damage("has a compressed chunk that is cut off")
+            raise DamagedFileError("has a compressed chunk that is cut off")
     if position != table or total != header.count:
-        raise _Damage(f"has {total} points in its compressed chunks, {header.count} are announced")
+        raise DamagedFileError(f"has {total} points in its compressed chunks, {header.count} are announced")

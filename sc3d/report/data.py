@@ -85,7 +85,7 @@ class ReportData:
         return Path(folder) if isinstance(folder, str) and Path(folder).is_dir() else self.scene.truth
 
     @property
-    def training_sheet(self) -> Path:
+    def contact_sheet_file(self) -> Path:
         """The contact sheet that training writes; may not exist."""
         return self.scene.path / "train.jpg"
 

@@ -16,9 +16,8 @@ from sc3d.geometry.cameras import View
 from sc3d.io.images import read_image, read_index_image
 from sc3d.report.data import ReportData
 from sc3d.scene.labelled_cloud import LabelledSurface
-from sc3d.view import screenshot
 from sc3d.view.colors import COLORINGS, color_points
-from sc3d.view.screenshot import Style, draw_points
+from sc3d.view.screenshot import Style, draw_points, screenshot
 
 logger = logging.getLogger(__name__)
 

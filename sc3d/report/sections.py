@@ -184,12 +184,12 @@ def flight_section(data: ReportData) -> str:
 
 def training_section(data: ReportData) -> str:
     """The contact sheet of the training."""
-    if not data.training_sheet.exists():
+    if not data.contact_sheet_file.exists():
         return ""
     text = "Photos of the flight, and the Gaussians seen by the same cameras: rendering, depth and normals"
     return (
         f'<p class="note">{text}. Where a rendering is blurred, or its depth stands out from its surroundings, too few photos overlap.</p>'
-        f'<figure><img src="{jpeg(read_image(data.training_sheet))}" alt="{text}"></figure>'
+        f'<figure><img src="{jpeg(read_image(data.contact_sheet_file))}" alt="{text}"></figure>'
     )
 
 

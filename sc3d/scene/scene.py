@@ -10,10 +10,8 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.images import check_photo, find_photos, image_size, read_index_image, require_within
-from sc3d.io.limits import FARTHEST
+from sc3d.io.limits import FARTHEST, MAX_MASK_PIXELS
 from sc3d.scene.class_table import CONTROL, ClassTable, read_classes
-
-MAX_MASK = 100_000_000  # pixels of a mask that is larger than its photo
 
 
 @dataclass(frozen=True)
@@ -228,9 +226,9 @@ def match_masks(
 def check_mask_aspect(file: Path, mask_size: tuple[int, int], photo_size: tuple[int, int]) -> None:
     """Raise InputError unless a mask has the aspect of its photo within 1 px of the smaller of the two."""
     (width, height), (photo_width, photo_height) = mask_size, photo_size
-    if width * height > max(MAX_MASK, photo_width * photo_height):
+    if width * height > max(MAX_MASK_PIXELS, photo_width * photo_height):
         raise InputError(
-            f"{file} is {width}x{height}, but its photo is {photo_width}x{photo_height}: more than {MAX_MASK // 10**6} megapixels are refused"
+            f"{file} is {width}x{height}, but its photo is {photo_width}x{photo_height}: more than {MAX_MASK_PIXELS // 10**6} megapixels are refused"
         )
     scale = min(1.0, min(photo_width / width, photo_height / height))
     if abs(width * photo_height - height * photo_width) * scale > max(photo_width, photo_height):

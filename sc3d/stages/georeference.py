@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from sc3d.errors import InputError
-from sc3d.georeferencing.georeference import Georeference as Found
 from sc3d.georeferencing.georeference import (
+    Georeference,
     from_origin,
     georeference_path,
     projected_crs,
@@ -18,25 +18,25 @@ from sc3d.georeferencing.georeference import (
 )
 from sc3d.georeferencing.gps import find_georeference, read_flight
 from sc3d.scene.scene import Scene
-from sc3d.settings.reconstruction import Georeference
+from sc3d.settings.reconstruction import GeoreferenceOptions
 
 
-def inputs(scene: Scene, settings: Georeference) -> list[Path]:
+def inputs(scene: Scene, settings: GeoreferenceOptions) -> list[Path]:
     return [scene.sparse]
 
 
-def outputs(scene: Scene, settings: Georeference) -> list[Path]:
+def outputs(scene: Scene, settings: GeoreferenceOptions) -> list[Path]:
     return [georeference_path(scene)]
 
 
-def run(scene: Scene, settings: Georeference) -> dict[str, object]:
+def run(scene: Scene, settings: GeoreferenceOptions) -> dict[str, object]:
     if settings.epsg is not None:
         projected_crs(settings.epsg)
     present = None if settings.from_gps else read_georeference(scene)
     if settings.offset is not None:
         if settings.epsg is None:
             raise InputError("--offset needs --epsg: world = CRS - offset")
-        found = Found(settings.epsg, settings.offset)
+        found = Georeference(settings.epsg, settings.offset)
     elif present is not None:
         found = _changed(present, settings)
     else:
@@ -51,7 +51,7 @@ def run(scene: Scene, settings: Georeference) -> dict[str, object]:
     } | ({"rms_to_gps_m": found.figures["gps"]["rms"]} if "gps" in found.figures else {})
 
 
-def _changed(present: Found, settings: Georeference) -> Found:
+def _changed(present: Georeference, settings: GeoreferenceOptions) -> Georeference:
     """The present georeference with the CRS of the settings."""
     if settings.epsg in (None, present.epsg):
         return present
@@ -64,7 +64,7 @@ def _changed(present: Found, settings: Georeference) -> Found:
     return replace(present, epsg=other.epsg, offset=other.offset)
 
 
-def _from_photos(scene: Scene, settings: Georeference) -> Found:
+def _from_photos(scene: Scene, settings: GeoreferenceOptions) -> Georeference:
     views = [view for view in scene.model.views if scene.photo(view.name).is_file()]
     if not views:
         raise InputError(

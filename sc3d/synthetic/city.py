@@ -18,7 +18,7 @@ from sc3d.io.images import write_image
 from sc3d.io.json_files import write_json
 from sc3d.scene.scene import Scene
 from sc3d.settings.synthesize import Synthesize, SynthesizeCity
-from sc3d.synthetic.city_files import CloudFile, MeshFile, open_cloud, open_mesh, write_cameras
+from sc3d.synthetic.city_files import CloudWriter, MeshWriter, open_cloud, open_mesh, write_cameras
 from sc3d.synthetic.city_flight import fly_over
 from sc3d.synthetic.cloud import truth_cloud
 from sc3d.synthetic.generate import CLASSES
@@ -159,7 +159,7 @@ def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
     return {"points": cloud.rows, "views": len(views), "triangles": mesh.triangles, "mask_accuracy": accuracy}
 
 
-def _write_site(site: Site, settings: SynthesizeCity, cloud: CloudFile, mesh: MeshFile) -> None:
+def _write_site(site: Site, settings: SynthesizeCity, cloud: CloudWriter, mesh: MeshWriter) -> None:
     made = truth_cloud(
         site.world, settings.points_per_site, np.random.default_rng([settings.seed, 5, site.number])
     )

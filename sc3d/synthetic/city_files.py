@@ -39,7 +39,7 @@ TOGETHER = 1 << 20  # triangles written at a time
 
 
 @dataclass
-class CloudFile:
+class CloudWriter:
     """A cloud that grows. rows: points so far."""
 
     stream: BinaryIO
@@ -59,7 +59,7 @@ class CloudFile:
 
 
 @dataclass
-class MeshFile:
+class MeshWriter:
     """A triangle soup that grows. triangles: so far."""
 
     stream: BinaryIO
@@ -72,23 +72,23 @@ class MeshFile:
 
 
 @contextmanager
-def open_cloud(path: Path, num_points: int) -> Iterator[CloudFile]:
+def open_cloud(path: Path, num_points: int) -> Iterator[CloudWriter]:
     """A cloud of `num_points`, all of which must be appended; it gets its name when the block succeeds."""
     with atomic_path(path) as temporary:
         with temporary.open("wb") as stream:
             stream.write(_header([f"element vertex {num_points}", *_properties(CLOUD)]))
-            cloud = CloudFile(stream)
+            cloud = CloudWriter(stream)
             yield cloud
         if cloud.rows != num_points:
             raise ValueError(f"{cloud.rows} points were appended, {num_points} announced")
 
 
 @contextmanager
-def open_mesh(path: Path) -> Iterator[MeshFile]:
+def open_mesh(path: Path) -> Iterator[MeshWriter]:
     """A triangle soup with three vertices per triangle; it gets its name when the block succeeds."""
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         stream.write(bytes(ROOM))
-        mesh = MeshFile(stream)
+        mesh = MeshWriter(stream)
         yield mesh
         for first in range(0, mesh.triangles, TOGETHER):
             numbers = np.arange(first, min(first + TOGETHER, mesh.triangles), dtype=np.int64)

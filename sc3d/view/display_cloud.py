@@ -24,7 +24,7 @@ _SAMPLE = 50_000  # points from which the spacing is found
 
 
 @dataclass(frozen=True)
-class ShownCloud:
+class DisplayCloud:
     """N points in the order in which they are shown.
 
     points: (N, 3) float32, world minus `origin` (3,) float64, so that UTM coordinates keep their millimeters
@@ -42,12 +42,12 @@ class ShownCloud:
     _colors: dict[tuple[str, bool], np.ndarray] = field(default_factory=dict)
 
     @classmethod
-    def of(
+    def from_cloud(
         cls, cloud: o3d.t.geometry.PointCloud, origin: np.ndarray, class_table: ClassTable | None
-    ) -> ShownCloud:
+    ) -> DisplayCloud:
         """origin: (3,) world, near the cloud"""
         world = cloud.point.positions.cpu().numpy()
-        rows = even_order(world)
+        rows = progressive_order(world)
         points = (world[rows].astype(np.float64) - origin).astype(np.float32)
         label = (
             cloud.point["label"].cpu().numpy().ravel().astype(np.uint8)[rows]
@@ -166,7 +166,7 @@ def with_votes(
     return result
 
 
-def even_order(points: np.ndarray) -> np.ndarray:
+def progressive_order(points: np.ndarray) -> np.ndarray:
     """Rows of the points so that the first K of them, for any K, thin the cloud evenly and keep its relative
     densities.
 

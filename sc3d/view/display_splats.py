@@ -24,7 +24,7 @@ SPLAT_COLORINGS: tuple[Coloring, ...] = ("photo", "label", "confidence")
 
 
 @dataclass(frozen=True)
-class ShownSplats:
+class DisplaySplats:
     """N Gaussians in the frame shifted by `origin` (3,), and their labels where `sc3d export --format splats`
     has found them.
 
@@ -60,7 +60,7 @@ class ShownSplats:
             raise InputError("the splats have no labels: run `sc3d export SCENE --format splats`")
         return table.palette[self.label] if by == "label" else confidence_colors(self.confidence)
 
-    def only(self, ids: set[int] | None) -> ShownSplats:
+    def only(self, ids: set[int] | None) -> DisplaySplats:
         """Those of some classes, None = all. InputError if there are none."""
         if ids is None:
             return self
@@ -88,7 +88,7 @@ class ShownSplats:
             )
         return cloud
 
-    def most_visible(self, count: int) -> ShownSplats:
+    def most_visible(self, count: int) -> DisplaySplats:
         """At most `count` splats: those with the largest area times opacity, in their order."""
         if len(self.gaussians) <= count:
             return self
@@ -98,21 +98,21 @@ class ShownSplats:
         )
         return self[np.sort(np.argsort(-area, kind="stable")[:count])]
 
-    def __getitem__(self, chosen: np.ndarray) -> ShownSplats:
+    def __getitem__(self, chosen: np.ndarray) -> DisplaySplats:
         label, confidence = (
             None if values is None else values[chosen] for values in (self.label, self.confidence)
         )
         return replace(self, gaussians=self.gaussians[chosen], label=label, confidence=confidence)
 
 
-def trained_splats(scene: Scene) -> ShownSplats:
+def trained_splats(scene: Scene) -> DisplaySplats:
     """gaussians.ply; InputError that says what to run if it is missing or belongs to other cameras."""
     from sc3d.splatting.dataset import load_gaussians
 
-    return ShownSplats(*load_gaussians(scene))
+    return DisplaySplats(*load_gaussians(scene))
 
 
-def labelled_splats(scene: Scene, table: ClassTable) -> ShownSplats:
+def labelled_splats(scene: Scene, table: ClassTable) -> DisplaySplats:
     """What `sc3d export SCENE --format splats` wrote; InputError if it is missing or belongs to other
     cameras.
     """
@@ -125,4 +125,4 @@ def labelled_splats(scene: Scene, table: ClassTable) -> ShownSplats:
         raise InputError(
             f"{path} belongs to other cameras than those in {scene.sparse}: run `sc3d export {scene.path} --format splats --overwrite`"
         )
-    return ShownSplats(found.gaussians, found.origin, found.label, found.confidence)
+    return DisplaySplats(found.gaussians, found.origin, found.label, found.confidence)

@@ -15,8 +15,8 @@ from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.scene.class_table import ClassTable
 from sc3d.view.captions import add_legend
 from sc3d.view.colors import Coloring, as_uint8, color_points
-from sc3d.view.renderers import Drawing, render
-from sc3d.view.viewpoints import aerial_view, frusta, frustum_depth, without_outliers
+from sc3d.view.renderers import Renderable, render
+from sc3d.view.viewpoints import frusta, frustum_depth, overview, without_outliers
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -113,14 +113,14 @@ def draw_points(points: np.ndarray, view: View | None, size: tuple[int, int], st
     # every point is drawn in a color of its own: its number, 24 bits; the last stands for lines
     codes = np.arange(len(chosen) + 1)
     colors = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=1).astype(np.uint8)
-    drawing = Drawing(
+    renderable = Renderable(
         (points[chosen] - origin).astype(np.float32),
         colors[:-1],
         _point_size(points[chosen], canvas),
         lines=(lines - origin).astype(np.float32),
         line_color=tuple(colors[-1].tolist()),
     )
-    image = render(drawing, canvas.shifted(origin), (255, 255, 255), style.renderer).astype(np.int32)
+    image = render(renderable, canvas.shifted(origin), (255, 255, 255), style.renderer).astype(np.int32)
     codes = image[..., 0] << 16 | image[..., 1] << 8 | image[..., 2]
     depth = points[chosen] @ canvas.cam_from_world[2, :3] + canvas.cam_from_world[2, 3]
     code = np.minimum(codes, len(chosen) + 1)
@@ -146,10 +146,10 @@ def _mesh_picture(
     canvas, lines, factor = _canvas(points, view, size, style)
     origin = local_origin([canvas])
     triangles, lines = mesh.triangle.indices.cpu().numpy(), (lines - origin).astype(np.float32)
-    drawing = Drawing(
+    renderable = Renderable(
         (points - origin).astype(np.float32), colors, triangles=triangles, lines=lines, line_color=LINE_COLOR
     )
-    return _shrunk(render(drawing, canvas.shifted(origin), style.background, style.renderer), factor)
+    return _shrunk(render(renderable, canvas.shifted(origin), style.background, style.renderer), factor)
 
 
 def _canvas(
@@ -164,7 +164,7 @@ def _canvas(
         else np.empty((0, 2, 3))
     )
     if view is None:
-        view = aerial_view(
+        view = overview(
             np.concatenate([without_outliers(points), lines.reshape(-1, 3)]), size, style.from_above
         )
     else:
