@@ -166,7 +166,7 @@ class _PanelWindow:
             return
         panel.add_child(self._gui.Label("Classes"))
         for label, count in self._display.class_counts.items():
-            name = f"{self._shown.class_table.name(label)} ({count:,})"
+            name = f"{self._display.class_table.name(label)} ({count:,})"
             self._add_box(
                 panel,
                 name,
