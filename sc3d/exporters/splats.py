@@ -14,6 +14,7 @@ from sc3d.geometry.cameras import undistorted
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.io.atomic import atomic_path
 from sc3d.io.clouds import read_cloud
+from sc3d.io.ply import read_records, write_records
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import REACH, LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
@@ -158,21 +159,15 @@ def read_splats(path: Path, table: ClassTable) -> LabelledSplats:
 
 
 def append_properties(path: Path, columns: dict[str, np.ndarray]) -> None:
-    """Add properties of type uchar and float, (N,) each, to the vertices of a PLY that has float properties
-    and nothing else.
-    """
-    header, _, body = path.read_bytes().partition(b"\nend_header\n")
-    names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property float ")]
-    values = np.frombuffer(body, "<f4").reshape(-1, len(names))
-    row = np.empty(
-        len(values),
-        [("known", "<f4", (len(names),)), *((name, column.dtype) for name, column in columns.items())],
-    )
-    row["known"] = values
+    """Add properties, (N,) each, to the vertices of a binary PLY that has nothing else."""
+    records, comments = read_records(path)
+    added = [(name, column.dtype) for name, column in columns.items()]
+    joined = np.empty(len(records), records.dtype.descr + added)
+    for name in records.dtype.names:
+        joined[name] = records[name]
     for name, column in columns.items():
-        row[name] = column
-        header += f"\nproperty {'uchar' if column.dtype == np.uint8 else 'float'} {name}".encode()
-    path.write_bytes(header + b"\nend_header\n" + row.tobytes())
+        joined[name] = column
+    write_records(path, joined, comments=comments)
 
 
 def origin_in_crs(splats: LabelledSplats, placement: Placement) -> np.ndarray:

@@ -86,8 +86,7 @@ def synthesize(
     num_sparse = _write_sparse(scene_path / "sparse" / "0", world, views, settings)
     report(0.93, "truth cloud")
     cloud = truth_cloud(world, settings.num_points, np.random.default_rng([settings.seed, 5]))
-    with atomic_path(scene_path / "truth.ply") as temporary:
-        o3d.t.io.write_point_cloud(str(temporary), cloud)
+    write_geometry(scene_path / "truth.ply", cloud)
     write_geometry(scene_path / "truth_mesh.ply", _mesh(world))
     write_json(scene_path / "classes.json", CLASSES)
     report(1.0, "done")
