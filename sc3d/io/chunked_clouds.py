@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.io.las import check_las
 from sc3d.io.limits import FARTHEST
 from sc3d.io.ply import check_ply
 
@@ -33,7 +34,8 @@ class CloudFile:
         """InputError if the file is damaged, empty, or of a kind that cannot be read in chunks."""
         kind = path.suffix.lower()
         if kind in (".las", ".laz"):
-            return _open_las(path)
+            header = check_las(path)
+            return cls(path, np.dtype(LAS_FIELDS + LAS_COLORS * header.has_colors), header.count)
         if kind != ".ply":
             raise InputError(
                 f"{path} does not fit into --max-memory, and can be read in parts as PLY, LAS or LAZ only: convert it, or allow more memory"
@@ -66,19 +68,6 @@ class CloudFile:
             file.seek(self.offset)
             for start in range(0, self.num_points, CHUNK):
                 yield start, np.fromfile(file, self.dtype, min(CHUNK, self.num_points - start))
-
-
-def _open_las(path: Path) -> CloudFile:
-    import laspy
-
-    try:
-        with laspy.open(path) as file:
-            colored = {"red", "green", "blue"} <= set(file.header.point_format.dimension_names)
-            return CloudFile(
-                path, np.dtype(LAS_FIELDS + (LAS_COLORS if colored else [])), file.header.point_count
-            )
-    except (OSError, ValueError, laspy.errors.LaspyException) as error:
-        raise InputError(f"cannot read {path}: {error}") from None
 
 
 def _read_las(cloud: CloudFile) -> Iterator[tuple[int, np.ndarray]]:

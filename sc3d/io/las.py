@@ -19,6 +19,7 @@ from sc3d.io.limits import DamagedFileError
 HEADER, HEADER_14 = 227, 375  # bytes, of versions up to 1.2 and of 1.4
 VLR, EVLR = 54, 60  # bytes of the header of a record
 POINT_SIZES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)  # bytes, smallest possible per point format
+COLORED = (2, 3, 5, 7, 8, 10)  # point formats that have red, green and blue
 LASZIP = (b"laszip encoded\0\0", 22204)
 # bytes per type of item; 0 and 14 are bytes of any number
 ITEM_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
@@ -30,7 +31,12 @@ VARIABLE, LARGEST_CHUNK = 2**32 - 1, 64 << 20
 STREAMED = -1  # the chunk table's position is at the end of the file
 
 
-class _Header(NamedTuple):
+class LasHeader(NamedTuple):
+    """size: bytes, then num_vlrs records up to `offset`, where the points begin; form: point format, 128 more if
+    they are compressed; record: bytes of a point; count: of points; evlrs: position and number of extended
+    records.
+    """
+
     size: int
     offset: int
     num_vlrs: int
@@ -39,22 +45,26 @@ class _Header(NamedTuple):
     count: int
     evlrs: tuple[int, int]
 
+    @property
+    def has_colors(self) -> bool:
+        return self.form & 63 in COLORED
 
-def check_las(path: Path) -> None:
-    """InputError unless a LAS or LAZ file holds what its header announces."""
+
+def check_las(path: Path) -> LasHeader:
+    """The header; InputError unless a LAS or LAZ file holds what it announces."""
     if not path.is_file():
         raise InputError(f"{path} is missing")
     if path.stat().st_size < HEADER:
         raise InputError(f"{path} is not a LAS file: it is shorter than a header")
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         try:
-            _check(data)
+            return _check(data)
         except (DamagedFileError, struct.error) as error:
             what = str(error) if isinstance(error, DamagedFileError) else "is cut off"
             raise InputError(f"cannot read {path}: it {what}; write or copy it again") from None
 
 
-def _check(data: mmap.mmap) -> None:
+def _check(data: mmap.mmap) -> LasHeader:
     header = _read_header(data)
     laszip = _walk_vlrs(data, header)
     _walk_evlrs(data, *header.evlrs)
@@ -64,16 +74,17 @@ def _check(data: mmap.mmap) -> None:
             raise DamagedFileError(
                 f"announces {header.count} points of {header.record} bytes, {room} bytes are there"
             )
-        return
+        return header
     if header.count * header.record > RATIO * room + SLACK:
         raise DamagedFileError(f"announces {header.count} points in {room} compressed bytes, which cannot be")
     if laszip is None:
         raise DamagedFileError("is compressed, but does not say how")
     if header.count:
         _check_chunks(data, header, laszip)
+    return header
 
 
-def _read_header(data: mmap.mmap) -> _Header:
+def _read_header(data: mmap.mmap) -> LasHeader:
     if data[:4] != b"LASF":
         raise DamagedFileError("is not a LAS file")
     minor = data[25]
@@ -86,10 +97,10 @@ def _read_header(data: mmap.mmap) -> _Header:
         raise DamagedFileError("has a header of an impossible size")
     if form & 63 >= len(POINT_SIZES) or record < POINT_SIZES[form & 63]:
         raise DamagedFileError(f"has points of an impossible format ({form & 63}, {record} bytes)")
-    return _Header(size, offset, num_vlrs, form, record, count, evlrs)
+    return LasHeader(size, offset, num_vlrs, form, record, count, evlrs)
 
 
-def _walk_vlrs(data: mmap.mmap, header: _Header) -> bytes | None:
+def _walk_vlrs(data: mmap.mmap, header: LasHeader) -> bytes | None:
     """The content of LASzip's record, if there is one."""
     position, found = header.size, None
     if header.num_vlrs * VLR > header.offset - header.size:
@@ -113,7 +124,7 @@ def _walk_evlrs(data: mmap.mmap, position: int, count: int) -> None:
             raise DamagedFileError("has an extended record that is cut off")
 
 
-def _check_chunks(data: mmap.mmap, header: _Header, laszip: bytes) -> None:
+def _check_chunks(data: mmap.mmap, header: LasHeader, laszip: bytes) -> None:
     kind, chunk = struct.unpack_from("<H10xI", laszip)
     num_items = struct.unpack_from("<H", laszip, 32)[0]
     items = [struct.unpack_from("<HHH", laszip, 34 + 6 * row) for row in range(num_items)]
@@ -142,7 +153,7 @@ def _check_chunks(data: mmap.mmap, header: _Header, laszip: bytes) -> None:
         )
 
 
-def _walk_layers(data: mmap.mmap, header: _Header, chunks: tuple[int, int], num_layers: int) -> None:
+def _walk_layers(data: mmap.mmap, header: LasHeader, chunks: tuple[int, int], num_layers: int) -> None:
     """Every chunk: its first point, the number of its points, the sizes of its layers, the layers."""
     position, (table, num_chunks), total = header.offset + 8, chunks, 0
     for _ in range(num_chunks):

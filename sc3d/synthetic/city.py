@@ -141,10 +141,9 @@ def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
     """
     scene, city = Scene(settings.scene), City(o3d.t.geometry.RaycastingScene(), [])
     columns, rows = settings.sites
+    num_points = columns * rows * settings.points_per_site
     with ExitStack() as files:
-        cloud = files.enter_context(
-            open_cloud(scene.path / "truth.ply", columns * rows * settings.points_per_site)
-        )
+        cloud = files.enter_context(open_cloud(scene.path / "truth.ply", num_points))
         mesh = files.enter_context(open_mesh(scene.mesh))
         for site in tqdm(
             make_sites(settings), total=columns * rows, desc="building", unit="site", disable=None
@@ -156,7 +155,7 @@ def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
     accuracy = _write_masks(scene, city, views, settings.seed)
     scene.cloud.symlink_to("truth.ply")
     write_json(scene.classes, CLASSES)
-    return {"points": cloud.rows, "views": len(views), "triangles": mesh.triangles, "mask_accuracy": accuracy}
+    return {"points": num_points, "views": len(views), "triangles": mesh.triangles, "mask_accuracy": accuracy}
 
 
 def _write_site(site: Site, settings: SynthesizeCity, cloud: CloudWriter, mesh: MeshWriter) -> None:
