@@ -147,41 +147,28 @@ def read_sparse_model(path: Path) -> SparseModel:
     """Read a COLMAP model, binary or text; InputError if it is missing, broken or names photos outside the
     scene.
     """
-    import pycolmap
-
     from sc3d.geometry.cameras import View
-    from sc3d.io.colmap import load_model
+    from sc3d.io import colmap
 
-    reconstruction = load_model(path)
-    images = sorted(
-        (reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()),
-        key=lambda image: image.name,
-    )
-    point_ids = np.array(sorted(reconstruction.point3D_ids()), dtype=np.uint64)
-    points = [reconstruction.point3D(int(point_id)) for point_id in point_ids]
+    model = colmap.load_model(path)
+    cameras = colmap.copy_cameras(model)
+    point_ids, xyz, colors = colmap.point_arrays(model)
     views, tracks = [], []
-    for image in images:
+    for image in colmap.registered_images(model):
         _check_name(image.name, path)
-        cam_from_world = np.eye(4)
-        cam_from_world[:3] = image.cam_from_world().matrix()
-        # a copy: image.camera dies with the model
-        views.append(View(image.name, pycolmap.Camera(image.camera.todict()), cam_from_world))
-        seen = np.array([point.point3D_id for point in image.get_observation_points2D()], dtype=np.uint64)
-        # without points that were filtered out of the model
-        tracks.append(np.searchsorted(point_ids, np.intersect1d(seen, point_ids)))
+        views.append(View(image.name, cameras[image.camera_id], colmap.cam_from_world(image)))
+        rows = colmap.observed_rows(image, point_ids)
+        tracks.append(np.unique(rows[rows >= 0]))
     stems = [Path(view.name).stem for view in views]
     if len(set(stems)) < len(stems):
         raise InputError(
             f"{path}: two photos share a name up to the suffix, by which masks are found; rename one"
         )
-    xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     if not (np.abs(xyz) < FARTHEST).all():
         raise InputError(
             f"{path} holds positions that are not finite numbers, or more than {FARTHEST:g} from the origin"
         )
-    return SparseModel(
-        views, xyz, np.array([point.color for point in points], np.uint8).reshape(-1, 3), tracks
-    )
+    return SparseModel(views, xyz, colors, tracks)
 
 
 def match_masks(

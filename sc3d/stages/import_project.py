@@ -20,11 +20,12 @@ from sc3d.georeferencing.georeference import (
 )
 from sc3d.importers.clouds import CLOUDS, MESHES, Geometry, is_mesh, read_geometry, to_open3d
 from sc3d.importers.frames import near_origin, to_world, whole_offset
-from sc3d.importers.model import guess_observations, sample, write_copy, write_model
+from sc3d.importers.model import guess_observations, sample, write_copy
 from sc3d.importers.photos import locate_photos
 from sc3d.importers.project import Project, project_files, read_project
 from sc3d.io.atomic import atomic_path, require_writable
 from sc3d.io.clouds import write_geometry
+from sc3d.io.colmap import build_model, write_model
 from sc3d.runner import execute
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import, ImportCommand
@@ -151,7 +152,7 @@ def _write_project(
     if project.model is not None and len(project.points):
         write_copy(scene.sparse, project)
     else:
-        write_model(scene.sparse, project.views, points, colors, observations)
+        write_model(scene.sparse, build_model(project.views, points, colors, observations))
     if photos is not None:
         _link(photos, scene.images)
     return {

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-import pycolmap
 
 from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
+from sc3d.io.colmap import build_model, write_model
 from sc3d.io.ply import Element, Property, format_header, record_writer, vertex_element
-from sc3d.synthetic.flight import camera_in_model
 
 CLOUD = np.dtype(
     [
@@ -97,11 +96,4 @@ def open_mesh(path: Path) -> Iterator[MeshWriter]:
 
 def write_cameras(path: Path, views: list[View]) -> None:
     """Views that share the camera of the first, as a COLMAP model without points."""
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera_in_model(views[0]))
-    for number, view in enumerate(views, start=1):
-        image = pycolmap.Image(name=view.name, camera_id=1, image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_world[:3]))
-    with atomic_path(path) as temporary:
-        temporary.mkdir(parents=True)
-        model.write(str(temporary))
+    write_model(path, build_model(views))
