@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.io.images import read_image
+from sc3d.io.images import data_uri, read_image
 from sc3d.report.charts import (
     css_color,
     flight_map,
@@ -21,7 +21,7 @@ from sc3d.report.charts import (
     stacked_bar,
 )
 from sc3d.report.data import ReportData, class_areas, read_features
-from sc3d.report.images import cloud_pictures, comparison, ground_picture, jpeg
+from sc3d.report.images import cloud_pictures, comparison, ground_picture
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.view.colors import STATES, color_points, confidence_colors, legend_entries
 
@@ -189,7 +189,7 @@ def training_section(data: ReportData) -> str:
     text = "Photos of the flight, and the Gaussians seen by the same cameras: rendering, depth and normals"
     return (
         f'<p class="note">{text}. Where a rendering is blurred, or its depth stands out from its surroundings, too few photos overlap.</p>'
-        f'<figure><img src="{jpeg(read_image(data.contact_sheet_file))}" alt="{text}"></figure>'
+        f'<figure><img src="{data_uri(read_image(data.contact_sheet_file))}" alt="{text}"></figure>'
     )
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,9 +21,10 @@ from sc3d.importers.frames import near_origin, to_world, whole_offset
 from sc3d.importers.model import guess_observations, sample, write_copy
 from sc3d.importers.photos import locate_photos
 from sc3d.importers.project import Project, project_files, read_project
-from sc3d.io.atomic import atomic_path, require_writable
+from sc3d.io.atomic import require_writable
 from sc3d.io.clouds import write_geometry
 from sc3d.io.colmap import build_model, write_model
+from sc3d.io.images import link_photos, require_place
 from sc3d.runner import execute
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import, ImportCommand
@@ -78,7 +77,8 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
         project, photos = locate_photos(
             near_origin(read_project(settings.project, settings), settings.epsg), settings.images
         )
-        _require_place_for_photos(scene, photos)
+        if photos is not None:
+            require_place(photos, scene.images)
         placed = _place(geometries, project.georeference, project.views, settings)
         georeference, figures = (
             project.georeference,
@@ -154,7 +154,7 @@ def _write_project(
     else:
         write_model(scene.sparse, build_model(project.views, points, colors, observations))
     if photos is not None:
-        _link(photos, scene.images)
+        link_photos(photos, scene.images)
     return {
         "program": project.program,
         "photos": len(project.views),
@@ -162,24 +162,3 @@ def _write_project(
         "points_are": told if len(points) else "none",
         "images": str(photos.resolve()) if photos else "not found: link them to SCENE/images",
     } | project.notes
-
-
-def _require_place_for_photos(scene: Scene, photos: Path | None) -> None:
-    if (
-        photos is not None
-        and scene.images.exists()
-        and not scene.images.is_symlink()
-        and scene.images.resolve() != photos.resolve()
-    ):
-        raise InputError(f"{scene.images} already holds other photos: choose another scene folder")
-
-
-def _link(photos: Path, images: Path) -> None:
-    """Make `images` a link to the photos; a copy where links are not possible."""
-    if images.exists() and images.resolve() == photos.resolve():
-        return
-    with atomic_path(images) as temporary:
-        try:
-            os.symlink(photos.resolve(), temporary, target_is_directory=True)
-        except OSError:
-            shutil.copytree(photos, temporary)

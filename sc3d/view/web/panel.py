@@ -12,13 +12,14 @@ import numpy as np
 
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View
+from sc3d.io.images import data_uri
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import Coloring, color_scale, legend_entries
 from sc3d.view.display_cloud import DisplayCloud
 from sc3d.view.picking import Inspector, PickedPoint, point_on_ray
 from sc3d.view.web.layers import CameraLayer, CloudLayer, SplatLayer
 from sc3d.view.web.orbit_camera import OrbitCamera
-from sc3d.view.web.photos import PhotoPictures, jpeg_uri, photo_pictures, thumbnail
+from sc3d.view.web.photos import PhotoPictures, photo_pictures, thumbnail
 
 if TYPE_CHECKING:
     import viser
@@ -229,7 +230,7 @@ def pictures_html(found: PhotoPictures) -> str:
     withdraws while they load.
     """
     pictures = [
-        f"{_note(label)}<img alt='{label}' style='display:block;width:100%' src='{jpeg_uri(picture)}'>"
+        f"{_note(label)}<img alt='{label}' style='display:block;width:100%' src='{data_uri(picture)}'>"
         for label, picture in (("photo", found.photo), ("mask", found.mask))
         if picture is not None
     ]
