@@ -97,14 +97,13 @@ class ReportData:
 
 def load_report_data(scene: Scene) -> ReportData:
     """Read whatever of a scene exists; InputError for files that exist and are broken."""
-    cloud_file = next((path for path in (scene.labelled, scene.seeds, scene.cloud) if path.exists()), None)
     metrics = read_json(scene.metrics) if scene.metrics.exists() else {}
     if not isinstance(metrics, dict):
         raise InputError(f"{scene.metrics} must hold an object: run `sc3d evaluate {scene.path} --overwrite`")
     return ReportData(
         scene=scene,
         class_table=scene.class_table() if scene.classes.exists() else None,
-        cloud=None if cloud_file is None else read_cloud(cloud_file),
+        cloud=None if scene.best_cloud is None else read_cloud(scene.best_cloud),
         mesh=read_mesh(scene.mesh) if scene.mesh.exists() else None,
         views=scene.model.views if scene.sparse.is_dir() else [],
         metrics=metrics,

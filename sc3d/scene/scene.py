@@ -69,6 +69,10 @@ class Scene:
         return self.path / "export"
 
     @property
+    def labelled_splats(self) -> Path:
+        return self.export / "splats.ply"
+
+    @property
     def truth(self) -> Path:
         return self.path / "truth"
 
@@ -95,6 +99,11 @@ class Scene:
     @property
     def report(self) -> Path:
         return self.path / "report.html"
+
+    @property
+    def best_cloud(self) -> Path | None:
+        """The labelled cloud, else the seeds, else the bare cloud; None if there is none."""
+        return next((path for path in (self.labelled, self.seeds, self.cloud) if path.exists()), None)
 
     def require(self, *paths: Path, hint: str) -> None:
         """Raise InputError naming the first of `paths` that is missing, and what to do."""

@@ -4,14 +4,18 @@ colors.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.io.clouds import read_cloud
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import VOTES, spacing_of
+from sc3d.scene.scene import Scene
 from sc3d.view.colors import COLORINGS, Coloring, can_color, color_points, shaded
 
 if TYPE_CHECKING:
@@ -147,6 +151,26 @@ def only_classes(cloud: o3d.t.geometry.PointCloud, ids: set[int] | None) -> o3d.
     if not chosen.any():
         raise InputError("no point has one of the chosen classes: nothing to show")
     return cloud.select_by_mask(o3d.core.Tensor(chosen))
+
+
+def load_cloud(
+    scene: Scene, file: Path | None = None, votes: bool | None = False
+) -> o3d.t.geometry.PointCloud:
+    """The cloud of a file, else the best of the scene; InputError if there is none.
+
+    votes: add those of seeds.ply to a cloud of the scene that has none; None = where that is possible
+    """
+    path = file or scene.best_cloud
+    if path is None:
+        raise InputError(f"{scene.path} has no cloud to show: run `sc3d extract SCENE`, or pass --file FILE")
+    cloud = read_cloud(path)
+    if votes is False or can_color(cloud, "disagreement") or file is not None or not scene.seeds.exists():
+        return cloud
+    if votes:
+        return with_votes(cloud, read_cloud(scene.seeds))
+    with suppress(InputError):
+        return with_votes(cloud, read_cloud(scene.seeds))
+    return cloud
 
 
 def with_votes(

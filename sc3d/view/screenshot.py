@@ -10,16 +10,19 @@ import cv2
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import View, local_origin, undistorted
+from sc3d.geometry.cameras import View, local_origin, resample, undistorted
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.scene.class_table import ClassTable
 from sc3d.view.captions import add_legend
 from sc3d.view.colors import Coloring, as_uint8, color_points
+from sc3d.view.contact_sheet import half_of, side_by_side
 from sc3d.view.renderers import Renderable, render
-from sc3d.view.viewpoints import frusta, frustum_depth, overview, without_outliers
+from sc3d.view.viewpoints import fitted, frusta, frustum_depth, overview, without_outliers
 
 if TYPE_CHECKING:
     import open3d as o3d
+
+    from sc3d.view.display_splats import DisplaySplats
 
 LINE_COLOR = (240, 150, 20)
 _LARGEST_CANVAS = 8192  # px; what software renderers take
@@ -98,6 +101,44 @@ def screenshot(
     labels = geometry.point[style.by].cpu().numpy() if style.by in ("label", "state") else None
     return add_legend(
         image, style.by, class_table, None if labels is None else set(np.unique(labels).tolist())
+    )
+
+
+def screenshot_splats(
+    splats: DisplaySplats,
+    view: View | None = None,
+    photo: np.ndarray | None = None,
+    size: tuple[int, int] = (1600, 1000),
+    style: Style = Style(),
+) -> np.ndarray:
+    """A picture of Gaussians, with a legend where they are colored by their labels.
+
+    view, photo: camera (world) and picture (H, W, 3) uint8 RGB that they are drawn beside; None = an overview
+    style: what it says of coloring, direction and background
+    returns: (H, W, 3) uint8 RGB
+    """
+    from sc3d.view.splat_images import compare, rendered
+
+    labelled = splats.label is not None and style.by != "photo"
+    gaussians = splats.painted(style.by) if labelled else splats.gaussians
+    if view is None:
+        seen = gaussians.means[gaussians.opacities > 0.5].numpy()
+        points = without_outliers(seen if len(seen) else gaussians.means.numpy())
+        image = rendered(gaussians, overview(points, size, style.from_above), style.background)
+    else:
+        source = view.shifted(splats.origin)
+        target = fitted(source, half_of(size))
+        pixels = resample(photo, source, target)
+        if labelled:
+            drawn, caption = rendered(gaussians, target, style.background), f"splats by {style.by}"
+        else:
+            found = compare(gaussians, target, pixels)
+            pixels, drawn, caption = found.photo, found.rendered, f"splats, PSNR {found.psnr:.2f} dB"
+        image = side_by_side((pixels, drawn), (view.name, caption))
+    return (
+        add_legend(image, style.by, splats.table, set(np.unique(splats.label).tolist()))
+        if labelled
+        else image
     )
 
 

@@ -197,7 +197,7 @@ class SplatLayer:
 
     def _colors(self) -> np.ndarray:
         labelled = self._splats.label is not None and self._by in SPLAT_COLORINGS
-        return self._splats.colors(self._by if labelled else "photo", self._display.class_table)
+        return self._splats.colors(self._by if labelled else "photo")
 
 
 class CameraLayer:

@@ -293,7 +293,7 @@ def position_in(rows: object) -> np.ndarray:
     return np.array([float(number) for number in re.findall(r"\d+\.\d+", rows.inner_text())])
 
 
-def two_layers() -> DisplaySplats:
+def two_layers(table) -> DisplaySplats:
     """Splats of class 1 above splats of class 3, given front to back: drawn in that order, the ones below
     would cover the ones above.
     """
@@ -310,14 +310,18 @@ def two_layers() -> DisplaySplats:
         torch.zeros(count, 1, 3),
     )
     return DisplaySplats(
-        gaussians, np.round(ORIGIN), np.repeat(np.uint8([1, 3]), x.size), np.ones(count, np.float32)
+        gaussians,
+        np.round(ORIGIN),
+        np.repeat(np.uint8([1, 3]), x.size),
+        np.ones(count, np.float32),
+        table,
     )
 
 
 def test_file_opens_from_disk_and_sorts_splats_by_depth(scene, browser, tmp_path):
     from sc3d.view.web.page import WebView, write_page
 
-    splats = two_layers()
+    splats = two_layers(scene.class_table())
     view = WebView(
         scene,
         Inspector(splats.centers(), scene.model.views, scene.class_table(), scene.mesh),
