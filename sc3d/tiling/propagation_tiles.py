@@ -20,7 +20,7 @@ from sc3d.propagation.appearance import (
     AppearanceModel,
     Histogram,
 )
-from sc3d.propagation.propagate import LabelledPoints, tie_breakers
+from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
 from sc3d.propagation.terrain import NUM_FEATURES
 from sc3d.scene.labelled_cloud import VOTES
 from sc3d.scene.labels import Labels

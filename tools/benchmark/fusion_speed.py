@@ -23,7 +23,8 @@ from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.fusion import Fusion, fuse
 from sc3d.labelling.inputs import Masks
 from sc3d.labelling.observation import Mask
-from sc3d.propagation.propagate import LabelledPoints, complete
+from sc3d.propagation.labelled_points import LabelledPoints
+from sc3d.propagation.propagate import propagate
 from sc3d.scene.labelled_cloud import point_arrays, read_surface, spacing_of
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
@@ -145,7 +146,7 @@ def _label(workload: Workload) -> Fusion:
 
 def _propagate(workload: Workload, fusion: Fusion) -> Labels:
     evidence = LabelledPoints(workload.cloud.points, fusion.labels, fusion.votes, workload.colors)
-    return complete(evidence, workload.cloud.normals, Propagate(method="map"))
+    return propagate(evidence, workload.cloud.normals, Propagate(method="map"))
 
 
 def _label_and_propagate(workload: Workload) -> Labels:
@@ -189,7 +190,7 @@ def _grown(workload: Workload, num_views: int) -> dict[str, float]:
     record = {
         "points": len(workload.cloud.points),
         "views": num_views,
-        "voxels": len(np.unique(fusion.cells // 2)),
+        "voxels": len(np.unique(fusion.rows // 2)),
         "label_cpu_seconds": cpu,
         "label_wall_seconds": wall,
         "label_peak_memory_mb": peak,
