@@ -58,7 +58,7 @@ def test_options_tell_defaults_choices_and_positionals():
 
 def test_the_examples_of_the_geometry_utilities_run():
     failed, tried = doctest.testfile(
-        str(MANUAL / "geometry.md"),
+        str(MANUAL / "geometry-by-example.md"),
         module_relative=False,
         optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE,
     )
