@@ -1,5 +1,5 @@
-"""Writes the manual's pages of commands, from the same records as `--help`: `python tools/make_manual.py
-[FOLDER]`.
+"""Writes the manual's pages of commands, from the same records as `--help`, and those of the geometry utilities,
+from their docstrings: `python tools/make_manual.py [FOLDER]`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,19 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from sc3d.commands import COMMANDS, STAGES
 from sc3d.io.json_files import write_text
+from tools.docstring_pages import module_page, public, summary
 
+ROOT = Path(__file__).resolve().parent.parent
+GEOMETRY = ROOT / "sc3d" / "geometry"
+NOTE_GEOMETRY = (
+    "<!-- Written by `python tools/make_manual.py`; edit the docstrings of sc3d/geometry instead. -->"
+)
+GEOMETRY_ABOUT = """`sc3d.geometry` knows nothing of classes and of files of photos, and stands alone: numpy arrays and Open3D's tensors in and out.
+[By example](../geometry-by-example.md) goes through it; here is every public function, from its docstring."""
 NOTE = "<!-- Written by `python tools/make_manual.py`; edit sc3d/settings instead. -->"
 
 
@@ -136,6 +143,33 @@ def write_pages(folder: Path, commands: dict[str, Command]) -> list[Path]:
     return [*written, folder / "README.md"]
 
 
+def write_geometry_pages(folder: Path) -> list[Path]:
+    """`<module>.md` for every module of sc3d.geometry with something public in it, and `README.md`, the list of
+    them.
+    """
+    written, rows = [], []
+    for file in sorted(GEOMETRY.glob("*.py")):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        if file.stem == "__init__" or "kernels" in file.stem or not public(tree.body):
+            continue
+        written.append(folder / f"{file.stem}.md")
+        write_text(written[-1], module_page(file, f"sc3d.geometry.{file.stem}", NOTE_GEOMETRY))
+        names = ", ".join(f"`{node.name}`" for node in public(tree.body))
+        rows.append(f"| [{file.stem}]({file.stem}.md) | {summary(tree)} | {names} |")
+    head = [
+        NOTE_GEOMETRY,
+        "",
+        "# Geometry utilities",
+        "",
+        GEOMETRY_ABOUT,
+        "",
+        "| module | | |",
+        "|---|---|---|",
+    ]
+    write_text(folder / "README.md", "\n".join([*head, *rows]) + "\n")
+    return [*written, folder / "README.md"]
+
+
 def _table(found: list[Option], scene: bool) -> str:
     rows = [(option.flag, option.values, option.default, option.help) for option in found]
     rows += [("--overwrite", "", "False", "Run again even if the outputs are up to date.")] if scene else []
@@ -178,12 +212,12 @@ def _shown(value: object) -> str:
 def main(arguments: list[str] | None = None) -> None:
     """Write all pages."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "data" / "manual" / "commands")
+    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "data" / "manual")
     folder = parser.parse_args(arguments).folder
     commands = {
         name: _command(record, name in STAGES) for name, record in sorted((STAGES | COMMANDS).items())
     }
-    written = write_pages(folder, commands)
+    written = write_pages(folder / "commands", commands) + write_geometry_pages(folder / "geometry")
     sys.stdout.write(f"wrote {len(written)} pages to {folder}\n")
 
 

@@ -29,9 +29,7 @@ def main(folder: Path) -> None:
     trained = execute("train", scene, train)  # -> gaussians.ply, train.csv, train.jpg
     extracted = execute("extract", scene, Extract(max_size=160))  # -> mesh.ply, cloud.ply
     print(f"{trained['gaussians']} Gaussians, PSNR {trained['psnr']} dB on the photos trained on")
-    print(
-        f"{extracted['points']} points, voxels of {extracted['voxel_size']} m, {extracted['coverage']} covered"
-    )
+    print(f"{extracted['points']} points; the mesh is met by {extracted['coverage']}")
 
     points = read_cloud(scene.cloud).point.positions.numpy()
     true_points = read_cloud(scene.path / "truth.ply").point.positions.numpy()
