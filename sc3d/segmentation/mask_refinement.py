@@ -13,8 +13,10 @@ from tqdm import tqdm
 
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex
-from sc3d.labelling.fusion import Cloud, Mask, fuse
+from sc3d.labelling.cloud import Cloud
+from sc3d.labelling.fusion import fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size, read_given_cloud
+from sc3d.labelling.observation import Mask
 from sc3d.metrics import Confusion, total
 from sc3d.propagation.propagate import LabelledPoints, complete
 from sc3d.scene.labelled_cloud import REACH, LabelledSurface, point_arrays, read_surface, spacing_of

@@ -15,7 +15,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.io.clouds import read_cloud
 from sc3d.io.images import read_index_image
-from sc3d.labelling.fusion import Cloud
+from sc3d.labelling.cloud import Cloud
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label, Propagate
 from sc3d.splatting.gaussians import Gaussians

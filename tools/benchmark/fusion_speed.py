@@ -19,8 +19,10 @@ from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.raycast import Surface
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.provenance import peak_memory_mb, reset_peak_memory, versions
-from sc3d.labelling.fusion import Cloud, Fusion, Mask, fuse
+from sc3d.labelling.cloud import Cloud
+from sc3d.labelling.fusion import Fusion, fuse
 from sc3d.labelling.inputs import Masks
+from sc3d.labelling.observation import Mask
 from sc3d.propagation.propagate import LabelledPoints, complete
 from sc3d.scene.labelled_cloud import point_arrays, read_surface, spacing_of
 from sc3d.scene.labels import Labels

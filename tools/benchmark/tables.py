@@ -20,7 +20,8 @@ from sc3d.errors import InputError
 from sc3d.io.atomic import require_writable
 from sc3d.io.json_files import write_json
 from sc3d.io.provenance import digest, peak_memory_mb, reset_peak_memory, versions
-from sc3d.labelling.fusion import Cloud, Fusion, fuse
+from sc3d.labelling.cloud import Cloud
+from sc3d.labelling.fusion import Fusion, fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size
 from sc3d.metrics import Confusion
 from sc3d.propagation.propagate import LabelledPoints, complete
