@@ -9,7 +9,7 @@ import ast
 import inspect
 import sys
 import textwrap
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
@@ -34,13 +34,14 @@ NOTE = "<!-- Written by `python tools/make_manual.py`; edit sc3d/settings instea
 @dataclass(frozen=True)
 class Option:
     """One option of a command. flag: as typed; values: what it takes; default: as text, "" = required; help:
-    one paragraph.
+    one paragraph; group: what the options of a record within the record have in common, "" = none.
     """
 
     flag: str
     values: str
     default: str
     help: str
+    group: str = ""
 
 
 @dataclass(frozen=True)
@@ -73,8 +74,8 @@ def helps(record: type) -> dict[str, str]:
 
 
 def options(record: type) -> list[Option]:
-    """The options of a record, in order; records inside it belong to other commands, to which one line
-    points.
+    """The options of a record, in order. A record inside it that is named like a command belongs to that one, to
+    which one line points; any other is a group.
     """
     found = []
     for field in fields(record):
@@ -87,11 +88,13 @@ def options(record: type) -> list[Option]:
             (note.name for note in notes if getattr(note, "name", None) is not None), field.name
         ).replace("_", "-")
         if is_dataclass(bare):
-            found += (
-                [Option(f"--{name}.OPTION", "", "", f"The options of `sc3d {name}`.")]
-                if name
-                else options(bare)
-            )
+            if name in STAGES | COMMANDS:
+                found.append(Option(f"--{name}.OPTION", "", "", f"The options of `sc3d {name}`."))
+            elif name:
+                group = " ".join((bare.__doc__ or "").split())
+                found += [replace(option, group=group) for option in options(bare)]
+            else:
+                found += options(bare)
             continue
         about = next((note.help for note in notes if getattr(note, "help", None)), None) or helps(record).get(
             field.name, ""
@@ -125,7 +128,7 @@ def page(name: str, command: Command) -> str:
             ]
         )
         heading = [f"## {subcommand}", " ".join((record.__doc__ or "").split())] if subcommand else []
-        parts += [*heading, f"```\n{usage}\n```", _table(options(record), command.scene)]
+        parts += [*heading, f"```\n{usage}\n```", *_tables(options(record), command.scene)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -170,12 +173,22 @@ def write_geometry_pages(folder: Path) -> list[Path]:
     return [*written, folder / "README.md"]
 
 
-def _table(found: list[Option], scene: bool) -> str:
-    rows = [(option.flag, option.values, option.default, option.help) for option in found]
-    rows += [("--overwrite", "", "False", "Run again even if the outputs are up to date.")] if scene else []
+def _tables(found: list[Option], scene: bool) -> list[str]:
+    """The everyday options, then every group under its sentence."""
+    overwrite = Option("--overwrite", "", "False", "Run again even if the outputs are up to date.")
+    everyday = [option for option in found if not option.group] + ([overwrite] if scene else [])
+    parts = [_table(everyday)]
+    for group in dict.fromkeys(option.group for option in found if option.group):
+        parts += [group, _table([option for option in found if option.group == group])]
+    return parts
+
+
+def _table(found: list[Option]) -> str:
     cells = [
-        "| " + " | ".join(_escaped(cell) for cell in (f"`{flag}`", values, default, about)) + " |"
-        for flag, values, default, about in rows
+        "| "
+        + " | ".join(map(_escaped, (f"`{option.flag}`", option.values, option.default, option.help)))
+        + " |"
+        for option in found
     ]
     return "\n".join(["| option | values | default | |", "|---|---|---|---|", *cells])
 

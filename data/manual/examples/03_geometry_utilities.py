@@ -13,7 +13,7 @@ import pycolmap
 from sc3d.geometry.cameras import View, look_at, project, rays
 from sc3d.geometry.neighbors import NeighborIndex, curvature, estimate_normals, orient_normals
 from sc3d.geometry.raycast import Surface, first_surface, see_points
-from sc3d.geometry.voxels import LabelGrid
+from sc3d.geometry.voxels import LabelGrid, sort_by_voxel
 
 
 def main() -> None:
@@ -49,8 +49,8 @@ def main() -> None:
     assert np.median(bend) < 0.01 < 0.1 < np.median(bend[rim])
 
     # a sparse grid of whole numbers: points per voxel of half a meter
-    grid = LabelGrid.around(points, voxel_size=0.5, num_channels=1)
-    np.add.at(grid.votes[:, 0], grid.find(points), 1)
+    grid = LabelGrid.from_voxels(sort_by_voxel(points, voxel_size=0.5), num_channels=1)
+    grid.add(grid.find(points), np.ones((len(points), 1), np.int32))
     print(f"{(grid.votes[:, 0] > 0).sum()} voxels of 0.5 m hold points, {grid.votes[:, 0].max()} at most")
     assert grid.votes[:, 0].sum() == len(points) and grid.find(view.center[None])[0] == -1
 
