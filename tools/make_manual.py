@@ -222,6 +222,13 @@ def _shown(value: object) -> str:
     return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
+def remove_stale_pages(folder: Path, written: list[Path], note: str) -> None:
+    """Remove pages that an earlier version wrote, told by their first line."""
+    for file in set(folder.glob("*.md")) - set(written):
+        if file.read_text(encoding="utf-8").startswith(note):
+            file.unlink()
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Write all pages."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -231,6 +238,8 @@ def main(arguments: list[str] | None = None) -> None:
         name: _command(record, name in STAGES) for name, record in sorted((STAGES | COMMANDS).items())
     }
     written = write_pages(folder / "commands", commands) + write_geometry_pages(folder / "geometry")
+    remove_stale_pages(folder / "commands", written, NOTE)
+    remove_stale_pages(folder / "geometry", written, NOTE_GEOMETRY)
     sys.stdout.write(f"wrote {len(written)} pages to {folder}\n")
 
 
