@@ -13,9 +13,8 @@ from sc3d.commands import COMMANDS, STAGES
 from sc3d.settings.labels import Label, Segment
 from sc3d.settings.reconstruction import ReconstructCommand
 from tools.docstring_pages import module_page
-from tools.make_manual import NOTE_GEOMETRY
+from tools.make_manual import NOTE_GEOMETRY, options
 from tools.make_manual import main as write_manual
-from tools.make_manual import options
 
 MANUAL = Path(__file__).parents[2] / "data" / "manual"
 
