@@ -132,6 +132,17 @@ def defines(body: list[ast.stmt], path: list[str]) -> bool:
     return False
 
 
+def test_the_picture_of_the_floors_has_every_part_of_the_package():
+    picture = re.findall(r"^```\n(.*?)^```", text_of(MANUAL / "architecture.md"), re.M | re.S)[0]
+    names = re.findall(r"^  (\w+)", picture, re.M)
+    parts = {
+        path.stem
+        for path in (ROOT / "sc3d").iterdir()
+        if (path / "__init__.py").exists() or path.suffix == ".py"
+    }
+    assert sorted(names) == sorted(parts - {"__init__"} | {"tools"})
+
+
 def test_the_checks_notice_what_is_wrong():
     assert exists("sc3d.metrics.Confusion.mean_iou") and exists("sc3d.geometry") and exists("sc3d.cli")
     assert (
