@@ -4,12 +4,97 @@ step.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 
 from sc3d.geometry.graph import Graph
+from sc3d.propagation.appearance import LearnedAppearance
+from sc3d.propagation.labelled_points import LabelledPoints
+from sc3d.propagation.region_growing import grow_regions
+from sc3d.settings.labels import Propagate
 
+MAX_EVIDENCE = 5.0  # a point's votes count as at most this many
+SMOOTHING = 0.25  # added to the votes of each class
+TRUST = 0.5  # weight of the votes beside the appearance, which sees what the views' shared errors hide
+SURE = 0.95  # later rounds learn from points of this probability
+# confidence: weight of the evidence and of the neighbors; full weights would be sure everywhere
+CAUTION, SUPPORT = 0.5, 0.1
 STEPS = 10
+
+
+def minimize_energy(
+    graph: Graph, known: LabelledPoints, appearance: LearnedAppearance | None, settings: Propagate
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) uint8 labels of the smallest Potts energy, and (N,) float32 their confidences.
+
+    appearance: votes beside the views; what it teaches is learned again from each round's result. None = votes alone
+    """
+    offered = np.bincount(known.seed_labels, minlength=known.num_classes + 1)[1:] > 0
+    if appearance is None:
+        return decided(graph, *vote_marginals(graph, known, offered, settings))
+    label = known.seed_labels
+    for turn in range(max(settings.rounds, 1)):
+        rating = appearance.log_likelihood(label)
+        if turn and rating is None:
+            break  # too little is sure; what was learned from agreed points stands
+        evidence, marginals = appearance_marginals(graph, known, offered, rating, settings)
+        label = (marginals.argmax(axis=1) + 1).astype(np.uint8)
+        statistics = appearance.model.statistics(label, sure_examples(marginals, known), known.num_classes)
+        appearance = replace(appearance, statistics=statistics)
+    return decided(graph, evidence, marginals)
+
+
+def vote_marginals(
+    graph: Graph, known: LabelledPoints, offered: np.ndarray, settings: Propagate
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log-evidence and belief (N, C) from the votes alone; offered: (C,) bool, a class without a single seed
+    is not.
+    """
+    likelihood = vote_likelihood(known.votes)
+    likelihood[:, ~offered] = -np.inf
+    # else the votes would take one edge per step to reach points without any
+    grown, _ = grow_regions(graph, known.seed_labels)
+    marginals = softmax(likelihood)
+    silent = np.flatnonzero(~known.votes[:, 1:].any(axis=1) & (grown > 0))
+    marginals[silent] = np.eye(likelihood.shape[1], dtype=np.float32)[grown[silent] - 1]
+    return likelihood, mean_field(graph, likelihood, settings.smoothness, marginals)
+
+
+def appearance_marginals(
+    graph: Graph, known: LabelledPoints, offered: np.ndarray, rating: np.ndarray, settings: Propagate
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same from votes and raters; rating: (N, C), overwritten."""
+    rating += np.float32(TRUST) * vote_likelihood(known.votes)
+    rating[:, ~offered] = -np.inf
+    return rating, mean_field(graph, rating, settings.smoothness)  # afresh: a sure belief would not move
+
+
+def sure_examples(marginals: np.ndarray, known: LabelledPoints) -> np.ndarray:
+    """(N,) bool points that a later round learns from."""
+    return (marginals.max(axis=1) > SURE) & (known.seeds.num_views > 0)
+
+
+def decided(graph: Graph, evidence: np.ndarray, marginals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) uint8 labels and (N,) float32 confidences of a belief (N, C); evidence (N, C) is overwritten."""
+    label = marginals.argmax(axis=1) + 1
+    evidence *= np.float32(CAUTION)
+    cautious = mean_field(graph, evidence, SUPPORT, marginals, steps=1)
+    return label.astype(np.uint8), cautious[np.arange(len(label)), label - 1]
+
+
+def vote_likelihood(votes: np.ndarray) -> np.ndarray:
+    """(N, C) float32 log-likelihood of the classes 1..C from the votes (N, C + 1); 0 for points without
+    votes.
+    """
+    total = votes[:, 1:].sum(axis=1, keepdims=True)
+    result = votes[:, 1:] + np.float32(SMOOTHING)
+    result /= total + np.float32(SMOOTHING * (votes.shape[1] - 1))
+    np.log(result, out=result)
+    result *= np.minimum(1 + total, np.float32(MAX_EVIDENCE))
+    result -= result.max(axis=1, keepdims=True)
+    return result.astype(np.float32, copy=False)
 
 
 def mean_field(

@@ -13,10 +13,13 @@ from tqdm import tqdm
 
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex
-from sc3d.labelling.fusion import Cloud, Mask, fuse
+from sc3d.labelling.cloud import Cloud
+from sc3d.labelling.fusion import fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size, read_given_cloud
+from sc3d.labelling.observation import Mask
 from sc3d.metrics import Confusion, total
-from sc3d.propagation.propagate import LabelledPoints, complete
+from sc3d.propagation.labelled_points import LabelledPoints
+from sc3d.propagation.propagate import propagate
 from sc3d.scene.labelled_cloud import REACH, LabelledSurface, point_arrays, read_surface, spacing_of
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
@@ -47,7 +50,7 @@ class RefinementInputs:
     def labels(self, views: list[View], read: ReadMask) -> Labels:
         """Labels of all points from the masks of some views."""
         fusion = fuse(self.cloud, views, read, self.seen.surface, self.num_ids, self.label)
-        return complete(
+        return propagate(
             LabelledPoints(self.cloud.points, fusion.labels, fusion.votes, self.colors),
             self.cloud.normals,
             self.propagate,

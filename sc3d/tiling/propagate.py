@@ -23,36 +23,27 @@ from sc3d.errors import InputError
 from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.ply import write_records
 from sc3d.propagation.appearance import (
-    MIN_EXAMPLES,
     AppearanceModel,
     AppearanceStatistics,
     feature_counts,
     folds_of,
-)
-from sc3d.propagation.potts import STEPS
-from sc3d.propagation.propagate import (
-    appearance_marginals,
-    decided,
-    examples_in,
-    final_labels,
     is_skillful,
-    needs_appearance,
-    spread,
+    plausible,
     sum_statistics,
-    verified,
-    views_to_agree,
-    vote_marginals,
+    uses_appearance,
 )
+from sc3d.propagation.labelled_points import MIN_EXAMPLES, views_to_agree
+from sc3d.propagation.potts import STEPS, appearance_marginals, decided, sure_examples, vote_marginals
+from sc3d.propagation.propagate import PropagateSummary, fill_from_nearest, no_seeds, spread, with_states
 from sc3d.propagation.quantile_sketch import QuantileSketch
-from sc3d.propagation.region_growing import vote_nearest
 from sc3d.propagation.terrain import WINDOWS, GroundModel, NormalStatistics
 from sc3d.scene.labelled_cloud import VOTES
 from sc3d.scene.labels import PROPAGATED
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
-from sc3d.tiling.executor import Executor
+from sc3d.tiling.executor import Executor, open_executor
 from sc3d.tiling.label import sample_spacing
-from sc3d.tiling.memory import WorkFolder, max_points
+from sc3d.tiling.memory import WorkFolder, fits, max_points, num_points
 from sc3d.tiling.propagation_tiles import PropagateJob, TileGraph, cells_of
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
 
@@ -63,46 +54,32 @@ EDGE = 2.6  # an edge is hardly longer, point spacings
 HOPS = STEPS + 3  # how far a round of mean field looks, and what the edges at that distance depend on
 
 
-@dataclass(frozen=True)
-class Summary:
-    """Of a finished cloud: points, those with a label, those that got it here, and the sum of the labelled
-    points' confidences.
-    """
-
-    num_points: int
-    labelled: int
-    propagated: int
-    confidence: float
+def propagate_fits(scene: Scene, settings: Propagate) -> bool:
+    """Whether the cloud fits into memory as a whole, and nobody asked for workers."""
+    count = num_points(settings.seeds or scene.seeds)
+    return count is None or fits(count * BYTES, settings)
 
 
-def propagate_tiles(scene: Scene, settings: Propagate, cloud: CloudFile, tasks: Executor) -> Summary:
-    """Complete the labels of a cloud that `label` wrote, and write it."""
-    output = settings.output or scene.labelled
+def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
+    """As `propagation.propagate.propagate_scene`, tile by tile, here or on the workers that the settings ask for."""
+    cloud, output = CloudFile.open(settings.seeds or scene.seeds), settings.output or scene.labelled
     num_ids = sum(name.startswith(VOTES) for name in cloud.dtype.names)
-    missing = [
-        name
-        for name in ("nx", "label", "confidence", "state", "num_views", f"{VOTES}0")
-        if name not in cloud.dtype.names
-    ]
-    if missing:
-        raise InputError(f"{cloud.path} has no attribute {missing[0]!r}: it was not written by `sc3d label`")
-    parts = WorkFolder(output, "propagate", [cloud.path], settings)
-    survey = CloudStatistics.from_cloud(cloud)
-    grid = survey.grid(max_points(settings, BYTES), HOPS * EDGE * survey.spacing)
-    store = TileStore.build(cloud, grid, parts.subfolder("tiles"))
-    margin = HOPS * EDGE * sample_spacing(store, survey)[0]
-    job = PropagateJob(
-        settings,
-        survey.extent,
-        store,
-        Results(parts.subfolder("results"), store),
-        margin,
-        num_ids,
-        parts.subfolder("shared"),
+    for name in ("nx", "label", "confidence", "state", "num_views", f"{VOTES}0"):
+        if name not in cloud.dtype.names:
+            raise InputError(f"{cloud.path} has no attribute {name!r}: it was not written by `sc3d label`")
+    folder, statistics = (
+        WorkFolder(output, "propagate", [cloud.path], settings),
+        CloudStatistics.from_cloud(cloud),
     )
-    _solve(job, tasks, cloud.path)
+    grid = statistics.grid(max_points(settings, BYTES), HOPS * EDGE * statistics.spacing)
+    store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
+    margin = HOPS * EDGE * sample_spacing(store, statistics)[0]
+    results, shared = Results(folder.subfolder("results"), store), folder.subfolder("shared")
+    job = PropagateJob(settings, statistics.extent, store, results, margin, num_ids, shared)
+    with open_executor(settings) as executor:
+        _solve(job, executor, cloud.path)
     summary = _write(output, cloud, job)
-    parts.remove()
+    folder.remove()
     return summary
 
 
@@ -115,12 +92,10 @@ def _solve(job: PropagateJob, tasks: Executor, path: Path) -> None:
         views_to_agree(sum(look.agreement for look in looks)),
     )
     if not offered.any():
-        raise InputError(
-            f"{path} has no labelled point to start from: check that masks and cloud belong together, or lower --consensus in label"
-        )
+        raise no_seeds(path)
     statistics = (
         _learn(job, tasks, NormalStatistics.merge([look.lean for look in looks]), least)
-        if needs_appearance(job.settings)
+        if uses_appearance(job.settings)
         else None
     )
     source = "once"
@@ -151,7 +126,7 @@ class TileSummary:
 
 def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
     part = TileGraph.load(job, tile)
-    core, start = part.core, part.known.start
+    core, start = part.core, part.known.seed_labels
     return TileSummary(
         np.bincount(start[core], minlength=job.num_ids)[1 : job.num_ids],
         part.known.agreement(core),
@@ -212,7 +187,7 @@ def _lesson_task(
         folds_of(part.known.points, job.extent.low, job.extent.high),
     )
     return tuple(
-        appearance.statistics(part.known.start, examples & (folds == fold), part.known.num_classes)
+        appearance.statistics(part.known.seed_labels, examples & (folds == fold), part.known.num_classes)
         for fold in (0, 1)
     )
 
@@ -221,7 +196,7 @@ def _error_task(
     job: PropagateJob, halves: list[AppearanceStatistics], least: int, tile: int
 ) -> tuple[int | None, int | None]:
     part = TileGraph.load(job, tile)
-    appearance, start = part.appearance(job), part.known.start
+    appearance, start = part.appearance(job), part.known.seed_labels
     examples, folds = (
         part.known.agreed_by(least) & part.core,
         folds_of(part.known.points, job.extent.low, job.extent.high),
@@ -236,11 +211,11 @@ def _turn_task(
     part = TileGraph.load(job, tile)
     appearance, known = part.appearance(job), part.known
     if not job.results.has(tile, f"round{turn}_examples"):
-        label = part.around(job, f"round{turn - 1}_label") if turn else known.start
+        label = part.around(job, f"round{turn - 1}_label") if turn else known.seed_labels
         evidence, marginals = appearance_marginals(
             part.graph, known, offered, appearance.log_likelihood(statistics, label), job.settings
         )
-        examples = examples_in(marginals, known)
+        examples = sure_examples(marginals, known)
         label, confidence = decided(part.graph, evidence, marginals)
         names = (f"round{turn}_label", f"round{turn}_confidence", f"round{turn}_examples")
         job.results.write(
@@ -273,11 +248,11 @@ def _once_task(
 
 def _start(job: PropagateJob, part: TileGraph, statistics: AppearanceStatistics | None) -> np.ndarray:
     """The labels of the seeds; for geometry and knn without those that look like another class."""
-    start = part.known.start
+    start = part.known.seed_labels
     return (
         start
         if statistics is None or job.settings.method == "map"
-        else verified(start, part.appearance(job).log_likelihood(statistics, start))
+        else plausible(start, part.appearance(job).log_likelihood(statistics, start))
     )
 
 
@@ -326,7 +301,7 @@ def _link_task(job: PropagateJob, first: dict[int, int], tile: int) -> tuple[np.
         lambda other: job.results.read(other, "group", mapped=True).astype(np.int64) + first[other]
     )[part.graph.order]
     pairs = np.unique(np.stack([mine[~part.core], others[~part.core]], axis=1), axis=0)
-    return pairs, np.unique(mine[part.core & (part.known.start > 0)])
+    return pairs, np.unique(mine[part.core & (part.known.seed_labels > 0)])
 
 
 def _state_task(
@@ -343,19 +318,15 @@ def _state_task(
             lambda other: reached[other][job.results.read(other, "group", mapped=True)]
         )
         label = np.where(groups[part.graph.order], label, 0)
-    if job.settings.fill and (label == 0).any() and (label > 0).any():
-        filled, filled_confidence = vote_nearest(part.known.points, label.astype(np.uint8), 1)
-        label, confidence = (
-            np.where(label == 0, filled, label),
-            np.where(label == 0, 0.5 * filled_confidence, confidence),
-        )
-    final = final_labels(part.known.seeds, _start(job, part, statistics), label, confidence, job.settings)
+    if job.settings.fill:
+        label, confidence = fill_from_nearest(part.known.points, label, confidence)
+    final = with_states(part.known.seeds, _start(job, part, statistics), (label, confidence), job.settings)
     job.results.write(
         tile, label=part.own(final.label), confidence=part.own(final.confidence), state=part.own(final.state)
     )
 
 
-def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> Summary:
+def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
     kept = [(name, cloud.dtype[name].str[1:]) for name in cloud.dtype.names if not name.startswith(VOTES)]
     counts, confidence = np.zeros(3, np.int64), [0.0]
 
@@ -372,4 +343,4 @@ def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> Summary:
             yield result
 
     write_records(path, chunks(), np.dtype(kept), cloud.num_points, ["sc3d"])
-    return Summary(*counts.tolist(), confidence[0])
+    return PropagateSummary(*counts.tolist(), confidence[0])

@@ -11,7 +11,7 @@ import numpy as np
 
 from sc3d.geometry.graph import Graph, build_graph
 from sc3d.io.chunked_clouds import columns, positions
-from sc3d.labelling.fusion import Extent
+from sc3d.labelling.cloud import CloudExtent
 from sc3d.propagation.appearance import (
     COLOR_BINS,
     COLOR_BLUR,
@@ -20,7 +20,7 @@ from sc3d.propagation.appearance import (
     AppearanceModel,
     Histogram,
 )
-from sc3d.propagation.propagate import LabelledPoints, tie_breakers
+from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
 from sc3d.propagation.terrain import NUM_FEATURES
 from sc3d.scene.labelled_cloud import VOTES
 from sc3d.scene.labels import Labels
@@ -39,7 +39,7 @@ class PropagateJob:
     """
 
     settings: Propagate
-    extent: Extent
+    extent: CloudExtent
     store: TileStore
     results: Results
     margin: float

@@ -16,7 +16,7 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
 from sc3d.io.chunked_clouds import CHUNK, CloudFile, positions
-from sc3d.labelling.fusion import MIDDLE_STEPS, Extent, count_steps, histogram_median
+from sc3d.labelling.cloud import STEPS, CloudExtent, histogram_median, position_histogram
 
 RASTER = 512  # cells per side in which points are counted, to choose the tiles
 MAX_TILES = 4096
@@ -79,7 +79,7 @@ class CloudStatistics:
     plane (RASTER, RASTER) int64.
     """
 
-    extent: Extent
+    extent: CloudExtent
     axes: tuple[int, int]
     counts: np.ndarray
 
@@ -90,14 +90,14 @@ class CloudStatistics:
             points = positions(records)
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
         axes = tuple(sorted(np.argsort(high - low, kind="stable")[1:].tolist()))
-        steps, counts = np.zeros((3, MIDDLE_STEPS), np.int64), np.zeros(RASTER * RASTER, np.int64)
+        steps, counts = np.zeros((3, STEPS), np.int64), np.zeros(RASTER * RASTER, np.int64)
         fine = TileGrid(low[list(axes)], float((high - low).max()) / RASTER or 1.0, (RASTER, RASTER), axes)
         for _, records in cloud.chunks():
             points = positions(records)
-            steps += count_steps(points, low, high)
+            steps += position_histogram(points, low, high)
             counts += np.bincount(fine.tile_of(points), minlength=RASTER * RASTER)
         return cls(
-            Extent(low, high, histogram_median(steps, low, high)), axes, counts.reshape(RASTER, RASTER)
+            CloudExtent(low, high, histogram_median(steps, low, high)), axes, counts.reshape(RASTER, RASTER)
         )
 
     @property
@@ -140,7 +140,7 @@ class CloudStatistics:
         return _square_grid(self.extent, self.axes, parts)
 
 
-def _square_grid(extent: Extent, axes: tuple[int, int], parts: int) -> TileGrid:
+def _square_grid(extent: CloudExtent, axes: tuple[int, int], parts: int) -> TileGrid:
     """So many tiles along the longer side; along the shorter, as many as are needed."""
     sides = (extent.high - extent.low)[list(axes)]
     size = float(sides.max()) / parts or 1.0

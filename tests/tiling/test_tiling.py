@@ -22,7 +22,7 @@ from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.ply import write_records
 from sc3d.io.clouds import read_cloud, write_geometry
 from sc3d.scene.scene import Scene
-from sc3d.settings.labels import Evaluate, Label, Propagate
+from sc3d.settings.labels import Evaluate, Label, PaperMechanisms, Propagate
 from sc3d.settings.synthesize import Synthesize
 from sc3d.stages import evaluate, label, propagate
 from sc3d.synthetic.generate import synthesize
@@ -57,7 +57,6 @@ def small_tiles(monkeypatch):
 
     for module in (tiled_label, tiled_propagate, tiled_evaluate):
         monkeypatch.setattr(module, "max_points", room)
-    for module in (label, propagate, evaluate):
         monkeypatch.setattr(module, "fits", lambda _, resources: resources.max_memory != "2G")
 
 
@@ -92,7 +91,8 @@ def blocks(path: Path) -> tuple[np.ndarray, np.ndarray]:
     "options",
     [
         {},
-        {"reproject": True, "incidence": True, "density": True},
+        {"mechanisms": PaperMechanisms(reproject=True, incidence=True, density=True)},
+        {"method": "paper"},
         {"method": "direct"},
         {"depth_filter": False},
     ],
@@ -263,7 +263,7 @@ def kill_a_worker(parent: int, site: Path, seconds: float = 120) -> bool:
     """SIGKILL one Dask worker as soon as the first tile has its labels; whether one was killed."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
-        if any(folder.glob("results/label.*.npy") for folder in site.glob(".workers2.ply.*.parts")):
+        if any(site.glob(".workers2.ply.*.parts/results/label.*.npy")):
             for folder in Path("/proc").iterdir():
                 if (
                     folder.name.isdigit()

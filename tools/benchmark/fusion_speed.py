@@ -19,9 +19,12 @@ from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.raycast import Surface
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.provenance import peak_memory_mb, reset_peak_memory, versions
-from sc3d.labelling.fusion import Cloud, Fusion, Mask, fuse
+from sc3d.labelling.cloud import Cloud
+from sc3d.labelling.fusion import Fusion, fuse
 from sc3d.labelling.inputs import Masks
-from sc3d.propagation.propagate import LabelledPoints, complete
+from sc3d.labelling.observation import Mask
+from sc3d.propagation.labelled_points import LabelledPoints
+from sc3d.propagation.propagate import propagate
 from sc3d.scene.labelled_cloud import point_arrays, read_surface, spacing_of
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
@@ -143,7 +146,7 @@ def _label(workload: Workload) -> Fusion:
 
 def _propagate(workload: Workload, fusion: Fusion) -> Labels:
     evidence = LabelledPoints(workload.cloud.points, fusion.labels, fusion.votes, workload.colors)
-    return complete(evidence, workload.cloud.normals, Propagate(method="map"))
+    return propagate(evidence, workload.cloud.normals, Propagate(method="map"))
 
 
 def _label_and_propagate(workload: Workload) -> Labels:
@@ -187,7 +190,7 @@ def _grown(workload: Workload, num_views: int) -> dict[str, float]:
     record = {
         "points": len(workload.cloud.points),
         "views": num_views,
-        "voxels": len(np.unique(fusion.cells // 2)),
+        "voxels": len(np.unique(fusion.rows // 2)),
         "label_cpu_seconds": cpu,
         "label_wall_seconds": wall,
         "label_peak_memory_mb": peak,
