@@ -16,6 +16,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
 from sc3d.commands import COMMANDS, MODULES, STAGES
+from sc3d.commands.renamed import MOVED, current
 from sc3d.errors import InputError, Sc3dError
 
 
@@ -26,21 +27,30 @@ def main(arguments: list[str] | None = None) -> None:
         sys.stdout.write(usage())
         sys.exit(0 if arguments else 2)
     name = arguments[0]
+    if name in MOVED:
+        sys.exit(
+            _fail(f"`sc3d {name}` is a tool of the checkout now: {MOVED[name]} {' '.join(arguments[1:])}")
+        )
     if name not in STAGES and name not in COMMANDS:
         sys.exit(_fail(f"unknown command {name!r}: one of {', '.join(sorted(STAGES | COMMANDS))}"))
-    command = parse(name, arguments[1:])
+    start_logging()
+    command = parse(name, current(arguments[1:]))
     with reporting_errors():
         _dispatch(name, command)
 
 
+def start_logging() -> None:
+    """Log to stderr, of other packages warnings only; `sc3d ... | head` ends quietly."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    logging.basicConfig(format="%(message)s", stream=sys.stderr)
+    for package in ("sc3d", "tools"):
+        logging.getLogger(package).setLevel(logging.INFO)
+    logging.captureWarnings(True)
+
+
 @contextmanager
 def reporting_errors() -> Iterator[None]:
-    """Log to stderr in the block; what goes wrong in it is told in one line and ends the process, see `main`."""
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `sc3d ... | head` ends quietly
-    logging.basicConfig(format="%(message)s", stream=sys.stderr)
-    logging.getLogger("sc3d").setLevel(logging.INFO)  # of other packages, warnings only
-    logging.getLogger("tools").setLevel(logging.INFO)
-    logging.captureWarnings(True)
+    """What goes wrong in the block is told in one line and ends the process, see `main`."""
     try:
         yield
     except InputError as error:
