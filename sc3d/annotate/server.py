@@ -1,10 +1,9 @@
 """HTTP for the annotation page, on the loopback address only.
 
 What keeps others out: the Host header must name this server (a foreign name that resolves to 127.0.0.1 does
-not), requests that a browser
-marks as coming from another site are refused, and whatever writes or computes must come from the page's own
-origin and carry the token that
-only this page was given. Photos are found by their names in a list, never by a path.
+not), requests that a browser marks as coming from another site are refused, and whatever writes or computes
+must come from the page's own origin and carry the token that only this page was given. Photos are found by
+their names in a list, never by a path.
 """
 
 from __future__ import annotations

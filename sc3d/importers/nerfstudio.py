@@ -1,8 +1,8 @@
 """nerfstudio and instant-ngp: `transforms.json`.
 
 `transform_matrix` is world from camera with OpenGL axes (x right, y up, z backwards). `applied_transform`
-(and `applied_scale`) lead from the original
-frame to that of the file; they are undone, so that clouds and meshes in the original frame fit.
+(and `applied_scale`) lead from the original frame to that of the file; they are undone, so that clouds and
+meshes in the original frame fit.
 """
 
 from __future__ import annotations

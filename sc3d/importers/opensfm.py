@@ -2,11 +2,10 @@
 ODM's `coords.txt` for the place.
 
 Focal lengths and principal points are in units of the longer side of the photo, the latter from its middle;
-`rotation` is the axis-angle vector of
-cam from world. The world is local ENU at `reference_lla`. ODM keeps that as `reconstruction.topocentric.json`
-and writes `reconstruction.json` anew in
-UTM minus the offset of `odm_georeferencing/coords.txt`, with rotations that are then rounded to the nearest:
-the topocentric file is read if it is there.
+`rotation` is the axis-angle vector of cam from world. The world is local ENU at `reference_lla`. ODM keeps
+that as `reconstruction.topocentric.json` and writes `reconstruction.json` anew in UTM minus the offset of
+`odm_georeferencing/coords.txt`, with rotations that are then rounded to the nearest: the topocentric file is
+read if it is there.
 """
 
 from __future__ import annotations

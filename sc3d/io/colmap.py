@@ -1,8 +1,8 @@
 """COLMAP models, read by pycolmap after a look at them, taken apart, put together and written.
 
 pycolmap believes the counts in binary files: one that is too large makes it fill the memory, or read on
-behind the end for ever. In text files a
-count never leads beyond its line. Cameras and poses are not checked by pycolmap at all.
+behind the end for ever. In text files a count never leads beyond its line. Cameras and poses are not checked
+by pycolmap at all.
 Layout: https://colmap.github.io/format.html; rigs.bin and frames.bin as COLMAP 3.12 and later write them.
     Little endian throughout.
 """
@@ -111,7 +111,7 @@ def build_model(
     colors: np.ndarray = NO_POINTS,
     observations: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> pycolmap.Reconstruction:
-    """A model of views, of which those with equal cameras share one; photos are numbered from 1 in their order.
+    """A model of views, of which those with equal cameras share one; photos are numbered from 1 on.
 
     points, colors: (P, 3) float64 world and uint8 RGB
     observations: per view the rows (K,) of points that it sees and their pixels (K, 2); None = nothing

@@ -155,8 +155,8 @@ def best_splats(scene: Scene) -> DisplaySplats:
 
 
 def splats_colored_by(scene: Scene, by: Coloring, classes: tuple[str, ...] = ()) -> DisplaySplats:
-    """The splats that can be colored in some way: gaussians.ply for the photos' colors, else the labelled ones,
-    of which only the named classes. For class colors, those of gaussians.ply do while there are no others.
+    """The splats that can be colored in some way, of the named classes: gaussians.ply for the photos' colors,
+    else the labelled ones. For class colors, gaussians.ply does while there are no others.
     """
     labelled = by == "confidence" or (by == "label" and scene.labelled_splats.exists())
     if labelled or classes:

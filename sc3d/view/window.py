@@ -257,8 +257,8 @@ def _show_with_keys(
     """Keys 1 to 5 choose the coloring, F1 to F12 show and hide classes, P describes the point in the middle;
     the log is the legend.
 
-    lines: (L, 2, 3) ends of the cameras' lines, in the frame of `display`; hidden: ids of classes that are not
-        shown at the start
+    lines: (L, 2, 3) ends of the cameras' lines, in the frame of `display`; hidden: ids of classes not shown
+        at the start
     Raises Sc3dError if no window can be opened.
     """
     visualizer = o3d.visualization.VisualizerWithKeyCallback()
