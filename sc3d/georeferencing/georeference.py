@@ -62,11 +62,6 @@ class Georeference:
     def crs(self) -> pyproj.CRS:
         return projected_crs(self.epsg)
 
-    @property
-    def wkt(self) -> str:
-        """OGC WKT 1, as LAS 1.4 wants it."""
-        return self.crs.to_wkt("WKT1_GDAL")
-
     @cached_property
     def unit(self) -> float:
         """Meters per unit of the CRS; heights have the same unit as eastings."""
@@ -94,10 +89,6 @@ class Georeference:
             local = np.concatenate([self._unproject(part) for part in _chunks(points)])
         matrix = np.asarray(self.local_from_world, np.float64)
         return np.linalg.solve(matrix[:3, :3], (local - matrix[:3, 3]).T).T
-
-    def enu_to_geodetic(self, enu: np.ndarray) -> np.ndarray:
-        """(N, 3) local ENU, m, to (N, 3) latitude, longitude (degrees), ellipsoidal height (m)."""
-        return enu_to_geodetic(enu, self.origin)
 
     def _project(self, enu: np.ndarray) -> np.ndarray:
         latitude, longitude, height = enu_to_geodetic(enu, self.origin).T
