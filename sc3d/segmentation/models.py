@@ -157,7 +157,7 @@ def to_pixels(image: np.ndarray, size: tuple[int, int], statistics: tuple, devic
     return torch.from_numpy(((resized - mean) / deviation).transpose(2, 0, 1)[None].copy()).to(device)
 
 
-class Patch(NamedTuple):
+class ScorePatch(NamedTuple):
     """Part of a map of the photo: (h, w) float32 values; row and column of its first pixel."""
 
     values: torch.Tensor
@@ -165,7 +165,7 @@ class Patch(NamedTuple):
     left: int
 
 
-def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> Patch:
+def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> ScorePatch:
     """Enlarge a map to the size of the photo, bilinearly (pixel centers at +0.5), but only where the result
     may exceed a threshold.
 
@@ -180,7 +180,7 @@ def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> P
     low_rows, high_rows, down, top = _sources(above.any(dim=1), shape[0])
     low_columns, high_columns, across, left = _sources(above.any(dim=0), shape[1])
     rows = torch.lerp(values[low_rows], values[high_rows], down[:, None])
-    return Patch(torch.lerp(rows[:, low_columns], rows[:, high_columns], across), top, left)
+    return ScorePatch(torch.lerp(rows[:, low_columns], rows[:, high_columns], across), top, left)
 
 
 def _sources(present: torch.Tensor, length: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, int]:

@@ -14,8 +14,9 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.geometry.neighbors import NeighborIndex, point_spacing
 from sc3d.geometry.voxels import BLOCK, VOXELS, sort_by_voxel, unpack_blocks, voxel_origin
-from sc3d.io.chunked_clouds import CloudFile, columns, positions, write_ply
+from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.io.images import image_size
+from sc3d.io.ply import write_records
 from sc3d.labelling.cloud import Cloud, CloudExtent
 from sc3d.labelling.fusion import Fusion, fuse
 from sc3d.labelling.inputs import FOOTPRINT_SAMPLE, Masks, best_confidence, point_density, voxel_size_for
@@ -249,5 +250,5 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndar
             counts[:] += np.bincount(values["state"], minlength=len(STATE_NAMES))
             yield result
 
-    write_ply(path, dtype, cloud.num_points, chunks())
+    write_records(path, chunks(), dtype, cloud.num_points, ["sc3d"])
     return counts

@@ -20,7 +20,8 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sc3d.errors import InputError
-from sc3d.io.chunked_clouds import CloudFile, write_ply
+from sc3d.io.chunked_clouds import CloudFile
+from sc3d.io.ply import write_records
 from sc3d.propagation.appearance import (
     AppearanceModel,
     AppearanceStatistics,
@@ -341,5 +342,5 @@ def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
             confidence[0] += float(values["confidence"][labelled].sum(dtype=np.float64))
             yield result
 
-    write_ply(path, np.dtype(kept), cloud.num_points, chunks())
+    write_records(path, chunks(), np.dtype(kept), cloud.num_points, ["sc3d"])
     return PropagateSummary(*counts.tolist(), confidence[0])

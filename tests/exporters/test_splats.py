@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from sc3d.cli import main
-from sc3d.exporters.splats import append_properties, distance_to_class, read_splats
+from sc3d.exporters.splats import append_properties, distance_to_class
+from sc3d.view.display_splats import read_splats
 from sc3d.geometry.cameras import local_origin
 from sc3d.io.images import read_image
 from sc3d.runner import sidecar

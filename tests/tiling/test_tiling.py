@@ -18,7 +18,8 @@ import open3d as o3d
 import pytest
 
 from sc3d.errors import InputError
-from sc3d.io.chunked_clouds import CloudFile, write_ply
+from sc3d.io.chunked_clouds import CloudFile
+from sc3d.io.ply import write_records
 from sc3d.io.clouds import read_cloud, write_geometry
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Evaluate, Label, PaperMechanisms, Propagate
@@ -372,12 +373,12 @@ def test_ply_in_chunks_is_what_open3d_reads(tmp_path):
     dtype = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("label", "u1")])
     records = np.zeros(10, dtype)
     records["x"], records["label"] = np.arange(10) + 5e5 + 1e-3, np.arange(10)
-    write_ply(tmp_path / "made.ply", dtype, 10, [records[:4], records[4:]])
+    write_records(tmp_path / "made.ply", [records[:4], records[4:]], dtype, 10)
     read = read_cloud(tmp_path / "made.ply")
     np.testing.assert_array_equal(read.point.positions.numpy()[:, 0], records["x"])
     np.testing.assert_array_equal(read.point.label.numpy().ravel(), records["label"])
     with pytest.raises(ValueError, match="instead of"):
-        write_ply(tmp_path / "made.ply", dtype, 11, [records])
+        write_records(tmp_path / "made.ply", [records], dtype, 11)
 
 
 @pytest.mark.parametrize(
