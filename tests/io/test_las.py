@@ -7,7 +7,6 @@ import pytest
 from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.las import check_las
 
-
 FORMS = [(form, ".las") for form in range(11)] + [(form, ".laz") for form in (0, 1, 2, 3, 6, 7, 8)]
 
 
