@@ -8,6 +8,7 @@ import re
 import shutil
 from dataclasses import asdict, fields
 from pathlib import Path
+from typing import Any
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import require_room
@@ -69,7 +70,7 @@ class WorkFolder:
     content, and removed with the last output.
     """
 
-    def __init__(self, output: Path, stage: str, inputs: list[Path], settings: object) -> None:
+    def __init__(self, output: Path, stage: str, inputs: list[Path], settings: Any) -> None:
         ignored = {field.name for field in fields(Resources)}
         decisive = [
             sorted(

@@ -19,8 +19,8 @@ import pytest
 
 from sc3d.errors import InputError
 from sc3d.io.chunked_clouds import CloudFile
-from sc3d.io.ply import write_records
 from sc3d.io.clouds import read_cloud, write_geometry
+from sc3d.io.ply import write_records
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Evaluate, Label, PaperMechanisms, Propagate
 from sc3d.settings.synthesize import Synthesize
@@ -222,8 +222,8 @@ def test_ranges_over_parts_of_a_mesh_are_those_of_the_whole(site, tmp_path):
 def command(site):
     """Runs `label` in a process of its own with room for few points, on `workers` Dask workers."""
     program = (
-        "import sys\nfrom sc3d.tiling import label\nlabel.max_points = lambda *_: %d\nfrom sc3d.cli import main\nif __name__ == '__main__':\n    main()\n"
-        % TILES
+        f"from sc3d.tiling import label\nlabel.max_points = lambda *_: {TILES}\n"
+        "from sc3d.cli import main\nif __name__ == '__main__':\n    main()\n"
     )
     script = site.parent / "few_points.py"
     script.write_text(program)
