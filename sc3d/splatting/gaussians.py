@@ -119,7 +119,7 @@ class Gaussians:
         """The same Gaussians on another device."""
         return Gaussians(**{name: tensor.to(device) for name, tensor in self.parameters().items()})
 
-    def __getitem__(self, chosen: torch.Tensor) -> Gaussians:
+    def __getitem__(self, chosen: torch.Tensor | np.ndarray) -> Gaussians:
         """The Gaussians of an index or bool tensor."""
         return Gaussians(**{name: tensor[chosen] for name, tensor in self.parameters().items()})
 

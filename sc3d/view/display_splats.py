@@ -63,9 +63,14 @@ class DisplaySplats:
             )
         if by not in SPLAT_COLORINGS:
             raise InputError(f"splats have no {by}: choose --by photo, label or confidence")
-        if self.label is None:
+        label, confidence, table = self.labels()
+        return table.palette[label] if by == "label" else confidence_colors(confidence)
+
+    def labels(self) -> tuple[np.ndarray, np.ndarray, ClassTable]:
+        """`label`, `confidence` and `table`. InputError if there are none."""
+        if self.label is None or self.confidence is None or self.table is None:
             raise InputError("the splats have no labels: run `sc3d export SCENE --format splats`")
-        return self.table.palette[self.label] if by == "label" else confidence_colors(self.confidence)
+        return self.label, self.confidence, self.table
 
     def only(self, ids: set[int] | None) -> DisplaySplats:
         """Those of some classes, None = all. InputError if there are none."""
@@ -75,9 +80,10 @@ class DisplaySplats:
             raise InputError(
                 "--classes needs labels, and the splats have none: run `sc3d export SCENE --format splats`"
             )
-        chosen = np.isin(self.label, sorted(ids))
+        labels, _, table = self.labels()
+        chosen = np.isin(labels, sorted(ids))
         if not chosen.any():
-            names = ", ".join(self.table.name(label) for label in sorted(ids))
+            names = ", ".join(table.name(label) for label in sorted(ids))
             raise InputError(f"no splat has one of the classes {names}: nothing to show or write")
         return self[chosen]
 
@@ -90,10 +96,9 @@ class DisplaySplats:
         )
         cloud.point.colors = o3d.core.Tensor(self.colors("photo"))
         if self.label is not None:
-            cloud.point["label"], cloud.point["confidence"] = (
-                o3d.core.Tensor(self.label[:, None]),
-                o3d.core.Tensor(self.confidence[:, None]),
-            )
+            label, confidence, _ = self.labels()
+            cloud.point["label"] = o3d.core.Tensor(label[:, None])
+            cloud.point["confidence"] = o3d.core.Tensor(confidence[:, None])
         return cloud
 
     def most_visible(self, count: int) -> DisplaySplats:
