@@ -217,7 +217,7 @@ class TileStore:
     def rows(self, tile: int) -> np.ndarray:
         return np.memmap(self.folder / f"{tile}.row", np.int64, "r")
 
-    def window(self, tile: int, margin: float) -> TileWithHalo:
+    def with_halo(self, tile: int, margin: float) -> TileWithHalo:
         """The points of a tile, and those less than `margin` (world units) around it; which these are is
         remembered in a file.
         """
@@ -267,9 +267,9 @@ class Results:
     def read(self, tile: int, name: str, mapped: bool = False) -> np.ndarray:
         return np.load(self._path(tile, name), mmap_mode="r" if mapped else None, allow_pickle=False)
 
-    def around(self, window: TileWithHalo, name: str) -> np.ndarray:
+    def around(self, halo: TileWithHalo, name: str) -> np.ndarray:
         """Values of the window's points."""
-        return window.gather(lambda tile: self.read(tile, name, mapped=True))
+        return halo.gather(lambda tile: self.read(tile, name, mapped=True))
 
     def in_order(self, names: list[str]) -> Iterator[dict[str, np.ndarray]]:
         """The values of all points in the order of the cloud, CHUNK at a time."""

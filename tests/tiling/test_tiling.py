@@ -30,9 +30,10 @@ from sc3d.tiling import evaluate as tiled_evaluate
 from sc3d.tiling import label as tiled_label
 from sc3d.tiling import memory as plan
 from sc3d.tiling import propagate as tiled_propagate
-from sc3d.tiling.memory import WorkFolder, memory_of
-from sc3d.tiling.ranges import MeshParts, RangeMaps, read_triangles, write_ranges
+from sc3d.tiling.first_surfaces import MeshParts, RangeMaps, read_triangles, write_ranges
+from sc3d.tiling.memory import memory_of
 from sc3d.tiling.store import CloudStatistics, TileStore
+from sc3d.tiling.work_folder import WorkFolder
 
 POINTS = 60_000
 TILES = 25_000  # points of a tile with its margin
@@ -313,8 +314,8 @@ class CloudFileTiles:
     @staticmethod
     def of(site: Path) -> list[int]:
         cloud = CloudFile.open(site / "cloud.ply")
-        survey = CloudStatistics.from_cloud(cloud)
-        grid = survey.grid(TILES, tiled_label.BLOCKS * tiled_label.BLOCK * tiled_label.VOXEL * survey.spacing)
+        statistics = CloudStatistics.from_cloud(cloud)
+        grid = statistics.grid(TILES, tiled_label.BLOCKS * tiled_label.BLOCK * tiled_label.VOXEL * statistics.spacing)
         return np.unique(grid.tile_of(read_cloud(site / "cloud.ply").point.positions.numpy())).tolist()
 
 
@@ -361,12 +362,12 @@ def test_a_store_gives_back_every_point_once_and_the_margin(site, tmp_path):
         np.sort(np.concatenate([store.rows(tile) for tile in store.tiles])), np.arange(POINTS)
     )
     for tile in store.tiles:
-        window = store.window(tile, 2.0)
-        np.testing.assert_array_equal(window.rows, np.flatnonzero(store.grid.within(points, tile, 2.0)))
+        halo = store.with_halo(tile, 2.0)
+        np.testing.assert_array_equal(halo.rows, np.flatnonzero(store.grid.within(points, tile, 2.0)))
         np.testing.assert_array_equal(
-            window.rows[window.core], np.flatnonzero(store.grid.tile_of(points) == tile)
+            halo.rows[halo.core], np.flatnonzero(store.grid.tile_of(points) == tile)
         )
-        np.testing.assert_array_equal(window.gather(store.records)["x"], points[window.rows, 0])
+        np.testing.assert_array_equal(halo.gather(store.records)["x"], points[halo.rows, 0])
 
 
 def test_ply_in_chunks_is_what_open3d_reads(tmp_path):
