@@ -12,8 +12,8 @@ from sc3d.exporters.masks import render_mask
 from sc3d.exporters.projected_cloud import Placement, chosen_classes, find_placement
 from sc3d.geometry.cameras import undistorted
 from sc3d.geometry.neighbors import NeighborIndex
-from sc3d.io.atomic import atomic_path
 from sc3d.io.clouds import read_cloud
+from sc3d.io.splats import origin_comment, read_splat_ply, write_splat_ply
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import REACH, LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
@@ -127,52 +127,31 @@ def write_splats(path: Path, splats: LabelledSplats, placement: Placement) -> No
     """3DGS PLY with two more properties, which viewers ignore; positions stay in the local frame, comments
     say where it lies.
     """
-    comments = ["sc3d origin " + " ".join(f"{value:.3f}" for value in splats.origin)]
+    comments = [origin_comment(splats.origin)]
     if placement.crs is not None:
         comments.append(
             f"sc3d EPSG:{placement.epsg} origin "
             + " ".join(f"{value:.3f}" for value in origin_in_crs(splats, placement))
         )
     comments += [f"sc3d label {entry.id} {entry.name}" for entry in splats.table]
-    with atomic_path(path) as temporary:
-        splats.gaussians.save(temporary, comments)
-        append_properties(
-            temporary, {"label": splats.label.astype(np.uint8), "confidence": splats.confidence.astype("<f4")}
-        )
+    extra = {"label": splats.label.astype(np.uint8), "confidence": splats.confidence.astype(np.float32)}
+    write_splat_ply(path, splats.gaussians.arrays(), comments, extra)
 
 
 def read_splats(path: Path, table: ClassTable) -> LabelledSplats:
     """What `write_splats` wrote; InputError if the file has no labels."""
-    gaussians, comments = Gaussians.load(path)
+    arrays, comments = read_splat_ply(path)
     found = read_cloud(path).point
     origins = [line.split()[2:] for line in comments if line.startswith("sc3d origin ")]
     if "label" not in found or "confidence" not in found or not origins:
         raise InputError(f"{path} has no labels: run `sc3d export SCENE --format splats`")
     return LabelledSplats(
-        gaussians,
+        Gaussians.from_arrays(arrays),
         found["label"].numpy().ravel(),
         found["confidence"].numpy().ravel(),
         np.array(origins[0], float),
         table,
     )
-
-
-def append_properties(path: Path, columns: dict[str, np.ndarray]) -> None:
-    """Add properties of type uchar and float, (N,) each, to the vertices of a PLY that has float properties
-    and nothing else.
-    """
-    header, _, body = path.read_bytes().partition(b"\nend_header\n")
-    names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property float ")]
-    values = np.frombuffer(body, "<f4").reshape(-1, len(names))
-    row = np.empty(
-        len(values),
-        [("known", "<f4", (len(names),)), *((name, column.dtype) for name, column in columns.items())],
-    )
-    row["known"] = values
-    for name, column in columns.items():
-        row[name] = column
-        header += f"\nproperty {'uchar' if column.dtype == np.uint8 else 'float'} {name}".encode()
-    path.write_bytes(header + b"\nend_header\n" + row.tobytes())
 
 
 def origin_in_crs(splats: LabelledSplats, placement: Placement) -> np.ndarray:

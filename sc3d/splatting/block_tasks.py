@@ -7,7 +7,6 @@ the rest: with that it is finished.
 
 from __future__ import annotations
 
-import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +19,8 @@ import torch
 
 from sc3d.errors import InputError
 from sc3d.io.json_files import read_json, write_json
+from sc3d.io.provenance import peak_memory_mb
+from sc3d.io.splats import read_splat_ply, write_splat_ply
 from sc3d.scene.scene import Scene
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.blocks import MIN_POINTS, Block, merge, restrict, share_settings, views_of
@@ -61,7 +62,9 @@ def train_blocks(job: BlockJob, data: TrainingData, tasks: Executor) -> tuple[Tr
         range(len(job.blocks)),
         GPU if job.settings.device == "cuda" else None,
     )
-    parts = [Gaussians.load(_file(job, index, "ply"))[0] for index in range(len(job.blocks))]
+    parts = [
+        Gaussians.from_arrays(read_splat_ply(_file(job, index, "ply"))[0]) for index in range(len(job.blocks))
+    ]
     records = [read_json(_file(job, index, "json")) for index in range(len(job.blocks))]
     gaussians = merge(parts, list(job.blocks))
     exposures, counts = np.zeros((len(data.views), 2)), np.zeros((len(data.views), 1))
@@ -92,9 +95,8 @@ def train_block(job: BlockJob, index: int) -> None:
     checkpoint = _file(job, index, "checkpoint") if settings.checkpoint_every else None
     with one_thread():
         result = train(restrict(data, block, views), settings, checkpoint, job.progress)
-    result.gaussians.save(_file(job, index, "ply"))
-    # of the process, so a worker's earlier blocks count
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+    write_splat_ply(_file(job, index, "ply"), result.gaussians.arrays())
+    peak = peak_memory_mb()  # of the process, so a worker's earlier blocks count
     write_json(
         _file(job, index, "json"),
         {"views": views, "exposures": result.exposures.tolist(), "log": result.log, "peak_memory_mb": peak},

@@ -9,7 +9,7 @@ from dataclasses import fields
 import torch
 
 from sc3d.geometry.cameras import View
-from sc3d.splatting.gaussians import Gaussians
+from sc3d.io.splats import check_splats
 from sc3d.splatting.strategy import Statistics
 
 
@@ -23,7 +23,7 @@ def check_state(state: dict, parameters: dict[str, torch.Tensor], views: list[Vi
     size = len(state["parameters"]["means"])
     shapes = {name: (size, *tensor.shape[1:]) for name, tensor in parameters.items()}
     _check_tensors(state["parameters"], shapes)
-    Gaussians(**state["parameters"]).check(path)
+    check_splats({name: tensor.numpy() for name, tensor in state["parameters"].items()}, path)
     _check_adam(state["optimizer"], shapes)
     exposure = {"exposure": (len(views), 2)}
     _check_tensors({"exposure": state["exposure"]}, exposure)

@@ -15,6 +15,14 @@ def pinhole(view: View) -> tuple[float, float, float, float]:
     return view.matrix[0, 0], view.matrix[1, 1], view.matrix[0, 2], view.matrix[1, 2]
 
 
+def ray_slopes(view: View, device: torch.device | str = "cpu") -> tuple[torch.Tensor, torch.Tensor]:
+    """(W,) and (H,) float32 x and y of the rays with z = 1 through the pixel centers."""
+    fx, fy, cx, cy = pinhole(view)
+    column = (np.arange(view.width) + 0.5 - cx) / fx
+    row = (np.arange(view.height) + 0.5 - cy) / fy
+    return tuple(torch.from_numpy(slopes.astype(np.float32)).to(device) for slopes in (column, row))
+
+
 def pixel_rays(view: View, device: torch.device | str = "cpu") -> torch.Tensor:
     """(H, W, 3) rays ((u - cx) / fx, (v - cy) / fy, 1) of the pixel centers, camera frame: a pixel's point is
     depth * ray.

@@ -13,6 +13,7 @@ import torch
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, local_origin, project, resample, undistorted
 from sc3d.io.images import read_image
+from sc3d.io.splats import origin_comment, read_splat_ply
 from sc3d.scene.scene import Scene
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.gaussians import Gaussians
@@ -122,13 +123,10 @@ def load_gaussians(scene: Scene) -> tuple[Gaussians, np.ndarray]:
     scene's.
     """
     scene.require(scene.gaussians, hint=f"run `sc3d train {scene.path}` first")
-    gaussians, comments = Gaussians.load(scene.gaussians)
+    arrays, comments = read_splat_ply(scene.gaussians)
     origin = local_origin(scene.model.views)
-    if (
-        any(line.startswith("sc3d origin") for line in comments)
-        and f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}" not in comments
-    ):
+    if any(line.startswith("sc3d origin") for line in comments) and origin_comment(origin) not in comments:
         raise InputError(
             f"{scene.gaussians} was trained with other cameras than those in {scene.sparse}: run `sc3d train {scene.path} --overwrite`"
         )
-    return gaussians, origin
+    return Gaussians.from_arrays(arrays), origin

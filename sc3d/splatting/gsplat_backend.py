@@ -1,4 +1,4 @@
-"""`render.render` for Gaussians on a GPU, through gsplat's low-level functions (written against gsplat
+"""`rendering.render` for Gaussians on a GPU, through gsplat's low-level functions (written against gsplat
 1.5.3).
 
 The rules are those of the CPU kernels: near plane 0.01, +0.3 px^2, Jacobian clamp at 1.3 tan(fov / 2) around
@@ -27,7 +27,7 @@ from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import View
 from sc3d.splatting.device import INSTALL
 from sc3d.splatting.gaussians import Gaussians
-from sc3d.splatting.rendering import Rendering, ViewStatistics
+from sc3d.splatting.rendered_view import Rendering, ViewStatistics
 
 TILE = 16
 NEAR = 0.01
@@ -152,7 +152,7 @@ def render_gsplat(
     geometry: bool,
     functions: Functions,
 ) -> Rendering:
-    """`render.render` with checked arguments. sh_degree: at most the stored one; functions:
+    """`rendering.render` with checked arguments. sh_degree: at most the stored one; functions:
     `cuda_functions()`, or twins of them.
     """
     screen = project(gaussians, view, functions)

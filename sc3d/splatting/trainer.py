@@ -32,7 +32,7 @@ from sc3d.splatting.strategy import DensifyLimits, Statistics
 log = logging.getLogger(__name__)
 
 LOG_EVERY = 50
-CHECKPOINT_VERSION = 1
+CHECKPOINT_VERSION = 2
 
 
 class Trainer:
@@ -203,9 +203,14 @@ class Trainer:
             )
             points, colors = points[chosen], colors[chosen]
         gaussians = Gaussians.from_points(points, colors, self.settings.sh_degree)
-        sh_rates = np.full(3 * gaussians.sh.shape[1], 1.25e-4)
-        sh_rates[:3] = 2.5e-3
-        rates = {"means": 0.0, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 0.05, "sh": sh_rates}
+        rates = {
+            "means": 0.0,
+            "log_scales": 5e-3,
+            "quats": 1e-3,
+            "opacity_logits": 0.05,
+            "sh_dc": 2.5e-3,
+            "sh_rest": 1.25e-4,
+        }
         return {
             name: tensor.to(self.device).requires_grad_() for name, tensor in gaussians.parameters().items()
         }, rates

@@ -8,6 +8,7 @@ from pathlib import Path
 from sc3d.errors import InputError
 from sc3d.io.atomic import remove
 from sc3d.io.provenance import digest
+from sc3d.io.splats import origin_comment, write_splat_ply
 from sc3d.scene.scene import Scene, check_photos
 from sc3d.settings.train import Train
 from sc3d.splatting.block_tasks import BlockJob, train_blocks
@@ -45,7 +46,7 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
             train(data, settings.training, unfinished if settings.checkpoint_every else None),
             {},
         )
-    result.gaussians.save(scene.gaussians, [f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}"])
+    write_splat_ply(scene.gaussians, result.gaussians.arrays(), [origin_comment(origin)])
     write_log(result.log, scene.path / "train.csv")
     write_training_sheet(scene.path / "train.jpg", result, data, settings.training)
     remove(unfinished)

@@ -40,20 +40,14 @@ class ShownSplats:
         """Class colors or confidences instead of the photos' colors. InputError if there are no labels."""
         if by == "photo":
             return self.gaussians
-        from sc3d.splatting.lifting import painted
-
-        return painted(self.gaussians, self.colors(by, table) / 255)
+        return self.gaussians.painted(self.colors(by, table) / 255)
 
     def colors(self, by: Coloring, table: ClassTable | None) -> np.ndarray:
         """(N, 3) uint8 RGB; of the photos: the mean over all directions of view, without what changes with
         them.
         """
         if by == "photo":
-            from sc3d.splatting.gaussians import SH_C0
-
-            return np.round(np.clip(0.5 + SH_C0 * self.gaussians.sh[:, 0].numpy(), 0, 1) * 255).astype(
-                np.uint8
-            )
+            return self.gaussians.base_colors
         if by not in SPLAT_COLORINGS:
             raise InputError(f"splats have no {by}: choose --by photo, label or confidence")
         if self.label is None or table is None:

@@ -88,10 +88,11 @@ def _read_splats(folder: Path) -> object:
     import torch
 
     from sc3d.geometry.cameras import look_at, pinhole_view
+    from sc3d.io.splats import read_splat_ply
     from sc3d.splatting.gaussians import Gaussians
     from sc3d.splatting.rendering import render
 
-    gaussians, _ = Gaussians.load(folder / "gaussians.ply")
+    gaussians = Gaussians.from_arrays(read_splat_ply(folder / "gaussians.ply")[0])
     view = pinhole_view("a", (24, 16), (20, 20, 12, 8), look_at(np.array([0.0, 0, 6]), np.zeros(3)))
     with torch.no_grad():
         return render(gaussians, view)

@@ -10,7 +10,14 @@ from sc3d.splatting.optimizer import RowAdam
 from sc3d.splatting.strategy import DensifyLimits, Statistics
 from tests.splatting.test_gaussians import random_gaussians
 
-RATES = {"means": 0.01, "log_scales": 0.01, "quats": 0.01, "opacity_logits": 0.01, "sh": 0.01}
+RATES = {
+    "means": 0.01,
+    "log_scales": 0.01,
+    "quats": 0.01,
+    "opacity_logits": 0.01,
+    "sh_dc": 0.01,
+    "sh_rest": 0.01,
+}
 
 
 def tagged(count: int) -> tuple[RowAdam, Statistics]:

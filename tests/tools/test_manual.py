@@ -30,7 +30,7 @@ def test_there_is_a_page_for_every_command(pages):
 def test_the_committed_pages_are_those_that_the_code_writes(pages):
     for file in pages.glob("*.md"):
         assert (MANUAL / "commands" / file.name).read_text() == file.read_text(), (
-            f"run: python tools/make_manual.py"
+            "run: python tools/make_manual.py"
         )
 
 

@@ -12,6 +12,7 @@ import torch
 from sc3d.cli import main
 from sc3d.geometry.cameras import local_origin, look_at, pinhole_view, project, undistorted
 from sc3d.io.images import read_image, write_image
+from sc3d.io.splats import origin_comment, write_splat_ply
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.gaussians import SH_C0, Gaussians
@@ -45,7 +46,7 @@ def make_gaussians(half: float = 4.0) -> Gaussians:
     scales = np.tile(np.float32([0.15, 0.15, 0.002]), (len(points), 1))
     scales[-1] = (0.08, 0.08, 0.002)
     quats = np.tile(np.float32([1, 0, 0, 0]), (len(points), 1))
-    sh = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32)
+    sh = ((colors - 0.5) / SH_C0).astype(np.float32)
     parts = [points.astype(np.float32), np.log(scales), quats, np.full(len(points), 6, np.float32), sh]
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(part)) for part in parts))
 
@@ -80,7 +81,7 @@ def trained(tmp_path_factory) -> Path:
     write_model(scene / "sparse" / "0", views())
     origin, gaussians = local_origin(views()), make_gaussians(7.0)
     gaussians.means += torch.from_numpy((ORIGIN - origin).astype(np.float32))
-    gaussians.save(scene / "gaussians.ply", [f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}"])
+    write_splat_ply(scene / "gaussians.ply", gaussians.arrays(), [origin_comment(origin)])
     for view in views():  # drawn by projection alone, not by the renderer under test
         photo = np.tile(np.uint8(GREEN), (view.height, view.width, 1))
         pixel = project(view, (ORIGIN + RED_POINT)[None])[0][0]

@@ -11,14 +11,17 @@ import torch
 
 from sc3d.io.provenance import peak_memory_mb, reset_peak_memory
 from sc3d.settings.train import TrainSettings
-from sc3d.splatting import rendering as render
-from sc3d.splatting.cpu import projection as kernels_project
-from sc3d.splatting.cpu import projection_backward as kernels_backproject
-from sc3d.splatting.cpu import rasterization as kernels_raster
-from sc3d.splatting.cpu import rasterization_backward as kernels_unraster
-from sc3d.splatting.cpu import ssim
+from sc3d.splatting.cpu import (
+    projection,
+    projection_backward,
+    rasterization,
+    rasterization_backward,
+    ssim,
+    tile_binning,
+)
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.optimizer import RowAdam
+from sc3d.splatting.rendering import render
 from sc3d.splatting.strategy import current
 from sc3d.splatting.trainer import Trainer
 from tools.benchmark.fragments import count_fragments
@@ -27,11 +30,11 @@ from tools.benchmark.workload import Workload
 
 # what the renderer calls for each stage; `loss`, `adam` and `total` are timed around the calls
 FUNCTIONS = {
-    "project": [(kernels_project, "project")],
-    "sort and bin": [(render, "sort_into_tiles")],
-    "forward": [(kernels_raster, "rasterize"), (kernels_raster, "collect_contributions")],
-    "backward": [(kernels_unraster, "rasterize_backward")],
-    "project backward": [(kernels_backproject, "project_backward")],
+    "project": [(projection, "project_view")],
+    "sort and bin": [(tile_binning, "sort_into_tiles")],
+    "forward": [(rasterization, "rasterize"), (rasterization, "collect_contributions")],
+    "backward": [(rasterization_backward, "rasterize_backward")],
+    "project backward": [(projection_backward, "project_backward")],
 }
 STAGES = ("project", "sort and bin", "forward", "loss", "backward", "project backward", "adam")
 FLOPS = 54 + 82  # per slot, forward and backward, with normals and plane distance
@@ -65,7 +68,7 @@ class Iteration:
         """
         watch = Stopwatch()
         with watch.watching(FUNCTIONS), watch.stage("total"):
-            rendering = render.render(current(self.optimizer), self.view)
+            rendering = render(current(self.optimizer), self.view)
             with watch.stage("loss"):
                 loss = ssim.image_loss(rendering.color, self.target)
             torch.autograd.backward([loss, rendering.normal, rendering.plane_distance], [None, *self.slopes])
