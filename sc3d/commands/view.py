@@ -227,9 +227,9 @@ def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.
     where they have labels.
     """
     from sc3d.geometry.cameras import resample
+    from sc3d.splatting.evaluation import compare, picture
     from sc3d.view.captions import add_legend
     from sc3d.view.contact_sheet import half_of, side_by_side
-    from sc3d.view.splat_images import compare, rendered
     from sc3d.view.viewpoints import aerial_view, fitted, without_outliers
 
     splats = _splats(command, scene)
@@ -239,7 +239,7 @@ def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.
     if photo is None:
         seen = gaussians.means[gaussians.opacities > 0.5].numpy()
         points = seen if len(seen) else gaussians.means.numpy()
-        image = rendered(
+        image = picture(
             gaussians, aerial_view(without_outliers(points), command.size, command.from_above), WHITE
         )
         return image if table is None else add_legend(image, command.by, table, present)
@@ -248,7 +248,7 @@ def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.
     pixels = resample(read_image(scene.photo(photo.name)), source, view)
     if table is not None:
         image = side_by_side(
-            (pixels, rendered(gaussians, view, WHITE)), (photo.name, f"splats by {command.by}")
+            (pixels, picture(gaussians, view, WHITE)), (photo.name, f"splats by {command.by}")
         )
         return add_legend(image, command.by, table, present)
     found = compare(gaussians, view, pixels)
@@ -258,8 +258,8 @@ def _picture_of_splats(command: View, scene: Scene, photo: Camera | None) -> np.
 def _write_flight(command: View, scene: Scene) -> None:
     from tqdm import tqdm
 
+    from sc3d.splatting.evaluation import picture
     from sc3d.view.flight_video import flight_path, write_video
-    from sc3d.view.splat_images import rendered
 
     splats = _splats(command, scene)
     gaussians = (
@@ -269,7 +269,7 @@ def _write_flight(command: View, scene: Scene) -> None:
     )
     path = flight_path([view.shifted(splats.origin) for view in scene.model.views], command.size)
     frames = (
-        rendered(gaussians, view, WHITE) for view in tqdm(path, desc="flight", unit="frame", disable=None)
+        picture(gaussians, view, WHITE) for view in tqdm(path, desc="flight", unit="frame", disable=None)
     )
     write_video(command.flight, frames, (path[0].width, path[0].height))
     logger.info("wrote %s", command.flight)

@@ -2,9 +2,8 @@
 c] += alpha T s.
 
 A fragment's weight w = alpha T is its share of a pixel; summed over the pixels of class c of all views (times
-the mask's confidence s) it is
-the evidence that Gaussian i belongs to c. It equals the gradient of sum(image * mask) with respect to the
-Gaussian's color.
+the mask's confidence s) it is the evidence that Gaussian i belongs to c. It equals the gradient of sum(image *
+mask) with respect to the Gaussian's color.
 """
 
 from __future__ import annotations
@@ -44,15 +43,13 @@ def lift(gaussians: Gaussians, views: Iterable[View], read: ReadMask, num_ids: i
             raise ValueError(
                 f"{view.name}: labels are lifted through pinhole views, from masks of the view's size"
             )
-        weights = (
-            np.ones(mask.shape, np.float32) if confidence is None else confidence.astype(np.float32) / 255
-        )
+        sure = np.full(mask.shape, 255, np.uint8) if confidence is None else confidence
+        weights = sure.astype(np.float32) / 255
         if device.has_kernels(gaussians.means):
             add_evidence(gaussians, view, mask, weights, float(SCALE), evidence)
         else:
-            evidence += np.rint(evidence_by_gradient(gaussians, view, mask, weights, num_ids) * SCALE).astype(
-                np.int64
-            )
+            part = evidence_by_gradient(gaussians, view, mask, weights, num_ids)
+            evidence += np.rint(part * SCALE).astype(np.int64)
     return evidence / SCALE
 
 
@@ -85,9 +82,7 @@ def winners(evidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     returns: (N,) uint8 ids, 0 = no evidence; (N,) float32 confidence, 0 to 1
     """
     label = evidence[:, 1:].argmax(axis=1) + 1 if evidence.shape[1] > 1 else np.zeros(len(evidence), int)
-    total = evidence[:, 1:].sum(axis=1)
-    best = np.take_along_axis(evidence, label[:, None], axis=1)[:, 0]
+    total, best = evidence[:, 1:].sum(axis=1), np.take_along_axis(evidence, label[:, None], axis=1)[:, 0]
     seen = total > 0
-    return np.where(seen, label, 0).astype(np.uint8), np.where(
-        seen, best / np.where(seen, total, 1), 0
-    ).astype(np.float32)
+    share = np.where(seen, best / np.where(seen, total, 1), 0)
+    return np.where(seen, label, 0).astype(np.uint8), share.astype(np.float32)

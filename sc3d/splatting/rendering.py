@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from sc3d.geometry.cameras import View
-from sc3d.splatting import device, gsplat_backend
-from sc3d.splatting.consistency import ray_slopes
+from sc3d.splatting import device
+from sc3d.splatting.consistency import pinhole, ray_slopes
 from sc3d.splatting.cpu.backend import render_cpu
 from sc3d.splatting.gaussians import Gaussians
+from sc3d.splatting.gpu.gsplat_backend import render_gpu
 from sc3d.splatting.rendered_view import Rendering
 
 
@@ -25,7 +26,7 @@ def render(
     """Render Gaussians, differentiable in all their tensors (eq. 1-3; rules in `cpu.projection` and
     `cpu.rasterization`).
 
-    Gaussians on a GPU are rendered there by gsplat, with the differences that `gsplat_backend` lists; images
+    Gaussians on a GPU are rendered there by gsplat, with the differences that `gpu.gsplat_backend` lists; images
     and statistics stay on it.
 
     view: pinhole, in the same local world as the Gaussians; its principal point is honored
@@ -42,8 +43,7 @@ def render(
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
     if device.has_kernels(gaussians.means):
         return render_cpu(gaussians, view, degree, background, geometry)
-    functions = gsplat_backend.cuda_functions()
-    return gsplat_backend.render_gsplat(gaussians, view, degree, background, geometry, functions)
+    return render_gpu(gaussians, view, degree, background, geometry)
 
 
 def unbiased_depth(rendering: Rendering, view: View) -> Tensor:
@@ -54,7 +54,8 @@ def unbiased_depth(rendering: Rendering, view: View) -> Tensor:
         differentiable
     """
     normal = rendering.normal
-    column, row = ray_slopes(view, normal.device)
+    slopes = ray_slopes(view.width, view.height, pinhole(view))
+    column, row = (torch.from_numpy(array).to(normal.device) for array in slopes)
     facing = -(normal[..., 0] * column + normal[..., 1] * row[:, None] + normal[..., 2])
     seen = facing > 1e-6
     return torch.where(seen, rendering.plane_distance / torch.where(seen, facing, 1.0), 0.0)

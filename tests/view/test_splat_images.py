@@ -15,9 +15,10 @@ from sc3d.io.images import read_image, write_image
 from sc3d.io.splats import origin_comment, write_splat_ply
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
+from sc3d.splatting.evaluation import compare, picture
 from sc3d.splatting.gaussians import SH_C0, Gaussians
 from sc3d.splatting.rendering import render
-from sc3d.splatting.train import TrainResult
+from sc3d.splatting.trainer import TrainResult
 from sc3d.view.contact_sheet import (
     contact_sheet,
     depth_colors,
@@ -25,10 +26,9 @@ from sc3d.view.contact_sheet import (
     half_of,
     normal_colors,
     side_by_side,
-    write_training_sheet,
 )
 from sc3d.view.flight_video import flight_path
-from sc3d.view.splat_images import chosen_views, compare, rendered, training_rows
+from sc3d.view.training_sheet import chosen_views, training_rows, write_training_sheet
 from tests.builders import ORIGIN, views, write_model
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -94,7 +94,7 @@ def trained(tmp_path_factory) -> Path:
 
 def test_panels_are_what_the_camera_sees(gaussians):
     view = view_of((1, -2, 9))
-    photo = rendered(gaussians, view)
+    photo = picture(gaussians, view)
     found = compare(gaussians, view, photo, exposure=(0.0, 0.0))
     expected = (render(gaussians, view).color.clamp(0, 1) * 255).round().byte().numpy()
     assert np.array_equal(found.rendered, expected) and np.array_equal(found.photo, photo) and found.psnr > 50
@@ -116,7 +116,7 @@ def test_panels_are_what_the_camera_sees(gaussians):
 
 def test_exposure_of_the_photo_is_fitted_or_applied(gaussians):
     view = view_of((1, -2, 9))
-    photo = np.round(0.8 * rendered(gaussians, view) + 10).astype(np.uint8)
+    photo = np.round(0.8 * picture(gaussians, view) + 10).astype(np.uint8)
     assert (
         compare(gaussians, view, photo).psnr
         > 45
@@ -151,7 +151,7 @@ def test_near_is_bright_up_is_blue_and_nothing_is_gray(gaussians):
 
 def test_sheet_holds_the_four_panels(gaussians):
     centers = [(0, -3, 7), (2, 2, 8)]
-    rows = [compare(gaussians, view, rendered(gaussians, view)) for view in map(view_of, centers)]
+    rows = [compare(gaussians, view, picture(gaussians, view)) for view in map(view_of, centers)]
     sheet = contact_sheet(rows, "a title " + "that is too long " * 20, width=560)
     assert sheet.shape[1] == 560 and sheet.dtype == np.uint8
     cell = (560 - 2 * 16 - 3 * 8) // 4
@@ -187,7 +187,7 @@ def test_chosen_photos_are_spread_and_held_out_ones_come_first():
 
 def test_training_sheet_uses_the_exposures_found(gaussians, tmp_path):
     cameras = [view_of(center) for center in [(0, -3, 7), (2, 2, 8), (-2, 1, 8), (0, 2, 9)]]
-    photos = [np.round(0.7 * rendered(gaussians, view)).astype(np.uint8) for view in cameras]
+    photos = [np.round(0.7 * picture(gaussians, view)).astype(np.uint8) for view in cameras]
     data = TrainingData(cameras, photos, np.zeros((10, 3)), np.zeros((10, 3), np.uint8))
     exposures = np.array([[np.log(0.7), 0], [0, 0], [np.log(0.7), 0], [0, 0]])
     settings = TrainSettings(iterations=30, test_every=4)
