@@ -117,10 +117,12 @@ def _trainer():
     points = np.random.default_rng(0).uniform(-3, 3, (60, 3)) * [1, 1, 0.1]
     from dataclasses import replace
 
-    return Trainer(
+    trainer = Trainer(
         TrainingData(views, [trace(view)[0] for view in views], points, np.full((60, 3), 99, np.uint8)),
         replace(SHORT, fill=False, max_gaussians=60),
     )
+    trainer.step()  # before it, the optimizers are empty
+    return trainer
 
 
 def _build_checkpoint(folder: Path) -> None:

@@ -11,18 +11,18 @@ import torch
 
 from sc3d.io.provenance import peak_memory_mb, reset_peak_memory
 from sc3d.settings.train import TrainSettings
+from sc3d.splatting import strategy
 from sc3d.splatting.cpu import (
     projection,
     projection_backward,
     rasterization,
     rasterization_backward,
-    ssim,
     tile_binning,
 )
 from sc3d.splatting.dataset import TrainingData
-from sc3d.splatting.optimizer import RowAdam
+from sc3d.splatting.gaussians import Gaussians
+from sc3d.splatting.losses import image_loss
 from sc3d.splatting.rendering import render
-from sc3d.splatting.strategy import current
 from sc3d.splatting.trainer import Trainer
 from tools.benchmark.fragments import count_fragments
 from tools.benchmark.machine import Stopwatch, fma_gflops, num_threads, use_threads
@@ -49,10 +49,8 @@ class Iteration:
 
     def __init__(self, workload: Workload) -> None:
         view, photo = workload.views[0], workload.photos[0]
-        parameters = {
-            name: tensor.clone().requires_grad_() for name, tensor in workload.gaussians.parameters().items()
-        }
-        self.optimizer = RowAdam(parameters, dict.fromkeys(parameters, 1e-7))
+        copies = {name: tensor.clone() for name, tensor in workload.gaussians.parameters().items()}
+        self.optimizer = strategy.adam(Gaussians(**copies), dict.fromkeys(copies, 1e-7))
         self.view = view
         self.target = (
             torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1))).float().div(255).permute(1, 2, 0)
@@ -68,12 +66,13 @@ class Iteration:
         """
         watch = Stopwatch()
         with watch.watching(FUNCTIONS), watch.stage("total"):
-            rendering = render(current(self.optimizer), self.view)
+            rendering = render(strategy.current_gaussians(self.optimizer), self.view)
             with watch.stage("loss"):
-                loss = ssim.image_loss(rendering.color, self.target)
+                loss = image_loss(rendering.color, self.target)
             torch.autograd.backward([loss, rendering.normal, rendering.plane_distance], [None, *self.slopes])
             with watch.stage("adam"):
                 self.optimizer.step()
+                self.optimizer.zero_grad(set_to_none=True)
         seconds = {stage: watch.seconds[stage] for stage in STAGES}
         return seconds | {
             "rest": watch.seconds["total"] - sum(seconds.values()),
@@ -180,10 +179,9 @@ def _trainer(workload: Workload, plain: bool) -> Trainer:
         settings,
     )
     for name, tensor in workload.gaussians.parameters().items():
-        trainer.optimizer.parameters[name].data.copy_(tensor)
-    trainer.optimizer.rates = {
-        name: log_likelihood * 1e-6 for name, log_likelihood in trainer.optimizer.rates.items()
-    }
+        trainer.gaussians.parameters()[name].data.copy_(tensor)
+    for group in trainer.optimizer.param_groups:
+        group["lr"] *= 1e-6
     trainer.iteration = round(_LATE * _STEPS)
     return trainer
 

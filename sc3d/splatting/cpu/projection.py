@@ -252,28 +252,29 @@ class _Scratch(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _near_image(i, means, log_scales, camera):
+    """Whether a sphere around Gaussian i may touch the image: asked before any expensive work."""
+    x, y, z = _mean_cam(means, i, camera)
+    if not z >= NEAR:
+        return False
+    j00, j11, j02, j12, _, _ = _jacobian(x, y, z, camera)
+    mean_x, mean_y = j00 * x + camera[14], j11 * y + camera[15]
+    bound = _REACH * math.exp(max(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2]))
+    half_x, half_y = bound * (j00 + abs(j02)) + _REACH, bound * (j11 + abs(j12)) + _REACH
+    across = mean_x + half_x > 0.0 and mean_x - half_x < camera[16]
+    return across and mean_y + half_y > 0.0 and mean_y - half_y < camera[17]
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _project_one(i, gaussians, degree, camera, scratch, records):
-    """Fills the record of Gaussian i; returns (depth, 3 sigma radius in px), both 0 if it cannot touch the
-    image.
+    """Fills the record of Gaussian i, which is near the image; returns (depth, 3 sigma radius in px), both 0 if
+    it cannot touch the image.
     """
     rotation, axes, scales, rows, basis = scratch
     means, log_scales = gaussians.means, gaussians.log_scales
     x, y, z = _mean_cam(means, i, camera)
-    if not z >= NEAR:
-        return 0.0, 0.0
-    width, height = camera[16], camera[17]
     j00, j11, j02, j12, _, _ = _jacobian(x, y, z, camera)
     mean_x, mean_y = j00 * x + camera[14], j11 * y + camera[15]
-    # a sphere around it, before any expensive work
-    bound = _REACH * math.exp(max(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2]))
-    half_x, half_y = bound * (j00 + abs(j02)) + _REACH, bound * (j11 + abs(j12)) + _REACH
-    if not (
-        mean_x + half_x > 0.0
-        and mean_x - half_x < width
-        and mean_y + half_y > 0.0
-        and mean_y - half_y < height
-    ):
-        return 0.0, 0.0
     log_opacity = -math.log2(np.float32(1.0) + math.exp(-gaussians.opacity_logits[i]))
     room = log_opacity - math.log2(MIN_ALPHA) + _SLACK
     if not room > _SLACK:
@@ -287,8 +288,8 @@ def _project_one(i, gaussians, degree, camera, scratch, records):
     if not (
         determinant > 0.0
         and math.isfinite(determinant)
-        and _touches(mean_x, half_x, width)
-        and _touches(mean_y, half_y, height)
+        and _touches(mean_x, half_x, camera[16])
+        and _touches(mean_y, half_y, camera[17])
     ):
         return 0.0, 0.0
     distance = math.sqrt(x * x + y * y + z * z)
@@ -318,10 +319,11 @@ def project(gaussians, degree, camera, order, records, depths, radii):
     """Fills what `project_view` returns; depths and radii are zero on entry. order: permutation of the
     chunks.
     """
-    count = depths.shape[0]
+    count, means, log_scales = depths.shape[0], gaussians.means, gaussians.log_scales
     for item in numba.prange(order.shape[0]):
         scratch = _Scratch(
             np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty((2, 3)), np.full(16, _C0)
         )
         for i in range(order[item] * CHUNK, min(count, (order[item] + 1) * CHUNK)):
-            depths[i], radii[i] = _project_one(i, gaussians, degree, camera, scratch, records)
+            if _near_image(i, means, log_scales, camera):
+                depths[i], radii[i] = _project_one(i, gaussians, degree, camera, scratch, records)
