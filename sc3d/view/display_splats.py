@@ -13,6 +13,8 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
+from sc3d.io.ply import read_records
+from sc3d.io.splats import read_splat_ply
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import Coloring, confidence_colors
@@ -47,20 +49,14 @@ class DisplaySplats:
         """Class colors or confidences instead of the photos' colors. InputError if there are no labels."""
         if by == "photo":
             return self.gaussians
-        from sc3d.splatting.lifting import painted
-
-        return painted(self.gaussians, self.colors(by) / 255)
+        return self.gaussians.painted(self.colors(by) / 255)
 
     def colors(self, by: Coloring) -> np.ndarray:
         """(N, 3) uint8 RGB; of the photos: the mean over all directions of view, without what changes with
         them.
         """
         if by == "photo":
-            from sc3d.splatting.gaussians import SH_C0
-
-            return np.round(np.clip(0.5 + SH_C0 * self.gaussians.sh[:, 0].numpy(), 0, 1) * 255).astype(
-                np.uint8
-            )
+            return self.gaussians.base_colors
         if by not in SPLAT_COLORINGS:
             raise InputError(f"splats have no {by}: choose --by photo, label or confidence")
         label, confidence, table = self.labels()
@@ -127,16 +123,15 @@ def trained_splats(scene: Scene) -> DisplaySplats:
 
 def read_splats(path: Path, table: ClassTable) -> DisplaySplats:
     """What `sc3d export SCENE --format splats` wrote; InputError if the file has no labels."""
-    from sc3d.io.clouds import read_cloud
     from sc3d.splatting.gaussians import Gaussians
 
-    gaussians, comments = Gaussians.load(path)
-    found = read_cloud(path).point
+    arrays, comments = read_splat_ply(path)
+    records, _ = read_records(path)
     origins = [line.split()[2:] for line in comments if line.startswith("sc3d origin ")]
-    if "label" not in found or "confidence" not in found or not origins:
+    if not {"label", "confidence"} <= set(records.dtype.names or ()) or not origins:
         raise InputError(f"{path} has no labels: run `sc3d export SCENE --format splats`")
-    label, confidence = (found[name].numpy().ravel() for name in ("label", "confidence"))
-    return DisplaySplats(gaussians, np.array(origins[0], float), label, confidence, table)
+    label, confidence = (np.ascontiguousarray(records[name]) for name in ("label", "confidence"))
+    return DisplaySplats(Gaussians.from_arrays(arrays), np.array(origins[0], float), label, confidence, table)
 
 
 def labelled_splats(scene: Scene) -> DisplaySplats:
