@@ -315,7 +315,9 @@ class CloudFileTiles:
     def of(site: Path) -> list[int]:
         cloud = CloudFile.open(site / "cloud.ply")
         statistics = CloudStatistics.from_cloud(cloud)
-        grid = statistics.grid(TILES, tiled_label.BLOCKS * tiled_label.BLOCK * tiled_label.VOXEL * statistics.spacing)
+        grid = statistics.grid(
+            TILES, tiled_label.BLOCKS * tiled_label.BLOCK * tiled_label.VOXEL * statistics.spacing
+        )
         return np.unique(grid.tile_of(read_cloud(site / "cloud.ply").point.positions.numpy())).tolist()
 
 
