@@ -62,7 +62,7 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
     return model
 
 
-class Photo(Protocol):
+class PosedCamera(Protocol):
     """A photo's camera; cam_from_world: (4, 4) rigid transform. `geometry.cameras.View` is one."""
 
     @property
@@ -109,7 +109,7 @@ def observed_rows(image: pycolmap.Image, point_ids: np.ndarray) -> np.ndarray:
 
 
 def build_model(
-    views: Sequence[Photo],
+    views: Sequence[PosedCamera],
     points: np.ndarray = NO_POINTS,
     colors: np.ndarray = NO_POINTS,
     observations: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,

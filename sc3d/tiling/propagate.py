@@ -141,7 +141,9 @@ def _learn(
     """What the agreed points of all tiles teach, if that does well on points held out."""
     tiles, terrain = job.store.tiles, GroundModel.from_statistics(lean, job.extent.low, job.extent.high)
     for window, ground in zip(
-        WINDOWS, terrain.grounds(executor.run("ground", partial(_lowest_task, job, terrain), tiles)), strict=True
+        WINDOWS,
+        terrain.grounds(executor.run("ground", partial(_lowest_task, job, terrain), tiles)),
+        strict=True,
     ):
         np.save(job.shared / f"ground{window}.npy", ground)
     counts = [
@@ -315,9 +317,7 @@ def _state_task(
     part = TileGraph.load(job, tile)
     label, confidence = (part.around(job, f"{source}_{name}") for name in ("label", "confidence"))
     if reached is not None:
-        groups = part.halo.gather(
-            lambda other: reached[other][job.results.read(other, "group", mapped=True)]
-        )
+        groups = part.halo.gather(lambda other: reached[other][job.results.read(other, "group", mapped=True)])
         label = np.where(groups[part.graph.order], label, 0)
     if job.settings.fill:
         label, confidence = fill_from_nearest(part.known.points, label, confidence)
