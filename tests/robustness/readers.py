@@ -356,7 +356,7 @@ def _read_project(folder: Path) -> object:
 
 def _build_project(kind: str):
     def build(folder: Path) -> None:
-        import test_imports as made
+        from tests.importers import test_importers as made
 
         views, points = made.fly(), made.probe(20)
         folder.mkdir(parents=True, exist_ok=True)
@@ -399,7 +399,7 @@ def _read_geometries(folder: Path) -> object:
 
 def _build_las(suffix: str):
     def build(folder: Path) -> None:
-        import test_imports as made
+        from tests.importers import test_importers as made
 
         folder.mkdir(parents=True, exist_ok=True)
         made.write_las(folder / f"cloud.{suffix}", made.surveyed(60))
