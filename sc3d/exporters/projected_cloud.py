@@ -15,7 +15,12 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.georeferencing.georeference import Georeference, projected_crs, read_georeference
+from sc3d.georeferencing.georeference import (
+    Georeference,
+    projected_crs,
+    read_georeference,
+    write_georeference,
+)
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import read_labelled, take_labels
@@ -183,3 +188,12 @@ def chosen_classes(scene: Scene, settings: Export) -> set[int]:
                 f"there is no class {name!r} in {scene.classes}: its classes are {', '.join(ids)}"
             )
     return {ids[name] for name in settings.classes}
+
+
+def write_place(scene: Scene, folder: Path) -> None:
+    """Put the scene's georeference beside an export, as the formats have no place for it; `sc3d import` finds
+    it there.
+    """
+    found = read_georeference(scene)
+    if found is not None:
+        write_georeference(Scene(folder), found)

@@ -17,16 +17,17 @@ from sc3d.segmentation.models import (
     check_packages,
     check_settings,
     choose_device,
+    find_weights,
     inference,
     load_model,
     load_tokenizer,
+    model_type,
     outline,
     to_pixels,
 )
 from sc3d.segmentation.segment import Segmentation
 from sc3d.segmentation.text_prompts import Caption, Prompt, build_captions, list_prompts, match_prompts
 from sc3d.segmentation.tiled_inference import Findings, segment_tiled
-from sc3d.segmentation.weights import find_weights, model_type
 from sc3d.settings.labels import Segment
 
 if TYPE_CHECKING:

@@ -11,17 +11,18 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.scene.class_table import ClassTable
-from sc3d.segmentation.instances import Instance
-from sc3d.segmentation.merge import Areas, paint
+from sc3d.segmentation.instances import Areas, Instance, paint
 from sc3d.segmentation.models import (
     HALVES,
     check_packages,
     check_settings,
     choose_device,
     enlarge,
+    find_weights,
     inference,
     load_model,
     load_tokenizer,
+    model_type,
     outline,
     to_pixels,
 )
@@ -29,7 +30,6 @@ from sc3d.segmentation.rle import Window
 from sc3d.segmentation.segment import Segmentation
 from sc3d.segmentation.text_prompts import Prompt, list_prompts
 from sc3d.segmentation.tiled_inference import Findings, segment_tiled
-from sc3d.segmentation.weights import find_weights, model_type
 from sc3d.settings.labels import Segment
 
 if TYPE_CHECKING:

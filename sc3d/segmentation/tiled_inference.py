@@ -27,8 +27,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sc3d.segmentation.instances import SAME_OBJECT, Instance, candidates, drop_duplicates, move, useful
-from sc3d.segmentation.merge import Areas, fill_gaps, merge_instances, paint_areas
+from sc3d.segmentation.instances import (
+    SAME_OBJECT,
+    Areas,
+    Instance,
+    candidates,
+    drop_duplicates,
+    fill_gaps,
+    merge_instances,
+    move,
+    paint_areas,
+    useful,
+)
 from sc3d.segmentation.rle import Window, clip_runs, cut_runs, iou, join_runs
 from sc3d.segmentation.segment import Segmentation
 

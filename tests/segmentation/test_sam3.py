@@ -14,7 +14,7 @@ import pytest
 
 from sc3d.errors import InputError
 from sc3d.scene.class_table import parse_classes
-from sc3d.segmentation.merge import Areas, merge_instances
+from sc3d.segmentation.instances import Areas, merge_instances
 from sc3d.segmentation.rle import find_runs
 from sc3d.segmentation.sam3 import Sam3, _paint_concept
 from sc3d.settings.labels import Segment

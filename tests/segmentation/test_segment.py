@@ -15,15 +15,13 @@ from sc3d.errors import InputError, MissingPackageError
 from sc3d.io.images import read_index_image, write_image
 from sc3d.scene.class_table import parse_classes
 from sc3d.segmentation.grounded_sam import GroundedSam
-from sc3d.segmentation.instances import Instance
+from sc3d.segmentation.instances import Areas, Instance, fill_gaps, merge_instances, paint, paint_areas
 from sc3d.segmentation.mask_formats.import_masks import import_masks
-from sc3d.segmentation.merge import Areas, fill_gaps, merge_instances, paint, paint_areas
-from sc3d.segmentation.models import check_settings
+from sc3d.segmentation.models import check_settings, find_weights
 from sc3d.segmentation.rle import Window
 from sc3d.segmentation.sam3 import Sam3
 from sc3d.segmentation.segment import Folders, Segmentation, segment_photos
 from sc3d.segmentation.text_prompts import Caption, Prompt, build_captions, list_prompts, match_prompts
-from sc3d.segmentation.weights import find_weights
 from sc3d.settings.labels import Segment
 
 TABLE = parse_classes(

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from sc3d.segmentation.instances import Instance, drop_duplicates
-from sc3d.segmentation.merge import Areas
+from sc3d.segmentation.instances import Areas, Instance, drop_duplicates
 from sc3d.segmentation.rle import Window, fill_runs, find_runs, iou, join_runs
 from sc3d.segmentation.tiled_inference import (
     Findings,
