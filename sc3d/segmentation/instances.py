@@ -12,7 +12,7 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.json_files import write_json
 from sc3d.scene.class_table import ClassTable
-from sc3d.segmentation.rle import Window, area, bounds, encode_runs, fill_runs, find_runs, iou, move_runs
+from sc3d.segmentation.rle import Window, area, bounds, encode_runs, fill_runs, iou, move_runs
 
 SAME_OBJECT = 0.5  # two masks of one class with a larger intersection over union are one object
 
@@ -34,13 +34,6 @@ class Instance:
     box_score: float
     mask_score: float
     prompt: str = ""
-
-    @classmethod
-    def from_mask(
-        cls, mask: np.ndarray, class_id: int, box_score: float, mask_score: float, prompt: str = ""
-    ) -> Instance:
-        """From an (H, W) bool mask of the whole photo."""
-        return cls(find_runs(mask, mask.shape[0]), mask.shape, class_id, box_score, mask_score, prompt)
 
     @cached_property
     def score(self) -> float:
@@ -153,31 +146,18 @@ def fill_gaps(labels: np.ndarray, confidence: np.ndarray, areas: Areas) -> None:
     labels[empty], confidence[empty] = areas.labels[empty], areas.confidence[empty]
 
 
-def paint(areas: Areas, class_id: int, confidence: np.ndarray, place: Window) -> None:
-    """Give pixels of a window a class where its confidence is higher than theirs; at equal confidence the
-    lower id stays. Changes `areas`.
+def paint_areas(areas: Areas, others: Areas, place: Window) -> None:
+    """Give pixels of a window what `others` say of them where that is surer; at equal confidence the lower id
+    stays. Changes `areas`.
 
-    confidence: (h, w) uint8 of that class, 0 where it is not present
+    others: of the window
     """
     window = slice(place.top, place.bottom), slice(place.left, place.right)
-    _keep_better(
-        areas.labels[window], areas.confidence[window], np.full_like(confidence, class_id), confidence
+    labels, confidence = areas.labels[window], areas.confidence[window]
+    better = (others.confidence > confidence) | (
+        (others.confidence == confidence) & (confidence > 0) & (others.labels < labels)
     )
-
-
-def paint_areas(areas: Areas, others: Areas, place: Window) -> None:
-    """The same with the areas of a window of the photo, such as a tile."""
-    window = slice(place.top, place.bottom), slice(place.left, place.right)
-    _keep_better(areas.labels[window], areas.confidence[window], *others)
-
-
-def _keep_better(
-    labels: np.ndarray, confidence: np.ndarray, new_labels: np.ndarray, new_confidence: np.ndarray
-) -> None:
-    better = (new_confidence > confidence) | (new_confidence == confidence) & (new_confidence > 0) & (
-        new_labels < labels
-    )
-    labels[better], confidence[better] = new_labels[better], new_confidence[better]
+    labels[better], confidence[better] = others.labels[better], others.confidence[better]
 
 
 def write_instances(

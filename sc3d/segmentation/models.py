@@ -6,8 +6,9 @@ Weights are looked for on this machine; nothing is downloaded unless that is all
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,7 +16,11 @@ import numpy as np
 
 from sc3d.errors import InputError, MissingPackageError
 from sc3d.io.json_files import read_json
+from sc3d.scene.class_table import ClassTable
 from sc3d.segmentation.rle import find_runs
+from sc3d.segmentation.segment import Segmentation
+from sc3d.segmentation.text_prompts import list_prompts
+from sc3d.segmentation.tiled_inference import Findings, segment_tiled
 from sc3d.settings.labels import Segment
 
 if TYPE_CHECKING:
@@ -42,6 +47,40 @@ _KNOWN = {  # download size in MB, license
     "facebook/sam-vit-huge": (2570, _FREE),
     "facebook/sam3": (3440, _GATED),
 }
+
+
+class PromptedSegmenter(ABC):
+    """What finds the classes of a table by their prompts; models are loaded for the first photo."""
+
+    def __init__(self, backend: str, settings: Segment, class_table: ClassTable) -> None:
+        """Find packages and a device; raises MissingPackageError or InputError at once if something is
+        missing.
+        """
+        check_packages(backend)
+        check_settings(settings)
+        self._settings = settings
+        self._prompts = list_prompts(class_table)
+        self._device = choose_device(settings)
+
+    @abstractmethod
+    def find(self, image: np.ndarray) -> Findings:
+        """What the models find in an (H, W, 3) uint8 RGB image, in one look."""
+
+    def segment(self, image: np.ndarray) -> Segmentation:
+        """Segment a photo, (H, W, 3) uint8 RGB, as a whole and in tiles."""
+        return segment_tiled(image, self.find, self._settings.tile, self._settings.overlap)
+
+    def _find_model(self, name: str, classes: dict[str, str]) -> Path:
+        """Folder of a model, whose type is one of `classes`."""
+        path = find_weights(name, self._settings.model_dir, self._settings.download)
+        if model_type(path) not in classes:
+            raise InputError(
+                f"{path} holds a model of type {model_type(path)!r}; possible here: {', '.join(classes)}"
+            )
+        return path
+
+    def _inference(self) -> AbstractContextManager[None]:
+        return inference(self._device, self._settings.half)
 
 
 def find_weights(name: str, model_dir: Path | None, download: bool) -> Path:
@@ -256,7 +295,7 @@ def to_pixels(image: np.ndarray, size: tuple[int, int], statistics: tuple, devic
     return torch.from_numpy(((resized - mean) / deviation).transpose(2, 0, 1)[None].copy()).to(device)
 
 
-class Patch(NamedTuple):
+class Crop(NamedTuple):
     """Part of a map of the photo: (h, w) float32 values; row and column of its first pixel."""
 
     values: torch.Tensor
@@ -264,7 +303,7 @@ class Patch(NamedTuple):
     left: int
 
 
-def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> Patch:
+def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> Crop:
     """Enlarge a map to the size of the photo, bilinearly (pixel centers at +0.5), but only where the result
     may exceed a threshold.
 
@@ -279,7 +318,7 @@ def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> P
     low_rows, high_rows, down, top = _sources(above.any(dim=1), shape[0])
     low_columns, high_columns, across, left = _sources(above.any(dim=0), shape[1])
     rows = torch.lerp(values[low_rows], values[high_rows], down[:, None])
-    return Patch(torch.lerp(rows[:, low_columns], rows[:, high_columns], across), top, left)
+    return Crop(torch.lerp(rows[:, low_columns], rows[:, high_columns], across), top, left)
 
 
 def _sources(present: torch.Tensor, length: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, int]:
@@ -301,8 +340,8 @@ def _sources(present: torch.Tensor, length: int) -> tuple[torch.Tensor, torch.Te
 
 def outline(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> np.ndarray:
     """(K, 2) runs of the pixels of a photo of `shape` (H, W) where the enlarged map exceeds a threshold."""
-    patch = enlarge(values.float(), threshold, shape)
-    return find_runs((patch.values > threshold).cpu().numpy(), shape[0], patch.top, patch.left)
+    crop = enlarge(values.float(), threshold, shape)
+    return find_runs((crop.values > threshold).cpu().numpy(), shape[0], crop.top, crop.left)
 
 
 def first_line(error: Exception) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,21 @@ class Caption:
     token_ids: list[int]
     spans: list[tuple[int, int]]
     prompts: list[Prompt]
+
+
+def replace_prompts(class_table: ClassTable, prompts: tuple[str, ...]) -> ClassTable:
+    """The table with the prompts of some classes replaced; `prompts`: texts like "road=street,parking lot"."""
+    texts = {}
+    for prompt in prompts:
+        name, separator, values = prompt.partition("=")
+        if not separator or name not in {entry.name for entry in class_table} or not values.strip():
+            raise InputError(
+                f"--prompts {prompt!r} must be NAME=text,text with a class name of {[entry.name for entry in class_table]}"
+            )
+        texts[name] = tuple(value.strip() for value in values.split(",") if value.strip())
+    return ClassTable(
+        tuple(replace(entry, prompts=texts.get(entry.name, entry.prompts)) for entry in class_table)
+    )
 
 
 def list_prompts(class_table: ClassTable) -> list[Prompt]:

@@ -13,11 +13,28 @@ from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path, discard
 from sc3d.io.images import image_size, open_image, read_index_image, write_image
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.scene import match_masks
+from sc3d.scene.scene import Scene, match_masks, photo_sizes
 from sc3d.segmentation.mask_formats.checks import Mask
 from sc3d.segmentation.mask_formats.source import MaskFiles, read_masks
+from sc3d.settings.labels import Segment
 
 logger = logging.getLogger(__name__)
+
+
+def import_scene_masks(scene: Scene, settings: Segment, class_table: ClassTable) -> dict[str, object]:
+    """Masks of `--masks` into the scene, or a look at those that are there; returns figures for the summary."""
+    if settings.masks is None:
+        if settings.mapping is not None or settings.format not in ("auto", "index"):
+            raise InputError("--mapping and --format say how to read --masks, which is missing")
+        if not scene.masks.is_dir():
+            raise InputError(
+                "--masks FOLDER is needed (or --backend grounded-sam, which makes masks from the prompts in classes.json)"
+            )
+        return {"masks": len(scene.mask_files(scene.masks, class_table)), "source": "already in the scene"}
+    source, sizes = MaskFiles(settings.masks, settings.format, settings.mapping), photo_sizes(scene.images)
+    names = import_masks(source, scene.masks, sizes, class_table, settings.confidence, scene.confidence)
+    warn_of_turned([scene.photo(name) for name in names])
+    return {"masks": len(names), "confidence": settings.confidence is not None}
 
 
 def import_masks(
