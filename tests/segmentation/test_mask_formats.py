@@ -24,7 +24,7 @@ from sc3d.scene.class_table import parse_classes
 from sc3d.scene.scene import Scene
 from sc3d.segmentation.mask_formats import outlines
 from sc3d.segmentation.mask_formats.coco import decompress
-from sc3d.segmentation.mask_formats.drawing import paint
+from sc3d.segmentation.mask_formats.annotations import paint
 from sc3d.segmentation.mask_formats.import_masks import import_masks
 from sc3d.segmentation.mask_formats.outlines import (
     OutlineError,

@@ -14,7 +14,7 @@ from pathlib import Path
 from xml.parsers import expat
 
 from sc3d.errors import InputError
-from sc3d.segmentation.mask_formats.drawing import Drawing, Shape
+from sc3d.segmentation.mask_formats.annotations import Drawing, Shape
 from sc3d.segmentation.mask_formats.outlines import (
     OutlineError,
     Polygons,

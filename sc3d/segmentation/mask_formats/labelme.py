@@ -16,7 +16,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.json_files import read_json
-from sc3d.segmentation.mask_formats.drawing import Drawing, Shape
+from sc3d.segmentation.mask_formats.annotations import Drawing, Shape
 from sc3d.segmentation.mask_formats.outlines import (
     OutlineError,
     Polygons,

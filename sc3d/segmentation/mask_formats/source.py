@@ -14,7 +14,7 @@ from sc3d.scene.class_table import ClassTable
 from sc3d.segmentation.mask_formats.checks import Checks, Mask
 from sc3d.segmentation.mask_formats.coco import read_coco
 from sc3d.segmentation.mask_formats.cvat import read_cvat
-from sc3d.segmentation.mask_formats.drawing import to_mask
+from sc3d.segmentation.mask_formats.annotations import to_mask
 from sc3d.segmentation.mask_formats.labelme import read_labelme
 from sc3d.segmentation.mask_formats.mapping import read_mapping
 from sc3d.segmentation.mask_formats.pngs import check_png, is_colored
