@@ -25,8 +25,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/splats.spz` (version 4), axes and origin as in splats.ply; with `--classes` of these only.
 
     What the format keeps: positions to 1/8192 of a unit, logs of scales to 1/32 from -10 on, opacity to
-    1/510, f_dc to 1/76 between -3.3 and 3.3,
-    f_rest to 1/32 (first degree) and 1/16 between -1 and 1.
+    1/510, f_dc to 1/76 between -3.3 and 3.3, f_rest to 1/32 (first degree) and 1/16 between -1 and 1.
     """
     chosen, placement = chosen_classes(scene, settings), find_placement(scene, settings)
     if "splats" in settings.format[: settings.format.index("spz")]:  # written by the same command

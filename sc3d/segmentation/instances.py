@@ -167,9 +167,9 @@ def write_instances(
     FiftyOne and others.
 
     photo: name of the photo; size: (height, width) px
-    Each annotation holds category_id (class id), segmentation (compressed RLE), bbox (left, top, width,
-    height of the mask, px), area (px),
-    score = box_score x mask_score, and the class name and prompt, which COCO does not ask for.
+    Each annotation holds category_id (class id), segmentation (compressed RLE), bbox (left, top, width, height
+    of the mask, px), area (px), score = box_score x mask_score, and the class name and prompt, which COCO does
+    not ask for.
     """
     annotations = [
         _annotation(number, instance, class_table) for number, instance in enumerate(instances, start=1)

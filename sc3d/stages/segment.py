@@ -50,5 +50,5 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
 
 def _segmenter(scene: Scene, settings: Segment, class_table: ClassTable) -> Segmenter:
     if settings.backend == "strokes":
-        return Strokes.learn(settings.strokes or scene.strokes, scene.images, class_table)
+        return Strokes.fit(settings.strokes or scene.strokes, scene.images, class_table)
     return (Sam3 if settings.backend == "sam3" else GroundedSam)(settings, class_table)

@@ -1,4 +1,4 @@
-"""What an annotation program says of one photo, and how its regions become one class per pixel."""
+"""The annotations of a photo, whatever program made them, and how their regions become one class per pixel."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from functools import partial
 
 import numpy as np
 
-from sc3d.segmentation.mask_formats.checks import Checks, Mask
-from sc3d.segmentation.mask_formats.outlines import OutlineError, Polygons, Runs, draw
+from sc3d.segmentation.mask_formats.checks import CheckedMask, Checks
+from sc3d.segmentation.mask_formats.outlines import OutlineError, Polygons, RunLengths, rasterize
 
-Region = tuple[int, Polygons | Runs]  # class id, outline
+Region = tuple[int, Polygons | RunLengths]  # class id, outline
 
 
 @dataclass(frozen=True)
-class Shape:
+class Annotation:
     """One annotation, not looked at yet.
 
     kind: what it is, such as "polygon"
@@ -26,62 +26,60 @@ class Shape:
 
     kind: str
     keys: tuple[str, ...]
-    build: Callable[[tuple[int, int]], Polygons | Runs] | None
+    build: Callable[[tuple[int, int]], Polygons | RunLengths] | None
 
 
 @dataclass(frozen=True)
-class Drawing:
+class PhotoAnnotations:
     """The annotations of one photo.
 
     origin: the file, for messages
     photos: file names that the photo may have, the likeliest first
     size: (width, height) px that the file states; None where it does not
-    shapes: from the bottom to the top
-    smaller_on_top: the file has no order: where shapes overlap, the one with fewer pixels wins, then the
+    annotations: from the bottom to the top
+    smaller_on_top: the file has no order: where annotations overlap, the one with fewer pixels wins, then the
         lower class id
     """
 
     origin: str
     photos: tuple[str, ...]
     size: tuple[object, object] | None
-    shapes: tuple[Shape, ...]
+    annotations: tuple[Annotation, ...]
     smaller_on_top: bool = False
 
 
-def to_mask(drawing: Drawing, checks: Checks) -> tuple[str, Mask] | None:
-    """The photo and its mask, not drawn yet; None if there is nothing to draw or something is wrong, which
-    `checks` keeps.
+def to_mask(photo: PhotoAnnotations, checks: Checks) -> tuple[str, CheckedMask] | None:
+    """The photo's name and its mask, not painted yet; None if there is nothing to paint or something is wrong,
+    which `checks` keeps.
     """
-    with_area = [shape for shape in drawing.shapes if shape.build is not None]
-    checks.skip(shape.kind for shape in drawing.shapes if shape.build is None)
+    with_area = [annotation for annotation in photo.annotations if annotation.build is not None]
+    checks.skip(annotation.kind for annotation in photo.annotations if annotation.build is None)
     if not with_area:
         return None
-    name = checks.photo(drawing.photos, drawing.origin)
-    size = None if name is None else checks.size(name, drawing.size, drawing.origin)
+    name = checks.photo(photo.photos, photo.origin)
+    size = None if name is None else checks.size(name, photo.size, photo.origin)
     regions = []
-    for shape in with_area:
-        class_id = checks.class_id(shape.keys, drawing.origin)
-        outline = None if size is None else _build(shape, size, drawing, checks)
+    for annotation in with_area:
+        class_id = checks.class_id(annotation.keys, photo.origin)
+        outline = None if size is None else _build(annotation, size, photo, checks)
         if class_id is not None and outline is not None:
             regions.append((class_id, outline))
-    return (
-        None
-        if size is None
-        else (name, Mask(drawing.origin, size, partial(paint, regions, size, drawing.smaller_on_top)))
-    )
+    if name is None or size is None:
+        return None
+    return name, CheckedMask(photo.origin, size, partial(paint, regions, size, photo.smaller_on_top))
 
 
-def _build(shape: Shape, size: tuple[int, int], drawing: Drawing, checks: Checks) -> Polygons | Runs | None:
+def _build(
+    annotation: Annotation, size: tuple[int, int], photo: PhotoAnnotations, checks: Checks
+) -> Polygons | RunLengths | None:
     try:
-        return shape.build(size)
+        return annotation.build(size)
     except OutlineError as error:
         text = str(error)
     except (ValueError, TypeError, KeyError, OverflowError):
         text = "is not complete or not of this format"
-    checks.add(
-        text,
-        f"the {shape.kind[:40]} of {shape.keys[0][:40]!r} on {drawing.photos[0][-80:]} in {drawing.origin} {text}",
-    )
+    where = f"on {photo.photos[0][-80:]} in {photo.origin}"
+    checks.add(text, f"the {annotation.kind[:40]} of {annotation.keys[0][:40]!r} {where} {text}")
     return None
 
 
@@ -92,11 +90,11 @@ def paint(regions: list[Region], size: tuple[int, int], smaller_on_top: bool) ->
     size: (width, height) px
     """
     if smaller_on_top:
-        areas = [np.count_nonzero(draw(outline, size).mask) for _, outline in regions]
+        areas = [np.count_nonzero(rasterize(outline, size).mask) for _, outline in regions]
         order = sorted(range(len(regions)), key=lambda index: (-areas[index], -regions[index][0]))
         regions = [regions[index] for index in order]
     labels = np.zeros((size[1], size[0]), np.uint8)
     for class_id, outline in regions:
-        patch = draw(outline, size)
-        labels[patch.window][patch.mask] = class_id
+        crop = rasterize(outline, size)
+        labels[crop.window][crop.mask] = class_id
     return labels

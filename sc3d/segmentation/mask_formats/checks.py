@@ -15,7 +15,7 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.images import IMAGE_SUFFIXES
 from sc3d.scene.scene import check_mask_aspect
-from sc3d.segmentation.mask_formats.mapping import Classes
+from sc3d.segmentation.mask_formats.mapping import ClassMapping
 
 logger = logging.getLogger(__name__)
 
@@ -24,7 +24,7 @@ MAX_TEXT = 400  # characters of a message about one mismatch
 
 
 @dataclass(frozen=True)
-class Mask:
+class CheckedMask:
     """A checked mask that has not been read yet.
 
     origin: where it comes from, for messages
@@ -42,7 +42,7 @@ class Checks:
     example and their number.
     """
 
-    def __init__(self, photo_sizes: dict[str, tuple[int, int]], classes: Classes) -> None:
+    def __init__(self, photo_sizes: dict[str, tuple[int, int]], classes: ClassMapping) -> None:
         """photo_sizes: (width, height) px by photo name, no two of one stem."""
         self.classes = classes
         self._photo_sizes = photo_sizes

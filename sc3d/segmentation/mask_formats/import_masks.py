@@ -14,7 +14,7 @@ from sc3d.io.atomic import atomic_path, discard
 from sc3d.io.images import image_size, open_image, read_index_image, write_image
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene, match_masks, photo_sizes
-from sc3d.segmentation.mask_formats.checks import Mask
+from sc3d.segmentation.mask_formats.checks import CheckedMask
 from sc3d.segmentation.mask_formats.source import MaskFiles, read_masks
 from sc3d.settings.labels import Segment
 
@@ -55,8 +55,8 @@ def import_masks(
     returns: names of the photos that have a mask, in order
 
     Raises InputError before anything is written if a file does not fit. With `scene_confidence` but no
-    `confidence`, confidence maps that
-    the scene already has are removed, because they describe the masks that are replaced.
+    `confidence`, confidence maps that the scene already has are removed, because they describe the masks that
+    are replaced.
     """
     if confidence is not None and scene_confidence is None:
         raise InputError("confidence maps are given, but not where in the scene they belong")
@@ -87,7 +87,7 @@ def check_masks(
     photo_sizes: dict[str, tuple[int, int]],
     class_table: ClassTable,
     confidence: Path | None = None,
-) -> tuple[dict[str, Mask], dict[str, Path]]:
+) -> tuple[dict[str, CheckedMask], dict[str, Path]]:
     """Masks that are not drawn yet, and confidence maps, by photo name; InputError, in one line, for all that
     does not fit.
     """
@@ -114,7 +114,7 @@ def warn_of_turned(photos: list[Path]) -> None:
 
 
 def _match_confidence(
-    folder: Path, photo_sizes: dict[str, tuple[int, int]], masks: dict[str, Mask]
+    folder: Path, photo_sizes: dict[str, tuple[int, int]], masks: dict[str, CheckedMask]
 ) -> dict[str, Path]:
     """Confidence maps by photo name, each readable and as large as the mask it belongs to."""
     maps = match_masks(folder, photo_sizes, None)
@@ -146,7 +146,7 @@ def _copy(files: dict[str, Path], folder: Path) -> None:
         write_image(folder / file.name, read_index_image(file))
 
 
-def _draw(masks: dict[str, Mask], folder: Path) -> None:
+def _draw(masks: dict[str, CheckedMask], folder: Path) -> None:
     from tqdm import tqdm
 
     folder.mkdir()

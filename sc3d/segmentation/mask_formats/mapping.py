@@ -18,7 +18,7 @@ UNKNOWN = -1
 
 
 @dataclass(frozen=True)
-class Classes:
+class ClassMapping:
     """The class table of a scene, with what stands for its classes elsewhere.
 
     mapping: class id by id, name or color in the files, 0 = unlabelled; None without --mapping
@@ -99,21 +99,21 @@ class Classes:
         return tuple(map(int, values.groups()))
 
 
-def read_mapping(mapping: Path | None, table: ClassTable) -> Classes:
+def read_mapping(mapping: Path | None, table: ClassTable) -> ClassMapping:
     """The table with the mapping of a JSON file, if there is one.
 
     The file holds an object: keys are ids ("7"), names ("wall") or colors ("#d63c3c", "[214, 60, 60]") of
-    the masks; values are names or ids
-    of the table, or null or "ignore" for unlabelled. Raises InputError for anything else.
+    the masks; values are names or ids of the table, or null or "ignore" for unlabelled. Raises InputError for
+    anything else.
     """
     if mapping is None:
-        return Classes(table)
+        return ClassMapping(table)
     content = read_json(mapping)
     if not isinstance(content, dict) or not content:
         raise InputError(
             f'{mapping} must hold an object such as {{"wall": "building", "7": "road", "#00ff00": "tree", "sky": null}}'
         )
-    return Classes(
+    return ClassMapping(
         table, {key.strip(): _class_id(key, value, table, mapping) for key, value in content.items()}, mapping
     )
 
