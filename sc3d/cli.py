@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional
@@ -76,7 +76,7 @@ def usage() -> str:
     return "\n".join(lines) + "\n"
 
 
-def parse(name: str, arguments: list[str]) -> object:
+def parse(name: str, arguments: list[str]) -> Any:
     """Arguments to the settings record of a command; exits with status 2 on a usage error."""
     record = COMMANDS.get(name) or scene_command(STAGES[name])
     return tyro.cli(record, args=arguments, prog=f"sc3d {name}", description=_describe(record))
@@ -88,7 +88,7 @@ def scene_command(record: type) -> type:
         "Command",
         [
             ("scene", Annotated[Positional[Path], tyro.conf.arg(help="Scene folder.")]),
-            ("settings", OmitArgPrefixes[record], dataclasses.field(default_factory=record)),
+            ("settings", OmitArgPrefixes[record], dataclasses.field(default_factory=record)),  # type: ignore
             (
                 "overwrite",
                 Annotated[bool, tyro.conf.arg(help="Run again even if the outputs are up to date.")],
@@ -105,7 +105,7 @@ def _describe(record: type) -> str:
     return (record.__doc__ or "").strip()
 
 
-def _dispatch(name: str, command: object) -> None:
+def _dispatch(name: str, command: Any) -> None:
     if name in COMMANDS:
         importlib.import_module(MODULES.get(name, f"sc3d.commands.{name}")).main(command)
         return

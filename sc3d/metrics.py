@@ -177,15 +177,10 @@ class Reliability:
     @classmethod
     def merge(cls, parts: list[Reliability]) -> Reliability:
         """Of all samples of several parts, one at least."""
-        count = sum(part.count for part in parts)
-        sums = (
-            sum(
-                np.nan_to_num(mean) * part.count
-                for part, mean in ((part, getattr(part, name)) for part in parts)
-            )
-            for name in ("confidence", "accuracy")
-        )
-        return cls.from_sums(*sums, count)
+        count = np.sum([part.count for part in parts], axis=0)
+        confidence = np.sum([np.nan_to_num(part.confidence) * part.count for part in parts], axis=0)
+        right = np.sum([np.nan_to_num(part.accuracy) * part.count for part in parts], axis=0)
+        return cls.from_sums(confidence, right, count)
 
     def summary(self) -> dict[str, object]:
         """JSON-ready figures; None for an empty bin."""
@@ -271,14 +266,17 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
     sources = SOURCES if mask_files else [key for key in SOURCES if key != "masks"]
     parts = {key: [photo[key] for photo in per_photo.values() if key in photo] for key in sources}
     totals = {key: total(found, table.num_ids).summary(table) for key, found in parts.items()}
-    believed = Reliability.merge(beliefs).summary() if beliefs else {}
+    believed = Reliability.merge(beliefs) if beliefs else None
     photos = {
         name: {key: found[key].summary(table) for key in SOURCES if key in found}
         for name, found in per_photo.items()
     }
     metrics = {"photos": [view.name for view in views], "classes": [entry.name for entry in table]} | totals
-    write_json(settings.output or scene.metrics, metrics | {"reliability": believed, "per_photo": photos})
-    return EvaluationSummary(totals, believed.get("ece"))
+    write_json(
+        settings.output or scene.metrics,
+        metrics | {"reliability": believed.summary() if believed else {}, "per_photo": photos},
+    )
+    return EvaluationSummary(totals, believed.ece if believed else None)
 
 
 def truth_masks(scene: Scene, settings: Evaluate) -> dict[str, Path]:

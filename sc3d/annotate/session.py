@@ -19,8 +19,8 @@ from sc3d.scene.scene import Scene
 from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, shrink
 from sc3d.segmentation.strokes.files import BACKGROUND, parse_shapes
 
-SHOWN = 4096  # px, longest side of the photo in the browser
-TRIED = 2048  # px, longest side of the mask that is tried out
+DISPLAY_SIZE = 4096  # px, longest side of the photo in the browser
+TRIAL_SIZE = 2048  # px, longest side of the mask that is tried out
 # A quick look, with whatever is drawn so far; `sc3d segment` takes its time
 QUICK = StrokesSettings(members=2, trees=40, steps=400, calibration_photos=1, require_all=False)
 
@@ -149,7 +149,7 @@ class Session:
                     state,
                     Strokes.fit(self._scene.strokes, self._scene.images, self.class_table, self._settings),
                 )
-            labels = self._learned[1].segment(shrink(read_image(photo), TRIED)).labels
+            labels = self._learned[1].segment(shrink(read_image(photo), TRIAL_SIZE)).labels
         finally:
             self._trying.release()
         return _png(
@@ -159,7 +159,7 @@ class Session:
         )
 
     def _encode(self, stem: str) -> bytes:
-        shown = np.ascontiguousarray(shrink(read_image(self.photos[stem]), SHOWN)[..., ::-1])
+        shown = np.ascontiguousarray(shrink(read_image(self.photos[stem]), DISPLAY_SIZE)[..., ::-1])
         return cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
 

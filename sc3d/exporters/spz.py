@@ -15,6 +15,7 @@ from sc3d.io.atomic import atomic_path
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
 from sc3d.splatting.gaussians import Gaussians
+from sc3d.view.display_splats import read_splats
 
 
 def outputs(scene: Scene, settings: Export) -> list[Path]:
@@ -29,7 +30,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """
     chosen, placement = chosen_classes(scene, settings), find_placement(scene, settings)
     if "splats" in settings.format[: settings.format.index("spz")]:  # written by the same command
-        labelled = splats.read_splats(splats.outputs(scene, settings)[0], scene.class_table())
+        labelled = read_splats(scene.labelled_splats, scene.class_table())
     else:
         labelled = splats.label_splats(scene, settings).only(chosen)
     path = outputs(scene, settings)[0]

@@ -45,7 +45,7 @@ class VoxelSurface:
             normals = (
                 estimate_normals(points, neighbors)
                 if neighbors.shape[1] > 3
-                else np.tile(np.float32([0, 0, 1]), (len(points), 1))
+                else np.tile(np.array([0, 0, 1], np.float32), (len(points), 1))
             )
         return cls(surface_patches(points, normals, voxel_size))
 

@@ -173,12 +173,18 @@ class LabelGrid(VoxelGrid):
         """
         slots, positions = self.blocks()
         votes = self.grid.attribute(self.ATTRIBUTE).numpy()[slots]
-        np.savez(path, value_000=votes, key=positions, attr_name_votes=np.zeros(1, np.int32), **self.header())
+        arrays = {"value_000": votes, "key": positions, **file_header(self.voxel_size)}
+        np.savez(path, **arrays)  # type: ignore[arg-type]  # the stub takes keywords for options
 
-    def header(self) -> dict[str, np.ndarray]:
-        """What `VoxelBlockGrid.load` reads beside keys and values."""
-        size = np.float32([self.voxel_size])
-        return {"CPU:0": np.uint8(0), "block_resolution": np.int64([BLOCK]), "voxel_size": size}
+
+def file_header(voxel_size: float) -> dict[str, np.ndarray]:
+    """What `VoxelBlockGrid.load` reads in the file of a label field beside `key` (B, 3) and `value_000`."""
+    return {
+        "attr_name_votes": np.zeros(1, np.int32),
+        "CPU:0": np.zeros((), np.uint8),
+        "block_resolution": np.array([BLOCK], np.int64),
+        "voxel_size": np.array([voxel_size], np.float32),
+    }
 
 
 @dataclass(frozen=True)

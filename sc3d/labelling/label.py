@@ -35,7 +35,7 @@ class LabelSummary:
             if name != "propagated"
         }
         size = round(self.voxel_size, 5)
-        return {"points": int(self.counts.sum()), "views": self.num_views, "voxel_size": size} | states
+        return {"points": int(self.counts.sum()), "views": self.num_views, "voxel_size": size, **states}
 
 
 def label_scene(scene: Scene, settings: Label) -> LabelSummary:

@@ -45,10 +45,11 @@ class VoteLog:
         """Cells int32, labels uint8 and weights uint16 of each view, in turn."""
         self.file.seek(0)
         for count in self.counts:
-            yield tuple(
+            cells, labels, weights = (
                 np.frombuffer(self.file.read(count * np.dtype(kind).itemsize), kind)
                 for kind in (np.int32, np.uint8, np.uint16)
             )
+            yield cells, labels, weights
 
 
 def verify(

@@ -171,7 +171,10 @@ def skill_score(wrong: list[int | None], counts: np.ndarray) -> float:
 
     wrong: errors of each fold, asked about points that it has not seen; counts: (C,) examples of each class
     """
-    return 0.0 if None in wrong else 1 - sum(wrong) / max(int(counts.sum() - counts.max()), 1)
+    errors = [number for number in wrong if number is not None]
+    if len(errors) < len(wrong):
+        return 0.0
+    return 1 - sum(errors) / max(int(counts.sum() - counts.max()), 1)
 
 
 def sum_statistics(lessons: list[AppearanceStatistics]) -> AppearanceStatistics:
@@ -190,10 +193,13 @@ def is_skillful(wrong: list[int | None], statistics: AppearanceStatistics) -> bo
     return skill >= MIN_SKILL
 
 
-def plausible(start: np.ndarray, rating: np.ndarray) -> np.ndarray:
-    """The seeds (N,) without those that look like another class: conflicts that all views share. rating: (N,
-    C)
+def plausible(start: np.ndarray, rating: np.ndarray | None) -> np.ndarray:
+    """The seeds (N,) without those that look like another class: conflicts that all views share.
+
+    rating: (N, C) log-likelihood of the classes; None = nothing is known
     """
+    if rating is None:
+        return start
     given = rating[np.arange(len(start)), np.maximum(start, 1).astype(np.int64) - 1]
     return np.where((start > 0) & (given < IMPLAUSIBLE), 0, start).astype(np.uint8)
 

@@ -34,6 +34,13 @@ class LabelledPoints:
         )
 
     @property
+    def known_votes(self) -> np.ndarray:
+        """(N, num_ids) float32 votes, where the method needs them; ValueError if there are none."""
+        if self.votes is None:
+            raise ValueError("these points have no votes, which the map method needs")
+        return self.votes
+
+    @property
     def seed_labels(self) -> np.ndarray:
         """(N,) uint8 labels of the seeds, 0 elsewhere."""
         return np.where(np.isin(self.seeds.state, (SEED, UNLOCKED)), self.seeds.label, 0).astype(np.uint8)

@@ -32,18 +32,16 @@ def minimize_energy(
     appearance: votes beside the views; what it teaches is learned again from each round's result. None = votes alone
     """
     offered = np.bincount(known.seed_labels, minlength=known.num_classes + 1)[1:] > 0
-    if appearance is None:
-        return decided(graph, *vote_marginals(graph, known, offered, settings))
-    label = known.seed_labels
-    for turn in range(max(settings.rounds, 1)):
+    found, label, rounds = None, known.seed_labels, max(settings.rounds, 1)
+    while appearance is not None and rounds:
         rating = appearance.log_likelihood(label)
-        if turn and rating is None:
-            break  # too little is sure; what was learned from agreed points stands
-        evidence, marginals = appearance_marginals(graph, known, offered, rating, settings)
-        label = (marginals.argmax(axis=1) + 1).astype(np.uint8)
-        statistics = appearance.model.statistics(label, sure_examples(marginals, known), known.num_classes)
-        appearance = replace(appearance, statistics=statistics)
-    return decided(graph, evidence, marginals)
+        if rating is None:
+            break  # too little is sure; what was learned before stands
+        found = appearance_marginals(graph, known, offered, rating, settings)
+        label = (found[1].argmax(axis=1) + 1).astype(np.uint8)
+        statistics = appearance.model.statistics(label, sure_examples(found[1], known), known.num_classes)
+        appearance, rounds = replace(appearance, statistics=statistics), rounds - 1
+    return decided(graph, *(found or vote_marginals(graph, known, offered, settings)))
 
 
 def vote_marginals(
@@ -52,12 +50,12 @@ def vote_marginals(
     """Log-evidence and belief (N, C) from the votes alone; offered: (C,) bool, a class without a single seed
     is not.
     """
-    likelihood = vote_likelihood(known.votes)
+    likelihood = vote_likelihood(known.known_votes)
     likelihood[:, ~offered] = -np.inf
     # else the votes would take one edge per step to reach points without any
     grown, _ = grow_regions(graph, known.seed_labels)
     marginals = softmax(likelihood)
-    silent = np.flatnonzero(~known.votes[:, 1:].any(axis=1) & (grown > 0))
+    silent = np.flatnonzero(~known.known_votes[:, 1:].any(axis=1) & (grown > 0))
     marginals[silent] = np.eye(likelihood.shape[1], dtype=np.float32)[grown[silent] - 1]
     return likelihood, mean_field(graph, likelihood, settings.smoothness, marginals)
 
@@ -66,7 +64,7 @@ def appearance_marginals(
     graph: Graph, known: LabelledPoints, offered: np.ndarray, rating: np.ndarray, settings: Propagate
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same from votes and raters; rating: (N, C), overwritten."""
-    rating += np.float32(TRUST) * vote_likelihood(known.votes)
+    rating += np.float32(TRUST) * vote_likelihood(known.known_votes)
     rating[:, ~offered] = -np.inf
     return rating, mean_field(graph, rating, settings.smoothness)  # afresh: a sure belief would not move
 

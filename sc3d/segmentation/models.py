@@ -295,7 +295,7 @@ def to_pixels(image: np.ndarray, size: tuple[int, int], statistics: tuple, devic
     return torch.from_numpy(((resized - mean) / deviation).transpose(2, 0, 1)[None].copy()).to(device)
 
 
-class Crop(NamedTuple):
+class ScorePatch(NamedTuple):
     """Part of a map of the photo: (h, w) float32 values; row and column of its first pixel."""
 
     values: torch.Tensor
@@ -303,7 +303,7 @@ class Crop(NamedTuple):
     left: int
 
 
-def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> Crop:
+def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> ScorePatch:
     """Enlarge a map to the size of the photo, bilinearly (pixel centers at +0.5), but only where the result
     may exceed a threshold.
 
@@ -318,7 +318,7 @@ def enlarge(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> C
     low_rows, high_rows, down, top = _sources(above.any(dim=1), shape[0])
     low_columns, high_columns, across, left = _sources(above.any(dim=0), shape[1])
     rows = torch.lerp(values[low_rows], values[high_rows], down[:, None])
-    return Crop(torch.lerp(rows[:, low_columns], rows[:, high_columns], across), top, left)
+    return ScorePatch(torch.lerp(rows[:, low_columns], rows[:, high_columns], across), top, left)
 
 
 def _sources(present: torch.Tensor, length: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, int]:
@@ -340,8 +340,8 @@ def _sources(present: torch.Tensor, length: int) -> tuple[torch.Tensor, torch.Te
 
 def outline(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> np.ndarray:
     """(K, 2) runs of the pixels of a photo of `shape` (H, W) where the enlarged map exceeds a threshold."""
-    crop = enlarge(values.float(), threshold, shape)
-    return find_runs((crop.values > threshold).cpu().numpy(), shape[0], crop.top, crop.left)
+    patch = enlarge(values.float(), threshold, shape)
+    return find_runs((patch.values > threshold).cpu().numpy(), shape[0], patch.top, patch.left)
 
 
 def first_line(error: Exception) -> str:

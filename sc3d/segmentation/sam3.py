@@ -126,10 +126,10 @@ def _paint_concept(areas: Areas, probabilities: torch.Tensor, presence: float, c
     """Add the pixels where a concept is likelier than not, each with its own confidence, presence x
     probability.
     """
-    crop = enlarge(probabilities, _MASK_THRESHOLD, areas.labels.shape)
-    height, width = crop.values.shape
-    values = crop.values.cpu().numpy()
+    patch = enlarge(probabilities, _MASK_THRESHOLD, areas.labels.shape)
+    height, width = patch.values.shape
+    values = patch.values.cpu().numpy()
     confidence = np.maximum(np.rint(255 * presence * values).astype(np.uint8), 1)
     confidence[values <= _MASK_THRESHOLD] = 0
-    window = Window(crop.left, crop.top, crop.left + width, crop.top + height)
+    window = Window(patch.left, patch.top, patch.left + width, patch.top + height)
     paint_areas(areas, Areas(np.full_like(confidence, class_id), confidence), window)

@@ -61,7 +61,7 @@ class Report:
 
 
 @dataclass(frozen=True)
-class View:
+class ViewCommand:
     """Look at a scene: Open3D window, page in the browser, or a picture without a display."""
 
     scene: Annotated[Positional[Path], arg(help="Scene folder.")]

@@ -136,7 +136,7 @@ def _beside_road(
 
 
 def _world_rects(building: Building, margin: float) -> list[tuple[float, ...]]:
-    rects = []
+    rects: list[tuple[float, ...]] = []
     for x, y, half_length, half_width in building.boxes():
         cx, cy, _ = (building.pose @ [x, y, 0.0, 1.0])[:3]
         rects.append(

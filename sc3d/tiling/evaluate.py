@@ -22,11 +22,18 @@ from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Evaluate
 from sc3d.tiling.executor import Executor, open_executor
+from sc3d.tiling.first_surfaces import (
+    RangeJob,
+    RangeMaps,
+    compute_ranges,
+    split_mesh,
+    split_surfels,
+    views_of,
+)
 from sc3d.tiling.label import sample_spacing
-from sc3d.tiling.memory import TRIANGLE, WorkFolder, fits, max_points, memory_of, mesh_triangles, num_points
-from sc3d.tiling.ranges import RangeMaps
+from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, mesh_triangles, num_points
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
-from sc3d.tiling.surfaces import RangeJob, compute_ranges, split_mesh, split_surfels, views_of
+from sc3d.tiling.work_folder import WorkFolder
 
 BYTES = 260  # of a point while pixels look for the nearest one
 
@@ -118,8 +125,8 @@ def find_points_in_tile(job: EvaluateJob, tile: int) -> None:
     """Pixels whose first surface lies in the tile, and the nearest point of each: (2, K) int64 pixel and row
     of the cloud, for every view.
     """
-    window = job.store.window(tile, job.reach)
-    points = positions(window.gather(job.store.records))
+    halo = job.store.with_halo(tile, job.reach)
+    points = positions(halo.gather(job.store.records))
     low, high, index, views = (
         points.min(axis=0) - job.reach,
         points.max(axis=0) + job.reach,
@@ -140,7 +147,7 @@ def find_points_in_tile(job: EvaluateJob, tile: int) -> None:
             near = distance[:, 0] <= job.reach
             pixels = (rows * truth.shape[1] + columns)[mine][near]
             job.results.write(
-                tile, **{f"seen{job.maps.numbers[name]}": np.stack([pixels, window.rows[nearest[near, 0]]])}
+                tile, **{f"seen{job.maps.numbers[name]}": np.stack([pixels, halo.rows[nearest[near, 0]]])}
             )
 
 

@@ -14,8 +14,9 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.geometry.neighbors import NeighborIndex, point_spacing
 from sc3d.geometry.voxels import BLOCK, VOXELS, sort_by_voxel, unpack_blocks, voxel_origin
-from sc3d.io.chunked_clouds import CloudFile, columns, positions, write_ply
+from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.io.images import image_size
+from sc3d.io.ply import write_records
 from sc3d.labelling.cloud import Cloud, CloudExtent
 from sc3d.labelling.fusion import Fusion, fuse
 from sc3d.labelling.inputs import FOOTPRINT_SAMPLE, Masks, best_confidence, point_density, voxel_size_for
@@ -25,11 +26,11 @@ from sc3d.scene.labels import STATE_NAMES
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
 from sc3d.tiling.executor import Executor, open_executor
-from sc3d.tiling.memory import TRIANGLE, WorkFolder, fits, max_points, memory_of, mesh_triangles, num_points
-from sc3d.tiling.ranges import RangeMaps
+from sc3d.tiling.first_surfaces import RangeJob, RangeMaps, compute_ranges, split_mesh, split_surfels
+from sc3d.tiling.label_grid_file import write_field
+from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, mesh_triangles, num_points
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
-from sc3d.tiling.surfaces import RangeJob, compute_ranges, split_mesh, split_surfels
-from sc3d.tiling.voxel_file import write_field
+from sc3d.tiling.work_folder import WorkFolder
 
 BYTES = 420  # of a point while its tile votes
 VOXEL = 2.2  # of a label voxel, in point spacings, while neither is known exactly
@@ -116,7 +117,7 @@ def _ranges(
     spacing: float,
     settings: Label,
     parts: WorkFolder,
-    tasks: Executor,
+    executor: Executor,
 ) -> RangeMaps:
     origin = local_origin(masks.views)
     if scene.mesh.exists() and settings.surface == "auto":
@@ -134,26 +135,26 @@ def _ranges(
         RangeJob(
             scene.path, mesh, maps, {view.name: image_size(masks.files[view.name]) for view in masks.views}
         ),
-        tasks,
+        executor,
     )
 
 
-def sample_spacing(store: TileStore, survey: CloudStatistics) -> tuple[float, np.ndarray]:
+def sample_spacing(store: TileStore, statistics: CloudStatistics) -> tuple[float, np.ndarray]:
     """Sampling distance as `labelled.spacing_of` has it, and the points (S, 3) by which `default_voxel_size`
     measures mask pixels.
     """
     rows, distances, footprint_rows, footprints = [], [], [], []
     num_points = sum(store.counts.values())
     for tile in store.tiles:
-        window = store.window(tile, SAMPLE_MARGIN * survey.spacing)
-        points = positions(window.gather(store.records))
-        mine = window.core & (window.rows % max(1, num_points // SPACING_SAMPLE) == 0)
-        rows.append(window.rows[mine])
+        halo = store.with_halo(tile, SAMPLE_MARGIN * statistics.spacing)
+        points = positions(halo.gather(store.records))
+        mine = halo.core & (halo.rows % max(1, num_points // SPACING_SAMPLE) == 0)
+        rows.append(halo.rows[mine])
         distances.append(
-            NeighborIndex(points, survey.extent.low).nearest(points[mine], SPACING_NEIGHBORS + 1)[1]
+            NeighborIndex(points, statistics.extent.low).nearest(points[mine], SPACING_NEIGHBORS + 1)[1]
         )
-        mine = window.core & (window.rows % max(1, num_points // FOOTPRINT_SAMPLE) == 0)
-        footprint_rows.append(window.rows[mine])
+        mine = halo.core & (halo.rows % max(1, num_points // FOOTPRINT_SAMPLE) == 0)
+        footprint_rows.append(halo.rows[mine])
         footprints.append(points[mine])
     ordered = [
         np.concatenate(values)[np.argsort(np.concatenate(keys))]
@@ -169,8 +170,8 @@ def label_tile(job: LabelJob, tile: int) -> None:
     if job.results.has(tile, "field"):
         return
     scene, store = Scene(job.scene), job.store
-    window = store.window(tile, job.margin)
-    records = window.gather(store.records)
+    halo = store.with_halo(tile, job.margin)
+    records = halo.gather(store.records)
     points, masks = positions(records), Masks.load(scene, job.confidence)
     normals = unit_normals(
         columns(records, ("nx", "ny", "nz")),
@@ -190,7 +191,7 @@ def label_tile(job: LabelJob, tile: int) -> None:
         scene.class_table().num_ids,
         job.settings,
     )
-    core = window.core
+    core = halo.core
     labels = fusion.labels
     job.results.write(
         tile,
@@ -249,5 +250,5 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndar
             counts[:] += np.bincount(values["state"], minlength=len(STATE_NAMES))
             yield result
 
-    write_ply(path, dtype, cloud.num_points, chunks())
+    write_records(path, chunks(), dtype, cloud.num_points, ["sc3d"])
     return counts

@@ -20,7 +20,8 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sc3d.errors import InputError
-from sc3d.io.chunked_clouds import CloudFile, write_ply
+from sc3d.io.chunked_clouds import CloudFile
+from sc3d.io.ply import write_records
 from sc3d.propagation.appearance import (
     AppearanceModel,
     AppearanceStatistics,
@@ -42,9 +43,10 @@ from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
 from sc3d.tiling.executor import Executor, open_executor
 from sc3d.tiling.label import sample_spacing
-from sc3d.tiling.memory import WorkFolder, fits, max_points, num_points
-from sc3d.tiling.propagation_tiles import PropagateJob, TileGraph, cells_of
+from sc3d.tiling.memory import fits, max_points, num_points
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
+from sc3d.tiling.tile_graph import PropagateJob, TileGraph, cells_of
+from sc3d.tiling.work_folder import WorkFolder
 
 logger = logging.getLogger(__name__)
 
@@ -82,18 +84,18 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     return summary
 
 
-def _solve(job: PropagateJob, tasks: Executor, path: Path) -> None:
+def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
     """All passes; leaves arrays `label`, `confidence` and `state` of every tile."""
     tiles = job.store.tiles
-    looks = tasks.run("graph", partial(_graph_task, job), tiles)
+    summaries = executor.run("graph", partial(_graph_task, job), tiles)
     offered, least = (
-        sum(look.seeds for look in looks) > 0,
-        views_to_agree(sum(look.agreement for look in looks)),
+        sum(summary.seeds for summary in summaries) > 0,
+        views_to_agree(sum(summary.agreement for summary in summaries)),
     )
     if not offered.any():
         raise no_seeds(path)
     statistics = (
-        _learn(job, tasks, NormalStatistics.merge([look.lean for look in looks]), least)
+        _learn(job, executor, NormalStatistics.merge([summary.lean for summary in summaries]), least)
         if uses_appearance(job.settings)
         else None
     )
@@ -104,12 +106,12 @@ def _solve(job: PropagateJob, tasks: Executor, path: Path) -> None:
                 break
             source = f"round{turn}"
             statistics = sum_statistics(
-                tasks.run(f"round {turn + 1}", partial(_turn_task, job, offered, statistics, turn), tiles)
+                executor.run(f"round {turn + 1}", partial(_turn_task, job, offered, statistics, turn), tiles)
             )
     else:
-        tasks.run("labels", partial(_once_task, job, offered, statistics), tiles)
-    reached = _reached(job, tasks) if job.settings.method == "map" else None
-    tasks.run("states", partial(_state_task, job, source, reached, statistics), tiles)
+        executor.run("labels", partial(_once_task, job, offered, statistics), tiles)
+    reached = _reached(job, executor) if job.settings.method == "map" else None
+    executor.run("states", partial(_state_task, job, source, reached, statistics), tiles)
 
 
 @dataclass(frozen=True)
@@ -134,25 +136,27 @@ def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
 
 
 def _learn(
-    job: PropagateJob, tasks: Executor, lean: NormalStatistics, least: int
+    job: PropagateJob, executor: Executor, lean: NormalStatistics, least: int
 ) -> AppearanceStatistics | None:
     """What the agreed points of all tiles teach, if that does well on points held out."""
     tiles, terrain = job.store.tiles, GroundModel.from_statistics(lean, job.extent.low, job.extent.high)
     for window, ground in zip(
-        WINDOWS, terrain.grounds(tasks.run("ground", partial(_lowest_task, job, terrain), tiles)), strict=True
+        WINDOWS,
+        terrain.grounds(executor.run("ground", partial(_lowest_task, job, terrain), tiles)),
+        strict=True,
     ):
         np.save(job.shared / f"ground{window}.npy", ground)
     counts = [
         QuantileSketch.merge(list(parts))
-        for parts in zip(*tasks.run("relief", partial(_relief_task, job, terrain), tiles), strict=True)
+        for parts in zip(*executor.run("relief", partial(_relief_task, job, terrain), tiles), strict=True)
     ]
     halves = [
         sum_statistics(list(parts))
         for parts in zip(
-            *tasks.run("examples", partial(_lesson_task, job, counts, least), tiles), strict=True
+            *executor.run("examples", partial(_lesson_task, job, counts, least), tiles), strict=True
         )
     ]
-    errors = tasks.run("held-out errors", partial(_error_task, job, halves, least), tiles)
+    errors = executor.run("held-out errors", partial(_error_task, job, halves, least), tiles)
     wrong = [None if None in fold else sum(fold) for fold in zip(*errors, strict=True)]
     statistics = sum_statistics(halves)
     return statistics if is_skillful(wrong, statistics) else None
@@ -255,14 +259,14 @@ def _start(job: PropagateJob, part: TileGraph, statistics: AppearanceStatistics 
     )
 
 
-def _reached(job: PropagateJob, tasks: Executor) -> dict[int, np.ndarray]:
+def _reached(job: PropagateJob, executor: Executor) -> dict[int, np.ndarray]:
     """Per tile, (K,) bool: the connected groups of its points from which some path, through whatever tiles,
     leads to a seed.
     """
     tiles = job.store.tiles
-    sizes = np.cumsum([0, *tasks.run("connections", partial(_component_task, job), tiles)])
+    sizes = np.cumsum([0, *executor.run("connections", partial(_component_task, job), tiles)])
     first = dict(zip(tiles, sizes[:-1].tolist(), strict=True))
-    found = tasks.run("links", partial(_link_task, job, first), tiles)
+    found = executor.run("links", partial(_link_task, job, first), tiles)
     links = np.concatenate([pairs for pairs, _ in found])
     graph = coo_matrix((np.ones(len(links), np.int8), links.T), shape=(sizes[-1], sizes[-1]))
     group, seeded = connected_components(graph, directed=False)[1], np.zeros(sizes[-1], bool)
@@ -296,7 +300,7 @@ def _link_task(job: PropagateJob, first: dict[int, int], tile: int) -> tuple[np.
     """
     part = TileGraph.load(job, tile)
     mine = job.results.read(tile, "all_groups").astype(np.int64) + first[tile]
-    others = part.window.gather(
+    others = part.halo.gather(
         lambda other: job.results.read(other, "group", mapped=True).astype(np.int64) + first[other]
     )[part.graph.order]
     pairs = np.unique(np.stack([mine[~part.core], others[~part.core]], axis=1), axis=0)
@@ -313,9 +317,7 @@ def _state_task(
     part = TileGraph.load(job, tile)
     label, confidence = (part.around(job, f"{source}_{name}") for name in ("label", "confidence"))
     if reached is not None:
-        groups = part.window.gather(
-            lambda other: reached[other][job.results.read(other, "group", mapped=True)]
-        )
+        groups = part.halo.gather(lambda other: reached[other][job.results.read(other, "group", mapped=True)])
         label = np.where(groups[part.graph.order], label, 0)
     if job.settings.fill:
         label, confidence = fill_from_nearest(part.known.points, label, confidence)
@@ -341,5 +343,5 @@ def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
             confidence[0] += float(values["confidence"][labelled].sum(dtype=np.float64))
             yield result
 
-    write_ply(path, np.dtype(kept), cloud.num_points, chunks())
+    write_records(path, chunks(), np.dtype(kept), cloud.num_points, ["sc3d"])
     return PropagateSummary(*counts.tolist(), confidence[0])

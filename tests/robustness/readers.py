@@ -320,7 +320,7 @@ def _copy_mask_file(name: str):
         _write(
             folder,
             mapping__json=json.dumps(
-                {name: "road" for name in ("vehicle", "sky", "person", "roof", "lawn", "thing", "crown")}
+                dict.fromkeys(("vehicle", "sky", "person", "roof", "lawn", "thing", "crown"), "road")
             ),
         )
 

@@ -11,7 +11,7 @@ from sc3d.cli import main
 from sc3d.scene.class_table import parse_classes
 from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, assign_folds, sample_pixels
 from sc3d.segmentation.strokes.features import pixel_features
-from sc3d.segmentation.strokes.files import NOTHING, PhotoStrokes, Stroke, parse_shapes, read_strokes
+from sc3d.segmentation.strokes.files import NOTHING, PhotoStrokes, StrokeShape, parse_shapes, read_strokes
 from sc3d.segmentation.strokes.guided_filter import fit_lines
 from sc3d.segmentation.strokes.novelty import fit_novelty
 from sc3d.segmentation.strokes.pixel_classifier import best_temperature
@@ -202,7 +202,7 @@ def test_errors_say_what_to_do(scene, capsys, change, words):
 def test_shapes_cover_what_geometry_says():
     def covered(kind, points, width=0.0, scale=1):
         labels, groups = PhotoStrokes(
-            None, (400, 300), (Stroke(5, kind, np.array(points, float), width),)
+            None, (400, 300), (StrokeShape(5, kind, np.array(points, float), width),)
         ).paint(400 * scale, 300 * scale)
         assert ((labels == 5) == (groups == 1)).all() and set(np.unique(labels)) <= {NOTHING, 5}
         return (labels == 5).sum() / scale**2, np.argwhere(labels == 5).mean(axis=0)[

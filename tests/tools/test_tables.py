@@ -185,7 +185,7 @@ def test_every_switch_has_a_row_that_turns_it_alone():
         zeros = {name for name, text in helps(type(default)).items() if "0 = off" in text}
         assert flags | zeros | {"method"} <= {name for names in changed for name in names}, stage
     assert len({row.key for row in rows}) == len(rows) and all(row.key != row.base.key for row in rows)
-    assert {getattr(record, "edge_width") for _, record in turned(replace(Label(), edge_width=0.0))} == {
+    assert {record.edge_width for _, record in turned(replace(Label(), edge_width=0.0))} == {
         0.0,
         1.0,
     }

@@ -14,12 +14,12 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.images import IMAGE_SUFFIXES
+from sc3d.io.limits import MAX_MASK_PIXELS
 from sc3d.scene.scene import check_mask_aspect
 from sc3d.segmentation.mask_formats.mapping import ClassMapping
 
 logger = logging.getLogger(__name__)
 
-MAX_PIXELS = 100_000_000  # of a mask that is larger than its photo
 MAX_TEXT = 400  # characters of a message about one mismatch
 
 
@@ -98,10 +98,10 @@ class Checks:
                 f"{_where(name, origin)} has a size that is none: {str(stated[0])[:20]} x {str(stated[1])[:20]}",
             )
             return None
-        if width * height > max(MAX_PIXELS, photo[0] * photo[1]):
+        if width * height > max(MAX_MASK_PIXELS, photo[0] * photo[1]):
             self.add(
                 "too large",
-                f"{_where(name, origin)} is {width}x{height}, but its photo is {photo[0]}x{photo[1]}: more than {MAX_PIXELS} px are refused",
+                f"{_where(name, origin)} is {width}x{height}, but its photo is {photo[0]}x{photo[1]}: more than {MAX_MASK_PIXELS} px are refused",
             )
             return None
         try:

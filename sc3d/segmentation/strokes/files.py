@@ -33,7 +33,7 @@ _MIN_SHARE = 0.25  # of a reduced pixel that a PNG must cover
 
 
 @dataclass(frozen=True)
-class Stroke:
+class StrokeShape:
     """One stroke or area. label: class id, 0 = background; points: (N, 2) float64 px of the stored photo;
     width: of strokes, px, 0 = default.
     """
@@ -55,7 +55,7 @@ class PhotoStrokes:
 
     photo: Path
     size: tuple[int, int]
-    shapes: tuple[Stroke, ...] = ()
+    shapes: tuple[StrokeShape, ...] = ()
     picture: np.ndarray | None = None
 
     def paint(self, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
@@ -116,7 +116,7 @@ def read_strokes(folder: Path, photos_folder: Path, class_table: ClassTable) -> 
 
 def parse_shapes(
     content: object, origin: Path | str, size: tuple[int, int], class_table: ClassTable
-) -> tuple[Stroke, ...]:
+) -> tuple[StrokeShape, ...]:
     """The shapes of a decoded LabelMe file, scaled to the photo; InputError if something is wrong.
 
     origin: names the file in messages; size: (width, height) px of the photo
@@ -137,7 +137,7 @@ def parse_shapes(
     )
 
 
-def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) -> Stroke:
+def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) -> StrokeShape:
     if not isinstance(shape, dict):
         raise InputError(f"{origin} is not an object")
     label, kind = shape.get("label"), shape.get("shape_type") or "polygon"
@@ -156,7 +156,9 @@ def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) 
         raise InputError(f"{origin}: a {kind} needs at least {MIN_POINTS[kind]} points")
     if not _is_number(width) or width < 0:
         raise InputError(f"{origin}: width must be a number of px")
-    return Stroke(ids[label], kind, np.array(points, np.float64).reshape(-1, 2) * scale, float(width) * scale)
+    return StrokeShape(
+        ids[label], kind, np.array(points, np.float64).reshape(-1, 2) * scale, float(width) * scale
+    )
 
 
 def _is_number(value: object) -> bool:
@@ -230,7 +232,7 @@ def _components(labels: np.ndarray) -> tuple[np.ndarray, int]:
     return groups, count
 
 
-def _draw(shape: Stroke, scale: np.ndarray, default_width: float, size: tuple[int, int]) -> np.ndarray:
+def _draw(shape: StrokeShape, scale: np.ndarray, default_width: float, size: tuple[int, int]) -> np.ndarray:
     """(H, W) bool pixels that a shape covers, at least one unless it lies outside; scale: (2,) of x and y;
     size: (H, W).
     """
