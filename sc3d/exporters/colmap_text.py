@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pycolmap
 
-from sc3d.exporters.projected_cloud import write_place
+from sc3d.exporters.projected_cloud import copy_georeference
 from sc3d.io.atomic import atomic_path
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
@@ -23,5 +23,5 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     with atomic_path(outputs(scene, settings)[0]) as folder:
         folder.mkdir()
         model.write_text(str(folder))
-        write_place(scene, folder)
+        copy_georeference(scene, folder)
     return {"photos": model.num_reg_images(), "points": model.num_points3D()}

@@ -9,12 +9,12 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.exporters.buildings import roof_heights, roof_tops, split_buildings
-from sc3d.exporters.polygonize import simplified, squared, trace
-from sc3d.exporters.projected_cloud import PlacedCloud, find_placement, read_placed_cloud
+from sc3d.exporters.polygonize import orthogonalized, polygonize, simplified
+from sc3d.exporters.projected_cloud import ProjectedCloud, find_projection, read_projected_cloud
 from sc3d.exporters.regions import cells_by_number
 from sc3d.exporters.terrain import ground_height
 from sc3d.exporters.trees import canopy_height, split_crowns
-from sc3d.exporters.vector_files import MapObject, has_geopackage, shapely, write_geojson, write_geopackage
+from sc3d.exporters.vector_files import Feature, has_geopackage, shapely, write_geojson, write_geopackage
 from sc3d.geometry.raster import Raster, spacing_of_all
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
@@ -39,7 +39,7 @@ class Kinds:
 
 
 def outputs(scene: Scene, settings: Export) -> list[Path]:
-    crs = find_placement(scene, settings).crs
+    crs = find_projection(scene, settings).crs
     paths = [scene.export / f"{layer}{'' if crs else '_local'}.geojson" for layer in LAYERS]
     return paths + ([scene.export / "objects.gpkg"] if crs and has_geopackage() else [])
 
@@ -48,24 +48,24 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/buildings.geojson` and `trees.geojson` (`*_local.geojson` without a CRS), and both as
     `objects.gpkg` where pyogrio is installed.
     """
-    placed = read_placed_cloud(scene, settings)
-    layers = find_objects(placed, scene.class_table(), settings)
+    projected = read_projected_cloud(scene, settings)
+    layers = find_objects(projected, scene.class_table(), settings)
     paths = outputs(scene, settings)
     for layer, path in zip(LAYERS, paths):
-        write_geojson(path, layers[layer], placed.placement)
+        write_geojson(path, layers[layer], projected.projection)
     if len(paths) > len(LAYERS):
-        write_geopackage(paths[-1], layers, placed.placement)
+        write_geopackage(paths[-1], layers, projected.projection)
     figures = {layer: len(layers[layer]) for layer in LAYERS}
     figures |= {f"{layer}_area": f"{sum(item.area for item in layers[layer]):.0f} m2" for layer in LAYERS}
-    return {**figures, **placed.placement.figures()}
+    return {**figures, **projected.projection.figures()}
 
 
-def find_objects(placed: PlacedCloud, table: ClassTable, settings: Export) -> dict[str, list[MapObject]]:
+def find_objects(projected: ProjectedCloud, table: ClassTable, settings: Export) -> dict[str, list[Feature]]:
     """Buildings and trees of a labelled cloud, from north to south; InputError if its classes cannot tell
     them from the ground.
     """
-    kinds = split_kinds(placed.labels.label, table)
-    points = placed.points * placed.placement.unit  # all lengths below are meters
+    kinds = split_kinds(projected.labels.label, table)
+    points = projected.points * projected.projection.unit  # all lengths below are meters
     pixel = max(CELL * spacing_of_all(points), MIN_CELL)
     grid = Raster.around(points, pixel)
     ground = ground_height(points, kinds.ground, grid)
@@ -74,13 +74,13 @@ def find_objects(placed: PlacedCloud, table: ClassTable, settings: Export) -> di
     buildings = split_buildings(covered, roofs, grid, settings.min_area)
     canopy = canopy_height(points, kinds.tree, ground, grid)
     crowns = split_crowns(canopy, grid, settings.min_height)
-    draw = squared if settings.rectangular else simplified
+    draw = orthogonalized if settings.rectangular else simplified
     building_outlines = {
-        number: draw(outline, 2 * pixel) for number, outline in trace(buildings, grid).items()
+        number: draw(outline, 2 * pixel) for number, outline in polygonize(buildings, grid).items()
     }
     tree_outlines = {
         number: simplified(shapely.Polygon(outline.exterior), pixel)
-        for number, outline in trace(crowns, grid).items()
+        for number, outline in polygonize(crowns, grid).items()
     }
     tops = np.array(
         [np.quantile(canopy.ravel()[cells], TREE_TOP) for cells in cells_by_number(crowns, int(crowns.max()))]
@@ -99,9 +99,9 @@ def find_objects(placed: PlacedCloud, table: ClassTable, settings: Export) -> di
             roof_tops(buildings, roofs, pixel) - ground_of[0],
             ground_of[0],
             members[0],
-            (placed, table),
+            (projected, table),
         ),
-        "trees": _describe(tree_outlines, tops, ground_of[1], members[1], (placed, table)),
+        "trees": _describe(tree_outlines, tops, ground_of[1], members[1], (projected, table)),
     }
 
 
@@ -137,21 +137,21 @@ def _describe(
     heights: np.ndarray,
     ground: np.ndarray,
     members: np.ndarray,
-    cloud: tuple[PlacedCloud, ClassTable],
-) -> list[MapObject]:
+    cloud: tuple[ProjectedCloud, ClassTable],
+) -> list[Feature]:
     """Objects of numbered outlines in meters; members: (N,) int number of the object that each point belongs
     to, 0 = none.
     """
-    placed, table = cloud
-    unit = placed.placement.unit
+    projected, table = cloud
+    unit = projected.projection.unit
     objects = []
     for number, rows in enumerate(cells_by_number(members, len(heights)), start=1):
         polygon = outlines[number]
-        labels = np.bincount(placed.labels.label[rows], minlength=1)
+        labels = np.bincount(projected.labels.label[rows], minlength=1)
         label = int(np.argmax(labels))
-        confidence = float(placed.labels.confidence[rows].astype(np.float64).mean()) if len(rows) else 0.0
+        confidence = float(projected.labels.confidence[rows].astype(np.float64).mean()) if len(rows) else 0.0
         objects.append(
-            MapObject(
+            Feature(
                 polygon if unit == 1 else shapely.transform(polygon, lambda corners: corners / unit),
                 number,
                 table.name(label),

@@ -11,7 +11,7 @@ import open3d as o3d
 from tqdm import tqdm
 
 from sc3d.exporters.packages import load
-from sc3d.exporters.projected_cloud import PlacedCloud, read_placed_cloud
+from sc3d.exporters.projected_cloud import ProjectedCloud, read_projected_cloud
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raster import Raster, close_gaps, highest_points, spacing_of_all
 from sc3d.geometry.raycast import Surface
@@ -41,14 +41,14 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/orthophoto.tif` (RGB and alpha), `classes.tif` (ids, 0 = none, names and palette) and
     `height.tif` (float32 z, CRS), on one grid.
     """
-    placed = read_placed_cloud(scene, settings)
-    unit = placed.placement.unit
+    projected = read_projected_cloud(scene, settings)
+    unit = projected.projection.unit
     pixel = (
         settings.pixel_size
-        or round_to_digit(spacing_of_all(placed.points) * unit * (1 if scene.mesh.exists() else 2))
+        or round_to_digit(spacing_of_all(projected.points) * unit * (1 if scene.mesh.exists() else 2))
     ) / unit
-    grid = Raster.around(placed.points, pixel)
-    above = FromAbove.build(scene, placed, grid)
+    grid = Raster.around(projected.points, pixel)
+    view = OrthographicView.from_scene(scene, projected, grid)
     table = scene.class_table()
     color, classes, names, height = outputs(scene, settings)
     with (
@@ -56,7 +56,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
         atomic_path(classes) as class_file,
         atomic_path(height) as height_file,
     ):
-        covered = _fill(above, placed, table, (color_file, class_file, height_file))
+        covered = _fill(view, projected, table, (color_file, class_file, height_file))
         for file, resampling in (
             (color_file, enums.Resampling.average),
             (class_file, enums.Resampling.mode),
@@ -66,12 +66,13 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     with atomic_path(names) as temporary:
         temporary.write_text(category_names(table), encoding="utf-8")
     size = f"{grid.width} x {grid.height} px of {pixel:g} {'m' if unit == 1 else 'units'}"
-    return {"size": size, "covered": f"{covered:.1%}", **placed.placement.figures()}
+    return {"size": size, "covered": f"{covered:.1%}", **projected.projection.figures()}
 
 
 @dataclass(frozen=True)
-class FromAbove:
-    """What is looked at, in the CRS.
+class OrthographicView:
+    """A scene straight from above: the first surface under each cell of a grid, and the cloud point that says
+    what it is; all in the CRS.
 
     points: (N, 3) float64; highest: (H, W) int64 row of the highest point of each cell, tiny gaps closed, -1
         = none
@@ -89,16 +90,16 @@ class FromAbove:
     reach: float
 
     @classmethod
-    def build(cls, scene: Scene, placed: PlacedCloud, grid: Raster) -> FromAbove:
+    def from_scene(cls, scene: Scene, projected: ProjectedCloud, grid: Raster) -> OrthographicView:
         """The scene's mesh where there is one; the highest point of each cell where it has holes or does not
         exist.
         """
-        points = placed.points
+        points = projected.points
         highest = close_gaps(highest_points(grid, points), GAP)
         if not scene.mesh.exists():
             return cls(grid, points, highest, None, None, 0.0, 0.0)
         mesh = read_mesh(scene.mesh)
-        vertices = placed.placement.points(mesh.vertex.positions.numpy())
+        vertices = projected.projection.to_crs(mesh.vertex.positions.numpy())
         inside = points.min(axis=0), points.max(axis=0)
         origin = np.round(0.5 * (inside[0] + inside[1]))
         surface = Surface.from_mesh(vertices, mesh.triangle.indices.numpy(), origin)
@@ -112,8 +113,8 @@ class FromAbove:
             REACH * spacing_of_all(points),
         )
 
-    def look(self, first_row: int, num_rows: int) -> tuple[np.ndarray, np.ndarray]:
-        """A strip of the grid.
+    def render_rows(self, first_row: int, num_rows: int) -> tuple[np.ndarray, np.ndarray]:
+        """What some rows of the grid show.
 
         returns: (num_rows, W) float64 height, CRS, NaN = nothing there; (num_rows, W) int64 row of the point
             that tells color and class, -1 = none near
@@ -158,13 +159,15 @@ def category_names(table: ClassTable) -> str:
     return f'<PAMDataset><PAMRasterBand band="1"><CategoryNames>{names}</CategoryNames></PAMRasterBand></PAMDataset>\n'
 
 
-def _fill(above: FromAbove, placed: PlacedCloud, table: ClassTable, files: tuple[Path, Path, Path]) -> float:
+def _fill(
+    view: OrthographicView, projected: ProjectedCloud, table: ClassTable, files: tuple[Path, Path, Path]
+) -> float:
     """Write all pixels, strip by strip; returns the share of the cells that have a height."""
-    grid, covered = above.grid, 0
+    grid, covered = view.grid, 0
     with (
-        _open(files[0], placed, grid, count=4, dtype="uint8", predictor=2) as color,
-        _open(files[1], placed, grid, count=1, dtype="uint8", nodata=0) as classes,
-        _open(files[2], placed, grid, count=1, dtype="float32", predictor=3, nodata=NO_HEIGHT) as height,
+        _open(files[0], projected, grid, count=4, dtype="uint8", predictor=2) as color,
+        _open(files[1], projected, grid, count=1, dtype="uint8", nodata=0) as classes,
+        _open(files[2], projected, grid, count=1, dtype="float32", predictor=3, nodata=NO_HEIGHT) as height,
     ):
         color.colorinterp = [
             enums.ColorInterp.red,
@@ -180,11 +183,11 @@ def _fill(above: FromAbove, placed: PlacedCloud, table: ClassTable, files: tuple
             dataset.set_band_description(1, name)
         for first_row in tqdm(range(0, grid.height, TILE), desc="rendering maps", unit="strip", disable=None):
             num_rows = min(TILE, grid.height - first_row)
-            heights, rows = above.look(first_row, num_rows)
+            heights, rows = view.render_rows(first_row, num_rows)
             window = rasterio.windows.Window(0, first_row, grid.width, num_rows)
-            color.write(_colors(placed, rows), window=window)
+            color.write(_colors(projected, rows), window=window)
             classes.write(
-                np.where(rows >= 0, placed.labels.label[rows], 0).astype(np.uint8), 1, window=window
+                np.where(rows >= 0, projected.labels.label[rows], 0).astype(np.uint8), 1, window=window
             )
             height.write(
                 np.where(np.isfinite(heights), heights, NO_HEIGHT).astype(np.float32), 1, window=window
@@ -193,20 +196,20 @@ def _fill(above: FromAbove, placed: PlacedCloud, table: ClassTable, files: tuple
     return covered / (grid.height * grid.width)
 
 
-def _colors(placed: PlacedCloud, rows: np.ndarray) -> np.ndarray:
+def _colors(projected: ProjectedCloud, rows: np.ndarray) -> np.ndarray:
     """(4, h, w) uint8 red, green, blue, alpha of point rows (h, w); gray for clouds without colors."""
     image = np.full((4, *rows.shape), 128, np.uint8)
-    if placed.colors is not None:
-        image[:3] = placed.colors[rows].transpose(2, 0, 1)
+    if projected.colors is not None:
+        image[:3] = projected.colors[rows].transpose(2, 0, 1)
     image[3] = 255
     image[:, rows < 0] = 0
     return image
 
 
-def _open(file: Path, placed: PlacedCloud, grid: Raster, **profile: object):
+def _open(file: Path, projected: ProjectedCloud, grid: Raster, **profile: object):
     """Rasterio's writer."""
     transform = transforms.from_origin(grid.left, grid.top, grid.pixel, grid.pixel)
-    crs = placed.placement.crs
+    crs = projected.projection.crs
     return rasterio.open(
         file,
         "w",

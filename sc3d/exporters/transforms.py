@@ -8,7 +8,7 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.exporters.projected_cloud import write_place
+from sc3d.exporters.projected_cloud import copy_georeference
 from sc3d.geometry.cameras import View
 from sc3d.importers.nerfstudio import OPENGL, camera_parameters
 from sc3d.io.clouds import write_geometry
@@ -44,7 +44,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     points.point.colors = o3d.core.Tensor(scene.model.colors)
     if len(scene.model.points):
         write_geometry(path.with_name("sparse_pc.ply"), points)
-    write_place(scene, path.parent)
+    copy_georeference(scene, path.parent)
     write_json(
         path,
         {

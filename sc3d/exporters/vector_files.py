@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.exporters.packages import load
-from sc3d.exporters.projected_cloud import Placement
+from sc3d.exporters.projected_cloud import MapProjection
 from sc3d.io.atomic import atomic_path
 
 shapely = load("shapely")
@@ -22,7 +22,7 @@ DEGREES, METERS = 9, 3  # decimals of coordinates: 0.1 mm and 1 mm
 
 
 @dataclass(frozen=True)
-class MapObject:
+class Feature:
     """A building or a tree.
 
     polygon: shapely polygon in the CRS; number: from 1, per layer; name, label: its class; area: m2 of the
@@ -60,19 +60,19 @@ def has_geopackage() -> bool:
     return importlib.util.find_spec("pyogrio") is not None
 
 
-def write_geojson(path: Path, objects: list[MapObject], placement: Placement) -> None:
+def write_geojson(path: Path, objects: list[Feature], projection: MapProjection) -> None:
     """RFC 7946: longitude and latitude, WGS 84, outer rings counter-clockwise; without a CRS the scene's
     meters, which a member of the file says.
     """
     collection: dict[str, object] = {"type": "FeatureCollection", "name": path.stem}
-    if placement.crs is None:
+    if projection.crs is None:
         collection["coordinates"] = "meters in the scene's own frame, not on Earth"
     collection["features"] = [
         {
             "type": "Feature",
             "id": item.number,
             "properties": item.properties(),
-            "geometry": {"type": "Polygon", "coordinates": _rings(item, placement)},
+            "geometry": {"type": "Polygon", "coordinates": _rings(item, projection)},
         }
         for item in objects
     ]
@@ -80,7 +80,7 @@ def write_geojson(path: Path, objects: list[MapObject], placement: Placement) ->
         temporary.write_text(json.dumps(collection, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def write_geopackage(path: Path, layers: dict[str, list[MapObject]], placement: Placement) -> None:
+def write_geopackage(path: Path, layers: dict[str, list[Feature]], projection: MapProjection) -> None:
     """One layer per kind of object, in the CRS."""
     raw = load("pyogrio.raw")
     logging.getLogger("pyogrio").setLevel(logging.WARNING)  # it reports every layer
@@ -88,7 +88,7 @@ def write_geopackage(path: Path, layers: dict[str, list[MapObject]], placement: 
     with atomic_path(path) as temporary:
         for name, objects in layers.items():
             rows = [item.properties() for item in objects]
-            fields = list(MapObject(None, 0, "", 0, 0.0, 0.0, 0.0, 0.0, 0).properties())
+            fields = list(Feature(None, 0, "", 0, 0.0, 0.0, 0.0, 0.0, 0).properties())
             columns = [
                 np.array([row[field] for row in rows], types.get(field, np.float64)) for field in fields
             ]
@@ -101,20 +101,20 @@ def write_geopackage(path: Path, layers: dict[str, list[MapObject]], placement: 
                 layer=name,
                 driver="GPKG",
                 geometry_type="Polygon",
-                crs=placement.crs.to_wkt(),
+                crs=projection.crs.to_wkt(),
                 append=temporary.exists(),
             )
 
 
-def _rings(item: MapObject, placement: Placement) -> list[list[list[float]]]:
+def _rings(item: Feature, projection: MapProjection) -> list[list[list[float]]]:
     polygon = shapely.geometry.polygon.orient(item.polygon)
     decimals, forward = METERS, None
-    if placement.crs is not None:
+    if projection.crs is not None:
         import pyproj
 
         decimals, forward = (
             DEGREES,
-            pyproj.Transformer.from_crs(placement.crs, "EPSG:4326", always_xy=True).transform,
+            pyproj.Transformer.from_crs(projection.crs, "EPSG:4326", always_xy=True).transform,
         )
     rings = [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
     return [
