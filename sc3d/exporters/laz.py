@@ -39,16 +39,15 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     scene's frame without one.
     """
     ids, codes = sorted(chosen_classes(scene, settings)), asprs_codes(scene.class_table())
-    low, high, counts, projected = np.full(3, np.inf), np.full(3, -np.inf), np.zeros(256, np.int64), None
+    low, high, counts = np.full(3, np.inf), np.full(3, -np.inf), np.zeros(256, np.int64)
+    projected: ProjectedCloud | None = None
     for projected in projected_chunks(scene, settings):
-        rows = np.isin(projected.labels.label, ids)
-        if rows.any():
-            low, high = (
-                np.minimum(low, projected.points[rows].min(axis=0)),
-                np.maximum(high, projected.points[rows].max(axis=0)),
-            )
+        rows = np.flatnonzero(np.isin(projected.labels.label, ids))
+        if len(rows):
+            low = np.minimum(low, projected.points[rows].min(axis=0))
+            high = np.maximum(high, projected.points[rows].max(axis=0))
         counts += np.bincount(codes[projected.labels.label[rows]], minlength=256)
-    if not counts.any():
+    if projected is None or not counts.any():
         raise InputError(f"no point has one of the classes {', '.join(settings.classes)}: nothing to write")
     header, projection = make_header(low, high, projected), projected.projection
     with (

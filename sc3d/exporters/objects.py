@@ -4,21 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.exporters.buildings import roof_heights, roof_tops, split_buildings
+from sc3d.exporters.packages import load
 from sc3d.exporters.polygonize import orthogonalized, polygonize, simplified
 from sc3d.exporters.projected_cloud import ProjectedCloud, find_projection, read_projected_cloud
 from sc3d.exporters.regions import cells_by_number
 from sc3d.exporters.terrain import ground_height
 from sc3d.exporters.trees import canopy_height, split_crowns
-from sc3d.exporters.vector_files import Feature, has_geopackage, shapely, write_geojson, write_geopackage
+from sc3d.exporters.vector_files import Feature, has_geopackage, write_geojson, write_geopackage
 from sc3d.geometry.raster import Raster, spacing_of_all
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
+
+if TYPE_CHECKING:
+    import shapely
+else:
+    shapely = load("shapely")
 
 LAYERS = ("buildings", "trees")
 CELL = 1.5  # side of the cells, in point spacings
@@ -38,6 +45,23 @@ class Kinds:
     ground: np.ndarray
 
 
+@dataclass(frozen=True)
+class Site:
+    """A labelled cloud and what is known of it on a grid; all lengths are meters.
+
+    points: (N, 3) CRS; ground: (H, W) z of the ground; above: (N,) bool, points as high above it as a building
+        or tree
+    """
+
+    projected: ProjectedCloud
+    table: ClassTable
+    points: np.ndarray
+    kinds: Kinds
+    grid: Raster
+    ground: np.ndarray
+    above: np.ndarray
+
+
 def outputs(scene: Scene, settings: Export) -> list[Path]:
     crs = find_projection(scene, settings).crs
     paths = [scene.export / f"{layer}{'' if crs else '_local'}.geojson" for layer in LAYERS]
@@ -55,7 +79,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
         write_geojson(path, layers[layer], projected.projection)
     if len(paths) > len(LAYERS):
         write_geopackage(paths[-1], layers, projected.projection)
-    figures = {layer: len(layers[layer]) for layer in LAYERS}
+    figures: dict[str, object] = {layer: len(layers[layer]) for layer in LAYERS}
     figures |= {f"{layer}_area": f"{sum(item.area for item in layers[layer]):.0f} m2" for layer in LAYERS}
     return {**figures, **projected.projection.figures()}
 
@@ -65,44 +89,43 @@ def find_objects(projected: ProjectedCloud, table: ClassTable, settings: Export)
     them from the ground.
     """
     kinds = split_kinds(projected.labels.label, table)
-    points = projected.points * projected.projection.unit  # all lengths below are meters
-    pixel = max(CELL * spacing_of_all(points), MIN_CELL)
-    grid = Raster.around(points, pixel)
+    points = projected.points * projected.projection.unit
+    grid = Raster.around(points, max(CELL * spacing_of_all(points), MIN_CELL))
     ground = ground_height(points, kinds.ground, grid)
     above = points[:, 2] >= ground.ravel()[grid.flat_cells(points)] + settings.min_height
-    covered, roofs = roof_heights(points, kinds.building, above, grid)
+    site = Site(projected, table, points, kinds, grid, ground, above)
+    return {"buildings": _find_buildings(site, settings), "trees": _find_trees(site, settings)}
+
+
+def _find_buildings(site: Site, settings: Export) -> list[Feature]:
+    grid, is_building = site.grid, site.kinds.building
+    covered, roofs = roof_heights(site.points, is_building, site.above, grid)
     buildings = split_buildings(covered, roofs, grid, settings.min_area)
-    canopy = canopy_height(points, kinds.tree, ground, grid)
-    crowns = split_crowns(canopy, grid, settings.min_height)
     draw = orthogonalized if settings.rectangular else simplified
-    building_outlines = {
-        number: draw(outline, 2 * pixel) for number, outline in polygonize(buildings, grid).items()
+    outlines = {
+        number: draw(traced, 2 * grid.pixel) for number, traced in polygonize(buildings, grid).items()
     }
-    tree_outlines = {
-        number: simplified(shapely.Polygon(outline.exterior), pixel)
-        for number, outline in polygonize(crowns, grid).items()
+    ground = _quantiles(site.ground, buildings, 0.5)
+    heights = roof_tops(buildings, roofs, grid.pixel) - ground
+    return _features(site, buildings, is_building, outlines, (heights, ground))
+
+
+def _find_trees(site: Site, settings: Export) -> list[Feature]:
+    grid, is_tree = site.grid, site.kinds.tree
+    canopy = canopy_height(site.points, is_tree, site.ground, grid)
+    crowns = split_crowns(canopy, grid, settings.min_height)
+    outlines = {
+        number: simplified(shapely.Polygon(traced.exterior), grid.pixel)
+        for number, traced in polygonize(crowns, grid).items()
     }
-    tops = np.array(
-        [np.quantile(canopy.ravel()[cells], TREE_TOP) for cells in cells_by_number(crowns, int(crowns.max()))]
-    )
-    ground_of = [
-        np.array([np.median(ground.ravel()[cells]) for cells in cells_by_number(regions, int(regions.max()))])
-        for regions in (buildings, crowns)
-    ]
-    members = [
-        np.where(chosen, regions.ravel()[grid.flat_cells(points)], 0)
-        for regions, chosen in ((buildings, kinds.building & above), (crowns, kinds.tree & above))
-    ]
-    return {
-        "buildings": _describe(
-            building_outlines,
-            roof_tops(buildings, roofs, pixel) - ground_of[0],
-            ground_of[0],
-            members[0],
-            (projected, table),
-        ),
-        "trees": _describe(tree_outlines, tops, ground_of[1], members[1], (projected, table)),
-    }
+    heights, ground = _quantiles(canopy, crowns, TREE_TOP), _quantiles(site.ground, crowns, 0.5)
+    return _features(site, crowns, is_tree, outlines, (heights, ground))
+
+
+def _quantiles(values: np.ndarray, regions: np.ndarray, share: float) -> np.ndarray:
+    """(R,) float64 quantile of the values (H, W) in each of the regions (H, W) numbered from 1."""
+    cells = cells_by_number(regions, int(regions.max()))
+    return np.array([np.quantile(values.ravel()[region], share) for region in cells])
 
 
 def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
@@ -132,35 +155,26 @@ def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
     return Kinds(building, tree, ground)
 
 
-def _describe(
-    outlines: dict,
-    heights: np.ndarray,
-    ground: np.ndarray,
-    members: np.ndarray,
-    cloud: tuple[ProjectedCloud, ClassTable],
+def _features(
+    site: Site,
+    regions: np.ndarray,
+    chosen: np.ndarray,
+    outlines: dict[int, shapely.Polygon],
+    heights: tuple[np.ndarray, np.ndarray],
 ) -> list[Feature]:
-    """Objects of numbered outlines in meters; members: (N,) int number of the object that each point belongs
-    to, 0 = none.
+    """Features of the regions (H, W) numbered from 1; chosen: (N,) bool points of their kind; outlines: m;
+    heights: (R,) of the top above the ground and z of the ground, m.
     """
-    projected, table = cloud
-    unit = projected.projection.unit
-    objects = []
-    for number, rows in enumerate(cells_by_number(members, len(heights)), start=1):
-        polygon = outlines[number]
-        labels = np.bincount(projected.labels.label[rows], minlength=1)
-        label = int(np.argmax(labels))
-        confidence = float(projected.labels.confidence[rows].astype(np.float64).mean()) if len(rows) else 0.0
-        objects.append(
-            Feature(
-                polygon if unit == 1 else shapely.transform(polygon, lambda corners: corners / unit),
-                number,
-                table.name(label),
-                label,
-                polygon.area,
-                float(heights[number - 1]),
-                float(ground[number - 1]),
-                confidence,
-                len(rows),
-            )
+    cloud, unit = site.projected, site.projected.projection.unit
+    members = np.where(chosen & site.above, regions.ravel()[site.grid.flat_cells(site.points)], 0)
+    features = []
+    for number, rows in enumerate(cells_by_number(members, int(regions.max())), start=1):
+        outline, label = outlines[number], int(np.argmax(np.bincount(cloud.labels.label[rows], minlength=1)))
+        polygon = outline if unit == 1 else shapely.transform(outline, lambda corners: corners / unit)
+        height, ground = (float(values[number - 1]) for values in heights)
+        confidence = float(cloud.labels.confidence[rows].astype(np.float64).mean()) if len(rows) else 0.0
+        name = site.table.name(label)
+        features.append(
+            Feature(polygon, number, name, label, outline.area, height, ground, confidence, len(rows))
         )
-    return objects
+    return features

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -69,25 +70,39 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     return {"size": size, "covered": f"{covered:.1%}", **projected.projection.figures()}
 
 
+class MeshBelow(NamedTuple):
+    """A mesh, looked down at. neighbors: over the points of the cloud; top: z from which rays go down; reach: largest
+    distance between surface and point; both in units of the CRS.
+    """
+
+    surface: Surface
+    neighbors: NeighborIndex
+    top: float
+    reach: float
+
+    def cast(self, grid: Raster, first_row: int, num_rows: int) -> np.ndarray:
+        """(num_rows * W,) float64 z of the mesh under the cell centers, CRS; NaN where rays hit nothing."""
+        origin = self.surface.origin
+        rays = np.zeros((num_rows * grid.width, 6), np.float32)
+        rays[:, :2] = grid.centers(first_row, num_rows) - origin[:2]
+        rays[:, 2], rays[:, 5] = self.top - origin[2], -1.0
+        distance = self.surface.scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy().astype(np.float64)
+        return np.where(np.isfinite(distance), np.float64(rays[0, 2]) - distance + origin[2], np.nan)
+
+
 @dataclass(frozen=True)
 class OrthographicView:
     """A scene straight from above: the first surface under each cell of a grid, and the cloud point that says
     what it is; all in the CRS.
 
     points: (N, 3) float64; highest: (H, W) int64 row of the highest point of each cell, tiny gaps closed, -1
-        = none
-    surface, index: of the mesh, and over the points; None for a bare cloud
-    start: z from which rays go down; reach: largest distance between surface and point, both in units of the
-        CRS
+        = none; mesh: None for a bare cloud
     """
 
     grid: Raster
     points: np.ndarray
     highest: np.ndarray
-    surface: Surface | None
-    index: NeighborIndex | None
-    start: float
-    reach: float
+    mesh: MeshBelow | None = None
 
     @classmethod
     def from_scene(cls, scene: Scene, projected: ProjectedCloud, grid: Raster) -> OrthographicView:
@@ -97,21 +112,13 @@ class OrthographicView:
         points = projected.points
         highest = close_gaps(highest_points(grid, points), GAP)
         if not scene.mesh.exists():
-            return cls(grid, points, highest, None, None, 0.0, 0.0)
+            return cls(grid, points, highest)
         mesh = read_mesh(scene.mesh)
         vertices = projected.projection.to_crs(mesh.vertex.positions.numpy())
-        inside = points.min(axis=0), points.max(axis=0)
-        origin = np.round(0.5 * (inside[0] + inside[1]))
+        origin = np.round(0.5 * (points.min(axis=0) + points.max(axis=0)))
         surface = Surface.from_mesh(vertices, mesh.triangle.indices.numpy(), origin)
-        return cls(
-            grid,
-            points,
-            highest,
-            surface,
-            NeighborIndex(points),
-            float(vertices[:, 2].max()) + 1.0,
-            REACH * spacing_of_all(points),
-        )
+        top, reach = float(vertices[:, 2].max()) + 1.0, REACH * spacing_of_all(points)
+        return cls(grid, points, highest, MeshBelow(surface, NeighborIndex(points), top, reach))
 
     def render_rows(self, first_row: int, num_rows: int) -> tuple[np.ndarray, np.ndarray]:
         """What some rows of the grid show.
@@ -121,28 +128,17 @@ class OrthographicView:
         """
         rows = self.highest[first_row : first_row + num_rows].copy()
         heights = np.where(rows >= 0, self.points[rows, 2], np.nan)
-        if self.surface is None:
+        if self.mesh is None:
             return heights, rows
-        below = self._cast(first_row, num_rows)
-        hit = np.isfinite(below).reshape(rows.shape)
-        centers = np.concatenate([self.grid.centers(first_row, num_rows), below[:, None]], axis=1)[
-            hit.ravel()
-        ]
+        below = self.mesh.cast(self.grid, first_row, num_rows)
+        hit = np.isfinite(below)
+        centers = np.column_stack([self.grid.centers(first_row, num_rows), below])[hit]
         if len(centers):
-            nearest, distance = self.index.nearest(centers, 1)
-            rows[hit] = np.where(distance[:, 0] <= self.reach, nearest[:, 0], -1)
+            hit = hit.reshape(rows.shape)
+            nearest, distance = self.mesh.neighbors.nearest(centers, 1)
+            rows[hit] = np.where(distance[:, 0] <= self.mesh.reach, nearest[:, 0], -1)
             heights[hit] = centers[:, 2]
         return heights, rows
-
-    def _cast(self, first_row: int, num_rows: int) -> np.ndarray:
-        """(num_rows * W,) float64 z of the mesh under the cell centers, CRS; NaN where rays hit nothing."""
-        rays = np.zeros((num_rows * self.grid.width, 6), np.float32)
-        rays[:, :2] = self.grid.centers(first_row, num_rows) - self.surface.origin[:2]
-        rays[:, 2], rays[:, 5] = self.start - self.surface.origin[2], -1.0
-        distance = self.surface.scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy().astype(np.float64)
-        return np.where(
-            np.isfinite(distance), np.float64(rays[0, 2]) - distance + self.surface.origin[2], np.nan
-        )
 
 
 def round_to_digit(length: float) -> float:

@@ -4,12 +4,19 @@ fits (shapely, rasterio).
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from sc3d.exporters.packages import load
 from sc3d.geometry.raster import Raster
 
-features, transforms, shapely = load("rasterio.features"), load("rasterio.transform"), load("shapely")
+if TYPE_CHECKING:
+    import shapely
+else:
+    shapely = load("shapely")
+
+features, transforms = load("rasterio.features"), load("rasterio.transform")
 
 MIN_IOU = 0.9  # IoU that a rectangular outline must have with the traced one, or it is not used
 

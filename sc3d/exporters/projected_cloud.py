@@ -164,7 +164,7 @@ def projected_chunks(scene: Scene, settings: Export) -> Iterator[ProjectedCloud]
     for _, records in CloudFile.open(path).chunks():
         cloud = o3d.t.geometry.PointCloud(positions(records))
         for name in ("label", "confidence", "state", "num_views"):
-            if name in records.dtype.names:
+            if name in (records.dtype.names or ()):
                 cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(records[name])[:, None])
         colors = columns(records, ("red", "green", "blue"))
         if colors is not None:

@@ -62,9 +62,8 @@ def tree_tops(heights: np.ndarray, tall: np.ndarray, pixel: float) -> np.ndarray
     their height, 0 elsewhere; equal heights are decided by place.
     """
     order = np.lexsort((np.arange(heights.size), np.where(tall, heights, -np.inf).ravel()))
-    rank = np.empty(heights.size, np.int64)
-    rank[order] = np.arange(heights.size)
-    rank = rank.reshape(heights.shape)
+    rank = np.empty(heights.shape, np.int64)
+    rank.ravel()[order] = np.arange(heights.size)
     rows, columns = np.nonzero(tall & (ndimage.maximum_filter(rank, 3, mode="nearest") == rank))
     radius = np.rint(0.5 * crown_width(heights[rows, columns]) / pixel).astype(np.int64)
     is_top = np.zeros(len(rows), bool)

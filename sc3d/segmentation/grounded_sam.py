@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -82,11 +82,11 @@ class GroundedSam(PromptedSegmenter):
         )
 
     @cached_property
-    def _detector(self) -> torch.nn.Module:
+    def _detector(self) -> Any:
         return load_model(self.detector_path, _DETECTORS, self._device)
 
     @cached_property
-    def _segmenter(self) -> torch.nn.Module:
+    def _segmenter(self) -> Any:
         return load_model(self.segmenter_path, _SEGMENTERS, self._device)
 
     @cached_property
@@ -183,7 +183,7 @@ def _detector_sides(path: Path) -> tuple[int, int]:
     return _SIDES
 
 
-def _image_side(segmenter: torch.nn.Module) -> int:
+def _image_side(segmenter: Any) -> int:
     """Side of the square image that a SAM model takes, px."""
     size = segmenter.config.prompt_encoder_config.image_size
     return int(size if isinstance(size, int) else size[0])

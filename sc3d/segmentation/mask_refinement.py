@@ -116,7 +116,9 @@ class Refinement:
 
     def confidence(self, view: View, read: ReadMask) -> np.ndarray:
         """(H, W) uint8 new confidence of a mask."""
-        return _doubted(self.inputs, self.labels, view, read)[1]
+        mask, confidence = read(view)
+        seen = self.inputs.render(self.labels, view, mask.shape[::-1])
+        return downweight_conflicts(mask, confidence, *seen)
 
 
 def refine_scene(scene: Scene, settings: Segment) -> Refinement:

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -228,7 +228,7 @@ def inference(device: str, half: bool) -> Iterator[None]:
         yield
 
 
-def load_model(path: Path, classes: dict[str, str], device: str) -> torch.nn.Module:
+def load_model(path: Path, classes: dict[str, str], device: str) -> Any:
     """Load a model for inference: safetensors only, from this machine only; InputError if the weights are
     damaged or incomplete.
 
@@ -335,7 +335,8 @@ def _sources(present: torch.Tensor, length: int) -> tuple[torch.Tensor, torch.Te
     high = (low + 1).clamp(max=number - 1)
     touched = torch.nonzero(there[low] | there[high])[:, 0]
     part = slice(int(touched[0]), int(touched[-1]) + 1) if len(touched) else slice(0, 0)
-    return *(values[part].to(present.device) for values in (low, high, (places - low).float())), part.start
+    low, high, weight = (values[part].to(present.device) for values in (low, high, (places - low).float()))
+    return low, high, weight, part.start
 
 
 def outline(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> np.ndarray:

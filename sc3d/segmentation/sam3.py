@@ -5,7 +5,7 @@ pass.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -38,7 +38,7 @@ class _Concept(NamedTuple):
     """A prompt as the model reads it: its text features, and which of its (1, T) tokens are no padding."""
 
     prompt: Prompt
-    features: object
+    features: Any
     attention_mask: torch.Tensor
 
 
@@ -77,7 +77,7 @@ class Sam3(PromptedSegmenter):
         return Findings(instances, areas)
 
     @cached_property
-    def _model(self) -> torch.nn.Module:
+    def _model(self) -> Any:
         return load_model(self.path, _MODELS, self._device)
 
     @cached_property
@@ -104,7 +104,7 @@ class Sam3(PromptedSegmenter):
         return concepts
 
     def _instances(
-        self, output: object, presence: float, prompt: Prompt, shape: tuple[int, int]
+        self, output: Any, presence: float, prompt: Prompt, shape: tuple[int, int]
     ) -> list[Instance]:
         """Instances of one concept whose score, query probability x presence, exceeds the box threshold."""
         scores = output.pred_logits[0].float().sigmoid().cpu().numpy() * presence

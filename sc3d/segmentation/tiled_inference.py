@@ -110,7 +110,7 @@ def join_tiles(found: list[list[Instance]], windows: list[Window]) -> list[Tiled
     """Objects from the instances of each tile, in pixels of the photo, by rules 3 and 4."""
     parts = [(tile, instance) for tile, instances in enumerate(found) for instance in instances]
     first = np.cumsum([0, *map(len, found)])
-    group, linked = list(range(len(parts))), set()
+    group, linked = list(range(len(parts))), set[int]()
 
     def root(number: int) -> int:
         while group[number] != number:

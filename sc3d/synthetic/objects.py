@@ -184,8 +184,8 @@ def add_car(builder: MeshBuilder, position: np.ndarray, yaw: float, rng: np.rand
     tint = linear(CAR_TINTS[rng.integers(len(CAR_TINTS))])
     length, width = rng.uniform(2.0, 2.35), rng.uniform(0.85, 0.95)
     for x in (-0.62 * length, 0.62 * length):
-        low, high = (x - 0.33, -width - 0.02, -0.15), (x + 0.33, width + 0.02, 0.62)
-        builder.box(pose, low, high, paint, np.full(3, 0.008))
+        axle = (x - 0.33, -width - 0.02, -0.15), (x + 0.33, width + 0.02, 0.62)
+        builder.box(pose, *axle, paint, np.full(3, 0.008))
     builder.box(pose, (-length, -width, 0.22), (length, width, 0.82), paint, tint)
     low = np.array([[-0.72, -0.92], [0.42, -0.92], [0.42, 0.92], [-0.72, 0.92]]) * [length, width]
     high = np.array([[-0.55, -0.8], [0.18, -0.8], [0.18, 0.8], [-0.55, 0.8]]) * [length, width]

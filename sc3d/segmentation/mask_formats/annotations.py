@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class PhotoAnnotations:
 
     origin: str
     photos: tuple[str, ...]
-    size: tuple[object, object] | None
+    size: tuple[Any, Any] | None
     annotations: tuple[Annotation, ...]
     smaller_on_top: bool = False
 
@@ -73,7 +74,7 @@ def _build(
     annotation: Annotation, size: tuple[int, int], photo: PhotoAnnotations, checks: Checks
 ) -> Polygons | RunLengths | None:
     try:
-        return annotation.build(size)
+        return annotation.build(size) if annotation.build else None
     except OutlineError as error:
         text = str(error)
     except (ValueError, TypeError, KeyError, OverflowError):

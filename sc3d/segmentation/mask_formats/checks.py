@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
+from typing import Any
 
 import numpy as np
 
@@ -81,7 +82,7 @@ class Checks:
             )
         return found.pop() if len(found) == 1 else None
 
-    def size(self, name: str, stated: tuple[object, object] | None, origin: str) -> tuple[int, int] | None:
+    def size(self, name: str, stated: tuple[Any, Any] | None, origin: str) -> tuple[int, int] | None:
         """(width, height) px of the mask of a photo: as stated if that fits the photo, the photo's own if
         nothing is stated.
         """

@@ -106,7 +106,7 @@ def _outline(tag: str, attributes: dict[str, str], size: tuple[int, int]) -> Pol
         return ellipse(
             [attributes["cx"], attributes["cy"]], [attributes["rx"], attributes["ry"]], rotation, size
         )
-    box = tuple(int(attributes[key]) for key in ("left", "top", "width", "height"))
-    if min(box) < 0 or max(box) > max(size):
+    left, top, width, height = (int(attributes[key]) for key in ("left", "top", "width", "height"))
+    if min(left, top, width, height) < 0 or max(left, top, width, height) > max(size):
         raise OutlineError("lies outside of the image")
-    return run_lengths(attributes["rle"].split(","), box, False, size)
+    return run_lengths(attributes["rle"].split(","), (left, top, width, height), False, size)

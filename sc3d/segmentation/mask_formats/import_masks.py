@@ -73,7 +73,7 @@ def import_masks(
     if scene_confidence is not None:
         _check_target(confidence, scene_confidence)
     with ExitStack() as folders:  # all is written before anything replaces what is there
-        if maps and confidence.resolve() != scene_confidence.resolve():
+        if maps and confidence and scene_confidence and confidence.resolve() != scene_confidence.resolve():
             _copy(maps, folders.enter_context(atomic_path(scene_confidence)))
         if not in_place:  # in place, they are already there and checked
             _draw(masks, folders.enter_context(atomic_path(scene_masks)))

@@ -36,7 +36,11 @@ def read_labelme(file: Path) -> Iterator[PhotoAnnotations]:
     """The annotations of a LabelMe file; the photo is found by its imagePath, or else by the file's own name."""
     content = read_json(file)
     shapes = content.get("shapes") if isinstance(content, dict) else None
-    if not isinstance(shapes, list) or not all(isinstance(shape, dict) for shape in shapes):
+    if (
+        not isinstance(content, dict)
+        or not isinstance(shapes, list)
+        or not all(isinstance(shape, dict) for shape in shapes)
+    ):
         raise InputError(f"{file} is not a LabelMe file: it has no list of shapes")
     size = (content.get("imageWidth"), content.get("imageHeight"))
     path = content.get("imagePath")

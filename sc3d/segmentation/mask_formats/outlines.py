@@ -24,6 +24,8 @@ import numpy as np
 CROSSINGS_AT_ONCE = 1 << 20  # of edges and rows
 MAX_SAGITTA = 0.02  # px by which the polygon that stands for an ellipse may miss it
 
+Values = Sequence | np.ndarray  # numbers, or texts of numbers, as a file holds them
+
 
 class OutlineError(ValueError):
     """A region that cannot be drawn; the text completes "the region ..."."""
@@ -68,7 +70,7 @@ class MaskCrop:
         )
 
 
-def polygons(rings: Iterable[Sequence], size: tuple[int, int]) -> Polygons:
+def polygons(rings: Iterable[Values], size: tuple[int, int]) -> Polygons:
     """Build polygons from coordinates, each ring (N, 2) or x, y, x, y, ...; size: (width, height) px of the
     image.
     """
@@ -89,7 +91,7 @@ def polygons(rings: Iterable[Sequence], size: tuple[int, int]) -> Polygons:
     return Polygons(checked)
 
 
-def _ring(ring: Sequence, size: tuple[int, int]) -> np.ndarray:
+def _ring(ring: Values, size: tuple[int, int]) -> np.ndarray:
     points = numbers(ring)
     if points.size % 2 or points.size < 6:
         raise OutlineError("is a polygon of fewer than three points")
@@ -100,36 +102,26 @@ def _ring(ring: Sequence, size: tuple[int, int]) -> np.ndarray:
     return points
 
 
-def rectangle(corner: Sequence, opposite: Sequence, rotation: float, size: tuple[int, int]) -> Polygons:
+def rectangle(corner: Values, opposite: Values, rotation: float, size: tuple[int, int]) -> Polygons:
     """A rectangle from two opposite corners, turned by `rotation` degrees (clockwise as seen) around its
     center.
     """
     (x0, y0), (x1, y1) = numbers(corner), numbers(opposite)
-    return polygons(
-        [_turn(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), ((x0 + x1) / 2, (y0 + y1) / 2), rotation)],
-        size,
-    )
+    points = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    return polygons([_turn(points, ((x0 + x1) / 2, (y0 + y1) / 2), rotation)], size)
 
 
-def ellipse(center: Sequence, radii: Sequence, rotation: float, size: tuple[int, int]) -> Polygons:
+def ellipse(center: Values, radii: Values, rotation: float, size: tuple[int, int]) -> Polygons:
     """An ellipse with half axes `radii` px, turned by `rotation` degrees (clockwise as seen) around its
     center.
     """
-    (x, y), radii = numbers(center), numbers(radii)
-    if not (radii > 0).all() or (radii > 3 * max(size)).any():
+    (x, y), half = numbers(center), numbers(radii)
+    if not (half > 0).all() or (half > 3 * max(size)).any():
         raise OutlineError("is an ellipse whose radii do not fit the image")
-    num_points = max(16, math.ceil(math.pi / math.acos(1 - min(MAX_SAGITTA / radii.max(), 0.1))))
+    num_points = max(16, math.ceil(math.pi / math.acos(1 - min(MAX_SAGITTA / half.max(), 0.1))))
     angle = np.arange(num_points) * (2 * np.pi / num_points)
-    return polygons(
-        [
-            _turn(
-                np.stack([x + radii[0] * np.cos(angle), y + radii[1] * np.sin(angle)], axis=1),
-                (x, y),
-                rotation,
-            )
-        ],
-        size,
-    )
+    points = np.stack([x + half[0] * np.cos(angle), y + half[1] * np.sin(angle)], axis=1)
+    return polygons([_turn(points, (x, y), rotation)], size)
 
 
 def _turn(points: np.ndarray, center: tuple[float, float], degrees: float) -> np.ndarray:
@@ -138,7 +130,7 @@ def _turn(points: np.ndarray, center: tuple[float, float], degrees: float) -> np
 
 
 def run_lengths(
-    counts: Sequence, box: tuple[int, int, int, int], by_column: bool, size: tuple[int, int]
+    counts: Values, box: tuple[int, int, int, int], by_column: bool, size: tuple[int, int]
 ) -> RunLengths:
     """Build a run-length code; the sum of the counts is checked before anything of that size exists."""
     left, top, width, height = box
@@ -162,7 +154,7 @@ def row_lengths(mask: np.ndarray) -> np.ndarray:
     return np.diff(changes, prepend=0, append=flat.size)
 
 
-def numbers(values: Sequence) -> np.ndarray:
+def numbers(values: Values) -> np.ndarray:
     """(...) float64 of decoded numbers or texts of numbers; OutlineError unless all are finite."""
     try:
         array = np.array(values, np.float64)

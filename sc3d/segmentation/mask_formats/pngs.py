@@ -26,7 +26,7 @@ def check_png(file: Path, colored: bool, checks: Checks) -> Iterator[tuple[str, 
     """The photo and mask of a PNG, after a look at all its pixels; mismatches go to `checks`."""
     name = checks.photo((file.name,), str(file))
     size = None if name is None else checks.size(name, image_size(file), str(file))
-    if size is None:
+    if name is None or size is None:
         return
     codes = _read_colors(file) if colored else _read_ids(file, checks.classes)
     unknown = (checks.classes.by_color if colored else checks.classes.by_id)[codes] == UNKNOWN

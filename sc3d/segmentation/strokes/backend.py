@@ -295,8 +295,9 @@ def _shrunk_size(width: int, height: int, max_size: int) -> tuple[int, int]:
 
 def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
     """(h, w, 3) uint8 photo whose longest side is at most `max_size` px."""
-    size = _shrunk_size(*image.shape[1::-1], max_size)
-    return image if size == image.shape[1::-1] else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    height, width = image.shape[:2]
+    size = _shrunk_size(width, height, max_size)
+    return image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def _check_packages() -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
+from typing import Any
 
 import cv2
 import numpy as np
@@ -122,14 +123,14 @@ def parse_shapes(
     origin: names the file in messages; size: (width, height) px of the photo
     """
     shapes = content.get("shapes") if isinstance(content, dict) else None
-    if not isinstance(shapes, list):
+    if not isinstance(content, dict) or not isinstance(shapes, list):
         raise InputError(f"{origin} is not a LabelMe file: it has no list of shapes")
-    stated = (content.get("imageWidth"), content.get("imageHeight"))
+    stated: tuple[Any, Any] = (content.get("imageWidth"), content.get("imageHeight"))
     scale = 1.0
     if stated != (None, None):
         if not all(isinstance(side, int) and 0 < side < _MAX_COORDINATE for side in stated):
             raise InputError(f"{origin}: imageWidth and imageHeight must be whole numbers of px")
-        check_mask_aspect(Path(str(origin)), stated, size)
+        check_mask_aspect(origin, stated, size)
         scale = max(size) / max(stated)
     ids = {entry.name: entry.id for entry in class_table} | {BACKGROUND: 0}
     return tuple(
