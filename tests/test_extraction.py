@@ -8,8 +8,9 @@ import torch
 
 from sc3d.errors import Sc3dError
 from sc3d.extraction import DepthViews, center_cloud, extract_surface, wanted_coverage
-from sc3d.geometry.cameras import look_at, pinhole_view
+from sc3d.geometry.cameras import look_at, pinhole_view, rays
 from sc3d.settings.reconstruction import Extract
+from sc3d.splatting.consistency import blocking
 from sc3d.splatting.gaussians import Gaussians
 
 STEP = 0.1
@@ -82,36 +83,17 @@ def test_centers_with_colors_and_normals_towards_the_cameras():
 
 
 def test_a_point_before_a_surface_that_others_see_is_blocked():
-    from sc3d.splatting.consistency import blocking
-
     view, *others = views()[:3]
-    flat = [
-        torch.from_numpy(
-            (
-                other.center[2]
-                / -(
-                    np.linalg.inv(other.matrix)
-                    @ np.concatenate(
-                        [
-                            np.stack(np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5), -1),
-                            np.ones((120, 160, 1)),
-                        ],
-                        -1,
-                    )[..., None]
-                )[..., 0].dot(
-                    # depth of the plane z = 0
-                    other.cam_from_world[:3, 2]
-                )
-            ).astype(np.float32)
-        )
-        for other in (view, *others)
-    ]
+    flat = []
+    for each in (view, *others):  # depth of the plane z = 0
+        directions, along = rays(each)
+        flat.append(np.float32(-each.center[2] / directions[:, 2] * along).reshape(120, 160))
     sure = list(zip(flat[1:], others, strict=True))
-    on_plane = blocking(flat[0], view, sure, 0.03).numpy()
-    floating = blocking(0.8 * flat[0], view, sure, 0.03).numpy()
+    on_plane = blocking(flat[0], view, sure, 0.03)
+    floating = blocking(0.8 * flat[0], view, sure, 0.03)
     assert on_plane.max() == 0
     assert (floating[40:80, 60:100] == 2).all()
-    assert blocking(0.8 * flat[0], view, [(torch.zeros_like(flat[1]), others[0])], 0.03).numpy().max() == 0
+    assert blocking(0.8 * flat[0], view, [(np.zeros_like(flat[1]), others[0])], 0.03).max() == 0
 
 
 def test_only_flights_that_look_one_way_are_filled_without_limit():

@@ -11,8 +11,7 @@ from sc3d.exporters.masks import render_mask
 from sc3d.exporters.projected_cloud import MapProjection, chosen_classes, find_projection
 from sc3d.geometry.cameras import undistorted
 from sc3d.geometry.neighbors import NeighborIndex
-from sc3d.io.atomic import atomic_path
-from sc3d.io.ply import read_records, write_records
+from sc3d.io.splats import origin_comment, write_splat_ply
 from sc3d.scene.labelled_cloud import REACH, LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
@@ -93,30 +92,15 @@ def write_splats(path: Path, splats: DisplaySplats, projection: MapProjection) -
     """3DGS PLY with two more properties, which viewers ignore; positions stay in the local frame, comments
     say where it lies.
     """
-    comments = ["sc3d origin " + " ".join(f"{value:.3f}" for value in splats.origin)]
+    comments = [origin_comment(splats.origin)]
     if projection.crs is not None:
         comments.append(
             f"sc3d EPSG:{projection.epsg} origin "
             + " ".join(f"{value:.3f}" for value in origin_in_crs(splats, projection))
         )
     comments += [f"sc3d label {entry.id} {entry.name}" for entry in splats.table]
-    with atomic_path(path) as temporary:
-        splats.gaussians.save(temporary, comments)
-        append_properties(
-            temporary, {"label": splats.label.astype(np.uint8), "confidence": splats.confidence.astype("<f4")}
-        )
-
-
-def append_properties(path: Path, columns: dict[str, np.ndarray]) -> None:
-    """Add properties, (N,) each, to the vertices of a binary PLY that has nothing else."""
-    records, comments = read_records(path)
-    added = [(name, column.dtype) for name, column in columns.items()]
-    joined = np.empty(len(records), records.dtype.descr + added)
-    for name in records.dtype.names:
-        joined[name] = records[name]
-    for name, column in columns.items():
-        joined[name] = column
-    write_records(path, joined, comments=comments)
+    extra = {"label": splats.label.astype(np.uint8), "confidence": splats.confidence.astype(np.float32)}
+    write_splat_ply(path, splats.gaussians.arrays(), comments, extra)
 
 
 def origin_in_crs(splats: DisplaySplats, projection: MapProjection) -> np.ndarray:

@@ -47,13 +47,13 @@ def splat_cloud(gaussians: Gaussians) -> o3d.t.geometry.PointCloud:
     lengths = gaussians.quats.norm(dim=1, keepdim=True)
     parts = {
         "positions": gaussians.means,
-        "f_dc": gaussians.sh[:, 0],
+        "f_dc": gaussians.sh_dc,
         "opacity": gaussians.opacity_logits[:, None],
         "scale": gaussians.scales,
         "rot": gaussians.quats / lengths.clamp_min(1e-12),
     }
     if gaussians.sh_degree:
-        parts["f_rest"] = gaussians.sh[:, 1:]
+        parts["f_rest"] = gaussians.sh_rest
     cloud = o3d.t.geometry.PointCloud()
     for name, values in parts.items():
         cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(values.detach().numpy(), np.float32))

@@ -1,6 +1,9 @@
-"""What trained Gaussians show: scores against photos, depth maps."""
+"""What trained Gaussians show: pictures, scores against photos, depth maps."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -8,10 +11,63 @@ import torch
 from sc3d.geometry.cameras import View
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses
-from sc3d.splatting.cpu.ssim import ssim_loss
+from sc3d.splatting.consistency import pixel_rays
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.rendering import render, unbiased_depth
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A photo, and the Gaussians seen by its camera.
+
+    photo, rendered: (H, W, 3) uint8 RGB; the rendering has the photo's exposure
+    depth: (H, W) float32 z, world units; 0 = nothing there
+    normals: (H, W, 3) float32 unit, world, towards the camera; 0 = nothing there
+    psnr: of the rendering, dB; held_out: the photo was not trained on
+    """
+
+    name: str
+    photo: np.ndarray
+    rendered: np.ndarray
+    depth: np.ndarray
+    normals: np.ndarray
+    psnr: float
+    held_out: bool = False
+
+
+@torch.no_grad()
+def picture(gaussians: Gaussians, view: View, background: tuple[int, int, int] = (0, 0, 0)) -> np.ndarray:
+    """(H, W, 3) uint8 RGB of a pinhole view in the Gaussians' local frame; background: RGB uint8 where
+    nothing is.
+    """
+    shade = torch.tensor(background, dtype=torch.float32) / 255
+    return _as_uint8(render(gaussians, view, background=shade, geometry=False).color)
+
+
+@torch.no_grad()
+def compare(
+    gaussians: Gaussians,
+    view: View,
+    photo: np.ndarray,
+    mask: np.ndarray | None = None,
+    exposure: Sequence[float] | None = None,
+) -> Comparison:
+    """Render the view of a photo and put the two side by side.
+
+    view: pinhole, local frame; photo: (H, W, 3) uint8 RGB; mask: (H, W) bool, False does not count for the
+        PSNR
+    exposure: a, b of the photo (`losses.apply_exposure`); None = what fits it best
+    """
+    image = render(gaussians, view, geometry=False).color.cpu()
+    target = torch.from_numpy(np.ascontiguousarray(photo)).float() / 255
+    used = torch.ones(photo.shape[:2], dtype=torch.bool) if mask is None else torch.from_numpy(mask)
+    if exposure is None:
+        exposure = losses.fit_exposure(image[used], target[used])
+    image = losses.apply_exposure(image, torch.as_tensor(exposure, dtype=torch.float32))
+    depth, _, normals_cam = depth_map(gaussians, view)
+    normals = normals_cam @ view.cam_from_world[:3, :3].astype(np.float32)
+    return Comparison(view.name, photo, _as_uint8(image), depth, normals, psnr(image[used], target[used]))
 
 
 def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
@@ -41,7 +97,7 @@ def score_view(
     if fit_exposure:
         image = losses.apply_exposure(image, losses.fit_exposure(image[used], target[used]))
     image = torch.where(used[..., None], image.clamp(0, 1), target)
-    return psnr(image[used], target[used]), 1 - float(ssim_loss(image.contiguous(), target))
+    return psnr(image[used], target[used]), 1 - float(losses.ssim_loss(image.contiguous(), target))
 
 
 def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSettings) -> dict[str, float]:
@@ -52,10 +108,7 @@ def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSet
         score_view(gaussians, *data.photo(index), settings.exposure)
         for index in settings.held_out(len(data.views))
     ]
-    if not scores:
-        return {}
-    means = np.mean(scores, axis=0)
-    return {"psnr": float(means[0]), "ssim": float(means[1])}
+    return dict(zip(("psnr", "ssim"), np.mean(scores, axis=0).tolist(), strict=True)) if scores else {}
 
 
 @torch.no_grad()
@@ -72,3 +125,15 @@ def depth_map(
     present = (rendering.alpha >= min_alpha) & torch.isfinite(depth) & (depth > 0)
     normals = torch.nn.functional.normalize(rendering.normal, dim=2) * present[..., None]
     return torch.where(present, depth, 0).cpu().numpy(), rendering.alpha.cpu().numpy(), normals.cpu().numpy()
+
+
+def facing_depth(gaussians: Gaussians, view: View, max_angle: float) -> np.ndarray:
+    """(H, W) float32 depth of `depth_map`, 0 where ray and normal are more than `max_angle` degrees apart."""
+    depth, _, normals_cam = depth_map(gaussians, view)
+    rays_cam = torch.nn.functional.normalize(pixel_rays(view), dim=2).numpy()
+    facing = -(normals_cam * rays_cam).sum(axis=2) > np.cos(np.deg2rad(max_angle))
+    return np.where(facing, depth, 0).astype(np.float32)
+
+
+def _as_uint8(image: torch.Tensor) -> np.ndarray:
+    return np.ascontiguousarray((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())

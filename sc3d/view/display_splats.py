@@ -47,20 +47,14 @@ class DisplaySplats:
         """Class colors or confidences instead of the photos' colors. InputError if there are no labels."""
         if by == "photo":
             return self.gaussians
-        from sc3d.splatting.lifting import painted
-
-        return painted(self.gaussians, self.colors(by) / 255)
+        return self.gaussians.painted(self.colors(by) / 255)
 
     def colors(self, by: Coloring) -> np.ndarray:
         """(N, 3) uint8 RGB; of the photos: the mean over all directions of view, without what changes with
         them.
         """
         if by == "photo":
-            from sc3d.splatting.gaussians import SH_C0
-
-            return np.round(np.clip(0.5 + SH_C0 * self.gaussians.sh[:, 0].numpy(), 0, 1) * 255).astype(
-                np.uint8
-            )
+            return self.gaussians.base_colors
         if by not in SPLAT_COLORINGS:
             raise InputError(f"splats have no {by}: choose --by photo, label or confidence")
         if self.label is None:
@@ -123,14 +117,16 @@ def trained_splats(scene: Scene) -> DisplaySplats:
 def read_splats(path: Path, table: ClassTable) -> DisplaySplats:
     """What `sc3d export SCENE --format splats` wrote; InputError if the file has no labels."""
     from sc3d.io.clouds import read_cloud
+    from sc3d.io.splats import read_splat_ply
     from sc3d.splatting.gaussians import Gaussians
 
-    gaussians, comments = Gaussians.load(path)
+    arrays, comments = read_splat_ply(path)
     found = read_cloud(path).point
     origins = [line.split()[2:] for line in comments if line.startswith("sc3d origin ")]
     if "label" not in found or "confidence" not in found or not origins:
         raise InputError(f"{path} has no labels: run `sc3d export SCENE --format splats`")
     label, confidence = (found[name].numpy().ravel() for name in ("label", "confidence"))
+    gaussians = Gaussians.from_arrays(arrays)
     return DisplaySplats(gaussians, np.array(origins[0], float), label, confidence, table)
 
 

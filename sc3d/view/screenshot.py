@@ -117,20 +117,20 @@ def screenshot_splats(
     style: what it says of coloring, direction and background
     returns: (H, W, 3) uint8 RGB
     """
-    from sc3d.view.splat_images import compare, rendered
+    from sc3d.splatting.evaluation import compare, picture
 
     labelled = splats.label is not None and style.by != "photo"
     gaussians = splats.painted(style.by) if labelled else splats.gaussians
     if view is None:
         seen = gaussians.means[gaussians.opacities > 0.5].numpy()
         points = without_outliers(seen if len(seen) else gaussians.means.numpy())
-        image = rendered(gaussians, overview(points, size, style.from_above), style.background)
+        image = picture(gaussians, overview(points, size, style.from_above), style.background)
     else:
         source = view.shifted(splats.origin)
         target = fitted(source, half_of(size))
         pixels = resample(photo, source, target)
         if labelled:
-            drawn, caption = rendered(gaussians, target, style.background), f"splats by {style.by}"
+            drawn, caption = picture(gaussians, target, style.background), f"splats by {style.by}"
         else:
             found = compare(gaussians, target, pixels)
             pixels, drawn, caption = found.photo, found.rendered, f"splats, PSNR {found.psnr:.2f} dB"

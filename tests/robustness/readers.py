@@ -88,10 +88,11 @@ def _read_splats(folder: Path) -> object:
     import torch
 
     from sc3d.geometry.cameras import look_at, pinhole_view
+    from sc3d.io.splats import read_splat_ply
     from sc3d.splatting.gaussians import Gaussians
     from sc3d.splatting.rendering import render
 
-    gaussians, _ = Gaussians.load(folder / "gaussians.ply")
+    gaussians = Gaussians.from_arrays(read_splat_ply(folder / "gaussians.ply")[0])
     view = pinhole_view("a", (24, 16), (20, 20, 12, 8), look_at(np.array([0.0, 0, 6]), np.zeros(3)))
     with torch.no_grad():
         return render(gaussians, view)
@@ -116,10 +117,12 @@ def _trainer():
     points = np.random.default_rng(0).uniform(-3, 3, (60, 3)) * [1, 1, 0.1]
     from dataclasses import replace
 
-    return Trainer(
+    trainer = Trainer(
         TrainingData(views, [trace(view)[0] for view in views], points, np.full((60, 3), 99, np.uint8)),
         replace(SHORT, fill=False, max_gaussians=60),
     )
+    trainer.step()  # before it, the optimizers are empty
+    return trainer
 
 
 def _build_checkpoint(folder: Path) -> None:

@@ -7,7 +7,7 @@ from sc3d.geometry.cameras import look_at, pinhole_view, rays
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.evaluation import depth_map
-from sc3d.splatting.train import train
+from sc3d.splatting.trainer import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

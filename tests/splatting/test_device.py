@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from sc3d.settings.train import TrainSettings
-from sc3d.splatting import gsplat_backend, trainer
-from sc3d.splatting.train import train
+from sc3d.splatting import trainer
+from sc3d.splatting.gpu import gsplat_backend
+from sc3d.splatting.trainer import train
 from tests.pretend_device import PretendDevice
 from tests.splatting.test_analytic import photographed, ring, valley
 from tests.splatting.test_gsplat_backend import functions, reference  # noqa: F401, fixtures

@@ -4,7 +4,7 @@ import numba
 import pytest
 import torch
 
-from sc3d.splatting.cpu.ssim import image_loss, ssim_loss
+from sc3d.splatting.losses import image_loss, ssim_loss
 
 
 def reference_ssim(x, y):

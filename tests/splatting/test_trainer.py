@@ -12,8 +12,9 @@ from sc3d.geometry.view_selection import neighbor_views
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.evaluation import depth_map
-from sc3d.splatting.initialization import fill_points
-from sc3d.splatting.train import train, write_log
+from sc3d.splatting.initialization import plane_sweep_points
+from sc3d.splatting.trainer import train
+from sc3d.stages.train import write_log
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -93,7 +94,7 @@ def test_empty_parts_are_filled_at_the_right_depth(scene):
     sparse = data.points[:, 0] < -1  # the right half has no sparse points
     data = replace(data, points=data.points[sparse], colors=data.colors[sparse])
     neighbors = neighbor_views(None, data.points, np.stack([view.center for view in data.views]))
-    points, colors = fill_points(data, neighbors, 3000)
+    points, colors = plane_sweep_points(data, neighbors, 3000)
     right = points[points[:, 0] > 0.5]
     assert len(right) > 150
     height = right[:, 2] - 0.3 * np.abs(right[:, 0])
@@ -101,7 +102,7 @@ def test_empty_parts_are_filled_at_the_right_depth(scene):
     expected = surface_color(points) * 255
     assert np.median(np.abs(colors - expected)) < 15
     masked = replace(data, masks=lambda index: np.zeros((HEIGHT, WIDTH), bool))
-    assert len(fill_points(masked, neighbors, 3000)[0]) == 0
+    assert len(plane_sweep_points(masked, neighbors, 3000)[0]) == 0
 
 
 def test_same_seed_same_result_and_resume_is_exact(scene, tmp_path):
