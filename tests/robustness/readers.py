@@ -217,7 +217,7 @@ def _read_sidecars(folder: Path) -> object:
 
 
 def _read_weights(folder: Path) -> object:
-    from sc3d.segmentation.weights import find_weights, model_type
+    from sc3d.segmentation.models import find_weights, model_type
 
     return model_type(find_weights("owner/model", folder, download=False))
 
