@@ -1,7 +1,7 @@
 """Where training starts: Gaussians at the sparse points, and at points between them from a small plane sweep.
 
-Sparse points leave parts of the photos empty (trees, lawn, asphalt), and optimization moves a Gaussian by little
-per step, so a tree crown that starts on the ground stays there: starting depth matters.
+Sparse points leave parts of the photos empty (trees, lawn, asphalt), and optimization moves a Gaussian by
+little per step, so a tree crown that starts on the ground stays there: starting depth matters.
 """
 
 from __future__ import annotations
@@ -40,11 +40,6 @@ class _Reference:
     pixels: np.ndarray
     depths: np.ndarray
     grid: np.ndarray
-
-    @property
-    def rays(self) -> np.ndarray:
-        """(G, 3) of the grid, z = 1, camera frame."""
-        return _rays(self.view, self.grid)
 
 
 @dataclass(frozen=True)
@@ -117,7 +112,7 @@ def plane_sweep_points(
         good = _settled(reference.grid, swept, cost < MAX_COST, step)
         lowest = planes[0] if volume else (np.array([0.0, 0.0, -1.0]), 1.0)
         depth = np.where(good, swept, _interpolated(reference, swept, good, lowest))
-        points_cam = reference.rays * depth[:, None]
+        points_cam = _rays(view, reference.grid) * depth[:, None]
         found.append((points_cam - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3])
         columns, rows = reference.grid.astype(int).T
         colors.append(data.image(index)[rows, columns])
@@ -187,7 +182,7 @@ def _sweep(
     """(G,) depth of the plane whose patches agree best with the two best of the other views; (G,) that mean 1
     - NCC, 2 = none.
     """
-    grid, rays = reference.grid, reference.rays
+    grid, rays = reference.grid, _rays(reference.view, reference.grid)
     pixels = torch.from_numpy((grid * (own[1].width / reference.view.width)).astype(np.int64))
     around = cKDTree(grid).query(grid, k=min(AROUND, len(grid)))[1].reshape(len(grid), -1)
     best_cost, best_depth = np.full(len(pixels), 2.0), np.ones(len(pixels))
@@ -221,9 +216,10 @@ def _interpolated(reference: _Reference, swept: np.ndarray, good: np.ndarray, lo
     """
     pixels = np.concatenate([reference.pixels, reference.grid[good]])
     depths = np.concatenate([reference.depths, swept[good]])
-    relative = depths / _plane_depth(lowest, _rays(reference.view, pixels))
+    view = reference.view
+    relative = depths / _plane_depth(lowest, _rays(view, pixels))
     near = cKDTree(pixels).query(reference.grid, k=MIN_SPARSE)[1]
-    depth = np.quantile(relative[near], 0.75, axis=1) * _plane_depth(lowest, reference.rays)
+    depth = np.quantile(relative[near], 0.75, axis=1) * _plane_depth(lowest, _rays(view, reference.grid))
     return np.minimum(depth, FARTHEST * reference.depths.max())
 
 
