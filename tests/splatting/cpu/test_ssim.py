@@ -32,7 +32,7 @@ def make_images(height, width, seed=0):
     return image, (image + 0.2 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1)
 
 
-@pytest.mark.parametrize("size", [(37, 45), (150, 301), (3, 5), (64, 128), (1, 1), (65, 129)])
+@pytest.mark.parametrize("size", [(37, 45), (70, 260), (3, 5), (64, 128), (1, 1), (65, 129)])
 def test_value_and_gradient_equal_the_convolution(size):
     image, target = make_images(*size)
     fast, slow = image.clone().requires_grad_(), image.double().requires_grad_()

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 
-from sc3d.errors import InputError, MissingPackageError
+from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import device
@@ -27,7 +27,7 @@ from sc3d.splatting.gpu.gsplat_backend import Functions, render_gpu, transmittan
 from sc3d.splatting.losses import image_loss
 from sc3d.splatting.rendering import render
 from sc3d.splatting.trainer import Trainer
-from tests.splatting.test_analytic import photographed, ring, valley
+from tests.splatting.scenes import photographed, ring, valley
 from tests.splatting.test_rendering import (
     BACKGROUND,
     NAMES,
@@ -287,22 +287,6 @@ def test_missing_gsplat_says_what_to_install(monkeypatch):
     monkeypatch.setattr(device, "has_kernels", lambda tensor: False)
     with pytest.raises(MissingPackageError, match=r"pip install 'sc3d\[cuda\]'"):
         render(make_scene(3), make_view())
-
-
-def test_device_is_picked_by_what_is_there(monkeypatch):
-    precision = torch.backends.cudnn.allow_tf32
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert device.pick_device("cpu").type == device.pick_device("auto").type == "cpu"
-    with pytest.raises(InputError, match="no CUDA device"):
-        device.pick_device("cuda")
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: None)
-    assert device.pick_device("auto").type == "cpu"
-    with pytest.raises(MissingPackageError, match="gsplat"):
-        device.pick_device("cuda")
-    monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: name)
-    assert device.pick_device("auto").type == device.pick_device("cuda").type == "cuda"
-    torch.backends.cudnn.allow_tf32 = precision
 
 
 @pytest.mark.parametrize("size", [(37, 45), (3, 5), (65, 129)])
