@@ -10,12 +10,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
 from sc3d.commands import COMMANDS, MODULES, STAGES
+from sc3d.commands.renamed import MOVED, current
 from sc3d.errors import InputError, Sc3dError
 
 
@@ -26,21 +27,30 @@ def main(arguments: list[str] | None = None) -> None:
         sys.stdout.write(usage())
         sys.exit(0 if arguments else 2)
     name = arguments[0]
+    if name in MOVED:
+        sys.exit(
+            _fail(f"`sc3d {name}` is a tool of the checkout now: {MOVED[name]} {' '.join(arguments[1:])}")
+        )
     if name not in STAGES and name not in COMMANDS:
         sys.exit(_fail(f"unknown command {name!r}: one of {', '.join(sorted(STAGES | COMMANDS))}"))
-    command = parse(name, arguments[1:])
+    start_logging()
+    command = parse(name, current(arguments[1:]))
     with reporting_errors():
         _dispatch(name, command)
 
 
+def start_logging() -> None:
+    """Log to stderr, of other packages warnings only; `sc3d ... | head` ends quietly."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    logging.basicConfig(format="%(message)s", stream=sys.stderr)
+    for package in ("sc3d", "tools"):
+        logging.getLogger(package).setLevel(logging.INFO)
+    logging.captureWarnings(True)
+
+
 @contextmanager
 def reporting_errors() -> Iterator[None]:
-    """Log to stderr in the block; what goes wrong in it is told in one line and ends the process, see `main`."""
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `sc3d ... | head` ends quietly
-    logging.basicConfig(format="%(message)s", stream=sys.stderr)
-    logging.getLogger("sc3d").setLevel(logging.INFO)  # of other packages, warnings only
-    logging.getLogger("tools").setLevel(logging.INFO)
-    logging.captureWarnings(True)
+    """What goes wrong in the block is told in one line and ends the process, see `main`."""
     try:
         yield
     except InputError as error:
@@ -66,7 +76,7 @@ def usage() -> str:
     return "\n".join(lines) + "\n"
 
 
-def parse(name: str, arguments: list[str]) -> object:
+def parse(name: str, arguments: list[str]) -> Any:
     """Arguments to the settings record of a command; exits with status 2 on a usage error."""
     record = COMMANDS.get(name) or scene_command(STAGES[name])
     return tyro.cli(record, args=arguments, prog=f"sc3d {name}", description=_describe(record))
@@ -78,7 +88,7 @@ def scene_command(record: type) -> type:
         "Command",
         [
             ("scene", Annotated[Positional[Path], tyro.conf.arg(help="Scene folder.")]),
-            ("settings", OmitArgPrefixes[record], dataclasses.field(default_factory=record)),
+            ("settings", OmitArgPrefixes[record], dataclasses.field(default_factory=record)),  # type: ignore
             (
                 "overwrite",
                 Annotated[bool, tyro.conf.arg(help="Run again even if the outputs are up to date.")],
@@ -95,7 +105,7 @@ def _describe(record: type) -> str:
     return (record.__doc__ or "").strip()
 
 
-def _dispatch(name: str, command: object) -> None:
+def _dispatch(name: str, command: Any) -> None:
     if name in COMMANDS:
         importlib.import_module(MODULES.get(name, f"sc3d.commands.{name}")).main(command)
         return

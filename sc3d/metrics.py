@@ -6,11 +6,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
+from tqdm import tqdm
 
+from sc3d.geometry.cameras import View
+from sc3d.geometry.raycast import FirstSurface
+from sc3d.io.images import read_index_image
+from sc3d.io.json_files import write_json
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
+from sc3d.scene.labels import Labels
+from sc3d.scene.scene import Scene
+from sc3d.settings.labels import Evaluate
 
 
 @dataclass(frozen=True)
@@ -166,15 +177,10 @@ class Reliability:
     @classmethod
     def merge(cls, parts: list[Reliability]) -> Reliability:
         """Of all samples of several parts, one at least."""
-        count = sum(part.count for part in parts)
-        sums = (
-            sum(
-                np.nan_to_num(mean) * part.count
-                for part, mean in ((part, getattr(part, name)) for part in parts)
-            )
-            for name in ("confidence", "accuracy")
-        )
-        return cls.from_sums(*sums, count)
+        count = np.sum([part.count for part in parts], axis=0)
+        confidence = np.sum([np.nan_to_num(part.confidence) * part.count for part in parts], axis=0)
+        right = np.sum([np.nan_to_num(part.accuracy) * part.count for part in parts], axis=0)
+        return cls.from_sums(confidence, right, count)
 
     def summary(self) -> dict[str, object]:
         """JSON-ready figures; None for an empty bin."""
@@ -198,3 +204,83 @@ def reliability(confidence: np.ndarray, right: np.ndarray, bins: int = 10) -> Re
         np.bincount(row, np.asarray(right, np.float64), minlength=bins),
         count,
     )
+
+
+SOURCES = ("labels", "masks", "labels_near_edges", "labels_elsewhere")  # order of the figures
+
+
+class SeenCloud(Protocol):
+    """What photos see of a labelled cloud: `LabelledSurface`, or by tiles `TiledSurface`."""
+
+    def rows(self, view: View, size: tuple[int, int], wanted: np.ndarray) -> tuple[np.ndarray, FirstSurface]:
+        """(H, W) int row of the cloud at each wanted pixel (H, W) bool, -1 = nothing; the first surface. size: (width,
+        height).
+        """
+
+
+@dataclass(frozen=True)
+class EvaluationSummary:
+    """totals: figures by source (SOURCES); calibration_error: expected error of the confidence, None = no labels"""
+
+    totals: dict[str, dict]
+    calibration_error: float | None
+
+    def figures(self) -> dict[str, object]:
+        """What the stage reports."""
+        rows: dict[str, object] = {}
+        for key, found in self.totals.items():
+            classes = "  ".join(f"{name} {value:.1%}" for name, value in found["iou"].items())
+            head = f"OA {found['oa']:.1%}  mIoU {found['miou']:.1%}"
+            rows[key] = f"{head}  ({classes})  coverage {found['coverage']:.1%}"
+        if self.calibration_error is not None:
+            rows["calibration_error"] = round(self.calibration_error, 4)
+        return rows
+
+
+def evaluate_scene(scene: Scene, settings: Evaluate) -> EvaluationSummary:
+    """Judge the labelled cloud of a scene (or `settings.labelled`) by its truth masks and write the figures. By tiles,
+    with the same signature: `tiling.evaluate`.
+    """
+    cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
+    return judge(scene, settings, LabelledSurface.build(cloud, scene.model.views, scene.mesh), labels)
+
+
+def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) -> EvaluationSummary:
+    """Judge labels, and the scene's masks, at every pixel that has truth, and write `metrics.json`."""
+    table, truth_files = scene.class_table(), truth_masks(scene, settings)
+    mask_files = scene.mask_files(scene.masks, table) if scene.masks.is_dir() else {}
+    views = [view for view in scene.model.views if view.name in truth_files]
+    per_photo, reliabilities = {}, []
+    for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
+        truth = read_index_image(truth_files[view.name])
+        rows, first = surface.rows(view, truth.shape[::-1], truth > 0)
+        pixels = EvaluationPixels.from_photo(truth, rows, depth_edge_band(first.range, settings.band))
+        near, elsewhere = pixels.confusions(pixels.look_up(labels.label), table.num_ids)
+        found = {"labels": near + elsewhere, "labels_near_edges": near, "labels_elsewhere": elsewhere}
+        if view.name in mask_files:
+            mask = read_index_image(mask_files[view.name])
+            mask = cv2.resize(mask, truth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            found["masks"] = Confusion.from_labels(truth, mask, table.num_ids)
+        per_photo[view.name] = found
+        reliabilities.append(pixels.reliability(labels.label, labels.confidence))
+    sources = SOURCES if mask_files else [key for key in SOURCES if key != "masks"]
+    parts = {key: [photo[key] for photo in per_photo.values() if key in photo] for key in sources}
+    totals = {key: total(found, table.num_ids).summary(table) for key, found in parts.items()}
+    overall = Reliability.merge(reliabilities) if reliabilities else None
+    photos = {
+        name: {key: found[key].summary(table) for key in SOURCES if key in found}
+        for name, found in per_photo.items()
+    }
+    metrics = {"photos": [view.name for view in views], "classes": [entry.name for entry in table]} | totals
+    write_json(
+        settings.output or scene.metrics,
+        metrics | {"reliability": overall.summary() if overall else {}, "per_photo": photos},
+    )
+    return EvaluationSummary(totals, overall.ece if overall else None)
+
+
+def truth_masks(scene: Scene, settings: Evaluate) -> dict[str, Path]:
+    """Truth mask of each view that has one; InputError if there are none."""
+    folder = settings.truth or scene.truth
+    scene.require(folder, hint="pass --truth FOLDER with manual masks")
+    return scene.mask_files(folder, scene.class_table())

@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, fields
 from pathlib import Path
+from typing import Any
 
 from sc3d.errors import InputError, Sc3dError
 from sc3d.io.atomic import remove_leftovers, require_inside, temporary_name
@@ -38,7 +39,7 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
     Up to date: every output and its sidecar exist, made by the same settings from inputs of the same content.
     """
     stage = importlib.import_module(f"sc3d.stages.{name}")
-    record = {
+    record: dict[str, Any] = {
         "stage": name,
         "settings": _decisive(settings),
         "inputs": {str(path): digest(path) for path in stage.inputs(scene, settings)},
@@ -123,7 +124,7 @@ def _room(scene: Scene) -> Iterator[None]:
         ) from error
 
 
-def _decisive(settings: object) -> dict[str, object]:
+def _decisive(settings: Any) -> dict[str, object]:
     """The settings without those that no result depends on."""
     ignored = {field.name for field in fields(Resources)} if isinstance(settings, Workers) else set()
     return {name: value for name, value in _plain(asdict(settings)).items() if name not in ignored}
@@ -135,14 +136,15 @@ def sidecar(output: Path) -> Path:
 
 
 def _finished(record: dict, outputs: list[Path]) -> dict | None:
-    found = None
+    found: dict | None = None
     for output in outputs:
         try:
-            found = read_json(sidecar(output), MAX_SIDECAR)
+            read = read_json(sidecar(output), MAX_SIDECAR)
         except InputError:
             return None
-        if not isinstance(found, dict) or not isinstance(found.get("summary"), dict):
+        if not isinstance(read, dict) or not isinstance(read.get("summary"), dict):
             return None
+        found = read
         if not output.exists() or any(found.get(key) != value for key, value in record.items()):
             return None
     return found
@@ -155,7 +157,7 @@ def _report(name: str, record: dict, outputs: list[Path]) -> None:
     logger.info("\n".join(lines))
 
 
-def _plain(value: object) -> object:
+def _plain(value: Any) -> Any:
     """JSON-ready copy: paths as text, tuples as lists, numpy scalars as numbers."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}

@@ -21,7 +21,8 @@ from sc3d.georeferencing.control_points import ControlPoints, align_to_control_p
 from sc3d.georeferencing.focal import anchor_focal, tells_focal
 from sc3d.georeferencing.georeference import Georeference, from_origin
 from sc3d.georeferencing.gps import Flight, place, read_flight, residuals
-from sc3d.io.atomic import atomic_path, require_room, telling_of_full_disk, temporary_name
+from sc3d.io.atomic import require_room, telling_of_full_disk, temporary_name
+from sc3d.io.colmap import registered_images, write_model
 from sc3d.settings.reconstruction import Reconstruct
 
 logger = logging.getLogger(__name__)
@@ -76,9 +77,7 @@ def reconstruct(
         free = settings.focal == "refine" or (settings.focal == "auto" and tells_focal(model))
         focal = {} if free else anchor_focal(model, images, flight)
         georeference = _georeference(model, flight, control_points, settings)
-        with atomic_path(sparse) as output:
-            output.mkdir()
-            model.write_binary(str(output))
+        write_model(sparse, model)
     return Reconstructed(
         _summary(model, names, georeference) | focal | _heights(model, flight, georeference), georeference
     )
@@ -228,10 +227,7 @@ def _georeference(
 
 def _centers(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
     """Camera center (3,) by photo name."""
-    images = sorted(
-        (model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name
-    )
-    return {image.name: image.projection_center() for image in images}
+    return {image.name: image.projection_center() for image in registered_images(model)}
 
 
 def _points(model: pycolmap.Reconstruction) -> np.ndarray:

@@ -14,8 +14,9 @@ import pytest
 from PIL import Image
 
 import sc3d.stages.label  # noqa: F401 - loaded before a test gives up its rights
-from sc3d.cli import main
+from sc3d.cli import main, parse
 from sc3d.commands import COMMANDS, STAGES
+from sc3d.commands.renamed import current
 from tests.builders import write_bare_scene
 
 
@@ -68,7 +69,12 @@ def test_usage_and_unknown_command(capsys):
 
 def test_scripts_in_tools_are_the_commands():
     tools = Path(__file__).parent.parent / "tools"
-    assert {file.stem for file in tools.glob("*.py")} - {"fuzz_readers", "make_manual", "__init__"} == {
+    assert {file.stem for file in tools.glob("*.py")} - {
+        "fuzz_readers",
+        "make_manual",
+        "docstring_pages",
+        "__init__",
+    } == {
         *STAGES,
         *COMMANDS,
     }
@@ -212,3 +218,37 @@ def test_interrupted_output_leaves_the_old_file(tmp_path):
         temporary.write_text("half")
         raise KeyboardInterrupt
     assert target.read_text() == "old" and list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize(
+    ("before", "now"),
+    [
+        (["--from", "centres"], ["--from", "centers"]),
+        (["--from=centres"], ["--from=centers"]),
+        (["--num_neighbours", "4"], ["--num-neighbors", "4"]),
+        (["--train.num-neighbours=4"], ["--train.num-neighbors=4"]),
+        (
+            ["--label.no-range", "--label.incidence"],
+            ["--label.mechanisms.no-range", "--label.mechanisms.incidence"],
+        ),
+    ],
+)
+def test_options_as_they_were_spelled_before_are_taken_with_a_warning(before, now, caplog):
+    with caplog.at_level("WARNING"):
+        assert current(["scene", *before]) == ["scene", *now]
+    assert set(now) - set(before) and all(new in caplog.text for new in set(now) - set(before))
+    caplog.clear()
+    assert current(["centres", *now]) == ["centres", *now] and not caplog.text  # a scene may be called so
+
+
+def test_old_spellings_reach_the_records(tmp_path):
+    assert parse("extract", current([str(tmp_path), "--from", "centres"])).settings.method == "centers"
+    assert parse("train", current([str(tmp_path), "--num-neighbours", "5"])).settings.num_neighbors == 5
+    assert parse("run", current(["a", "b", "--label.incidence"])).label.mechanisms.incidence
+
+
+def test_commands_that_became_tools_say_where_they_are(capsys):
+    assert "python -m tools.benchmark speed --repeats 2" in fails(
+        capsys, "benchmark", "speed", "--repeats", "2"
+    )
+    assert "tools/make_manual.py" in fails(capsys, "manual", "folder")

@@ -50,12 +50,14 @@ def main() -> None:
     arguments, rest = parser.parse_known_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     if arguments.atheris:
-        return guided(arguments.atheris, rest)
+        guided(arguments.atheris, rest)
+        return
     from tests.robustness.readers import READERS
 
     if arguments.only:
         name, number = arguments.only.rsplit(":", 1)
-        return print(one_case(Fixture(name), int(number)))
+        print(one_case(Fixture(name), int(number)))
+        return
     started, parts = time.time(), arguments.folder / "parts.jsonl"
     done = (
         {(row["reader"], row["first"]) for row in map(json.loads, parts.read_text().splitlines())}
@@ -202,7 +204,7 @@ def guided(name: str, rest: list[str]) -> None:
         fixture.reader.read(fixture.folder)  # loads the code under test
     corpus = fixture.folder.parent / "corpus"
     corpus.mkdir()
-    for row, (target, content) in enumerate(fixture.contents.items()):
+    for row, content in enumerate(fixture.contents.values()):
         (corpus / f"{row}").write_bytes(struct.pack("B", row) + content)
 
     def once(data: bytes) -> None:

@@ -3,5 +3,4 @@
 set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 cd "$root"
-[ $# -gt 0 ] || set -- -m "not slow"
 exec "$venv/bin/python" -m pytest "$@"

@@ -7,7 +7,7 @@ from sc3d.settings import labels, outputs, reconstruction, synthesize, train
 # stages that are one settings record applied to one scene folder, in the order of the data flow
 STAGES: dict[str, type] = {
     "synthesize": synthesize.Synthesize,
-    "georeference": reconstruction.Georeference,
+    "georeference": reconstruction.GeoreferenceOptions,
     "train": train.Train,
     "extract": reconstruction.Extract,
     "segment": labels.Segment,
@@ -22,7 +22,7 @@ COMMANDS: dict[str, type] = {
     "reconstruct": reconstruction.ReconstructCommand,
     "import": reconstruction.ImportCommand,
     "run": outputs.Run,
-    "view": outputs.View,
+    "view": outputs.ViewCommand,
     "annotate": labels.Annotate,
     "doctor": outputs.Doctor,
 }

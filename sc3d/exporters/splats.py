@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.exporters.masks import render_mask
-from sc3d.exporters.projected_cloud import Placement, chosen_classes, find_placement
+from sc3d.exporters.projected_cloud import MapProjection, chosen_classes, find_projection
 from sc3d.geometry.cameras import undistorted
 from sc3d.geometry.neighbors import NeighborIndex
-from sc3d.io.clouds import read_cloud
-from sc3d.io.splats import origin_comment, read_splat_ply, write_splat_ply
-from sc3d.scene.class_table import ClassTable
+from sc3d.io.splats import origin_comment, write_splat_ply
 from sc3d.scene.labelled_cloud import REACH, LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
 from sc3d.splatting.dataset import load_gaussians
-from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.lifting import lift, winners
+from sc3d.view.display_splats import DisplaySplats
 
 # longest side of the masks whose labels are lifted, px; Gaussians are trained at about that size
 LIFTED_SIZE = 800
@@ -29,53 +26,21 @@ LIFTED_SIZE = 800
 GUARD = 32.0
 
 
-@dataclass(frozen=True)
-class LabelledSplats:
-    """N Gaussians in a frame shifted by `origin`.
-
-    label: (N,) uint8 ids, 0 = no photo shows it with a label, or it floats
-    confidence: (N,) float32, share of the class in all that it shows, 0 to 1; 0 without label
-    origin: (3,) float64 world position of the Gaussians' origin; table: the classes
-    """
-
-    gaussians: Gaussians
-    label: np.ndarray
-    confidence: np.ndarray
-    origin: np.ndarray
-    table: ClassTable
-
-    def only(self, classes: set[int]) -> LabelledSplats:
-        """Those of the given class ids; InputError if there are none."""
-        chosen = np.isin(self.label, sorted(classes))
-        if not chosen.any():
-            raise InputError(
-                f"no splat has one of the classes {', '.join(self.table.name(label) for label in sorted(classes))}: nothing to write"
-            )
-        return LabelledSplats(
-            self.gaussians[chosen], self.label[chosen], self.confidence[chosen], self.origin, self.table
-        )
-
-    def counts(self) -> dict[str, int]:
-        """Number of splats per class name."""
-        counts = np.bincount(self.label, minlength=256)
-        return {self.table.name(int(label)): int(counts[label]) for label in np.flatnonzero(counts)}
-
-
 def outputs(scene: Scene, settings: Export) -> list[Path]:
-    return [scene.export / "splats.ply"]
+    return [scene.labelled_splats]
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/splats.ply`: gaussians.ply with `label` (uchar) and `confidence` (float) per splat; of the
     chosen classes only.
     """
-    chosen, placement = chosen_classes(scene, settings), find_placement(scene, settings)
+    chosen, projection = chosen_classes(scene, settings), find_projection(scene, settings)
     splats = label_splats(scene, settings).only(chosen)
-    write_splats(outputs(scene, settings)[0], splats, placement)
-    return figures(splats, placement)
+    write_splats(outputs(scene, settings)[0], splats, projection)
+    return figures(splats, projection)
 
 
-def label_splats(scene: Scene, settings: Export) -> LabelledSplats:
+def label_splats(scene: Scene, settings: Export) -> DisplaySplats:
     """Lift the fused labels, as every photo sees them on the surface, to all Gaussians of the scene."""
     source, table = settings.labelled or scene.labelled, scene.class_table()
     cloud, labels = read_labelled(source, "propagate")
@@ -101,11 +66,11 @@ def label_splats(scene: Scene, settings: Export) -> LabelledSplats:
         raise InputError(
             f"no splat shows a label of {source}: check that gaussians.ply and this cloud belong together"
         )
-    return LabelledSplats(
+    return DisplaySplats(
         gaussians,
+        origin,
         np.where(floating, np.uint8(0), label),
         np.where(floating, np.float32(0), confidence),
-        origin,
         table,
     )
 
@@ -123,50 +88,34 @@ def distance_to_class(
     return distance
 
 
-def write_splats(path: Path, splats: LabelledSplats, placement: Placement) -> None:
+def write_splats(path: Path, splats: DisplaySplats, projection: MapProjection) -> None:
     """3DGS PLY with two more properties, which viewers ignore; positions stay in the local frame, comments
     say where it lies.
     """
     comments = [origin_comment(splats.origin)]
-    if placement.crs is not None:
+    if projection.crs is not None:
         comments.append(
-            f"sc3d EPSG:{placement.epsg} origin "
-            + " ".join(f"{value:.3f}" for value in origin_in_crs(splats, placement))
+            f"sc3d EPSG:{projection.epsg} origin "
+            + " ".join(f"{value:.3f}" for value in origin_in_crs(splats, projection))
         )
     comments += [f"sc3d label {entry.id} {entry.name}" for entry in splats.table]
     extra = {"label": splats.label.astype(np.uint8), "confidence": splats.confidence.astype(np.float32)}
     write_splat_ply(path, splats.gaussians.arrays(), comments, extra)
 
 
-def read_splats(path: Path, table: ClassTable) -> LabelledSplats:
-    """What `write_splats` wrote; InputError if the file has no labels."""
-    arrays, comments = read_splat_ply(path)
-    found = read_cloud(path).point
-    origins = [line.split()[2:] for line in comments if line.startswith("sc3d origin ")]
-    if "label" not in found or "confidence" not in found or not origins:
-        raise InputError(f"{path} has no labels: run `sc3d export SCENE --format splats`")
-    return LabelledSplats(
-        Gaussians.from_arrays(arrays),
-        found["label"].numpy().ravel(),
-        found["confidence"].numpy().ravel(),
-        np.array(origins[0], float),
-        table,
-    )
-
-
-def origin_in_crs(splats: LabelledSplats, placement: Placement) -> np.ndarray:
+def origin_in_crs(splats: DisplaySplats, projection: MapProjection) -> np.ndarray:
     """(3,) easting, northing and height of the splats' origin in the CRS; the world without one."""
-    return placement.points(splats.origin[None])[0]
+    return projection.to_crs(splats.origin[None])[0]
 
 
-def figures(splats: LabelledSplats, placement: Placement) -> dict[str, object]:
+def figures(splats: DisplaySplats, projection: MapProjection) -> dict[str, object]:
     """What the summary and the sidecar say."""
-    labelled = splats.label > 0
+    labelled, counts = splats.label > 0, np.bincount(splats.label, minlength=256)
     return {
         "splats": len(splats.label),
         "labelled": f"{labelled.mean():.1%}",
         "mean_confidence": round(float(splats.confidence[labelled].mean()), 3),
-        "origin": np.round(origin_in_crs(splats, placement) + 0.0, 3).tolist(),
-        **placement.figures(),
-        "splats_by_class": splats.counts(),
+        "origin": np.round(origin_in_crs(splats, projection) + 0.0, 3).tolist(),
+        **projection.figures(),
+        "splats_by_class": {splats.table.name(int(row)): int(counts[row]) for row in np.flatnonzero(counts)},
     }

@@ -81,14 +81,12 @@ def build_graph(
     order = canonical_order(local, ties)
     local, oriented = local[order], normals is not None
     neighbors, distances = _others(local, num_neighbors)
-    if oriented:
+    if normals is not None:
         normals = np.ascontiguousarray(normals[order], np.float32)
+    elif neighbors.shape[1] > 2:
+        normals = estimate_normals(local, neighbors)
     else:
-        normals = (
-            estimate_normals(local, neighbors)
-            if neighbors.shape[1] > 2
-            else np.tile(np.float32([0, 0, 1]), (len(points), 1))
-        )
+        normals = np.tile(np.array([0, 0, 1], np.float32), (len(points), 1))
     bend, roughness = _shape(local, normals, neighbors, distances)
     reach = (
         RADIUS * np.maximum(distances[:, min(SPACING_NEIGHBOR, distances.shape[1]) - 1], 1e-12)

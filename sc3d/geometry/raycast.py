@@ -240,7 +240,7 @@ def surfels(
         normals = (
             estimate_normals(points, neighbors)
             if neighbors.shape[1] > 3
-            else np.tile(np.float32([0, 0, 1]), (len(points), 1))
+            else np.tile(np.array([0, 0, 1], np.float32), (len(points), 1))
         )
     spacing = spacing or point_spacing(distances) or 1.0
     supported = (distances[:, 1:] < 4 * spacing).sum(axis=1) >= min(MIN_SUPPORT, len(points) - 1)

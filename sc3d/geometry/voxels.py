@@ -1,16 +1,16 @@
-"""A sparse field of voxels on Open3D's `VoxelBlockGrid`: integer counts in voxels near points.
+"""A sparse grid of voxels on Open3D's `VoxelBlockGrid`: blocks of BLOCK^3 voxels in a hash map (coarse level), and
+the voxels of each block (fine level).
 
-Two levels: blocks of BLOCK^3 voxels in a hash map, and the voxels of each block. A voxel has two sides, told
-apart by the
-normals of its points, so that a wall thinner than a voxel keeps what was seen on either face.
-Counts are integers: sums of integers do not depend on the order of views, points or threads, and fields merge
-by addition.
+A voxel has two sides, told apart by the normals of its points, so that a wall thinner than a voxel keeps what was
+seen on either face. Counts are integers: sums of integers do not depend on the order of views, points or threads,
+and grids merge by addition.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -20,116 +20,171 @@ BLOCK = 8
 SIDES = 2
 VOXELS = BLOCK**3  # of a block
 AXIS_BITS = 18  # of a block's position along one axis; three of them and a voxel's 9 bits make one int64
-# of a voxel, below the smallest coordinate: irrational, so that points on a regular grid do not lie on voxel
-# faces
+AXIS_MASK = (1 << AXIS_BITS) - 1
+# of a voxel, below the smallest coordinate: irrational, so that points on a regular grid do not lie on voxel faces
 ORIGIN_SHIFT = 0.381966
-# share of the main axis in the squared normals of a voxel's points; below it they scatter (leaves, corners)
-# and have no two sides
+# share of the main axis in the squared normals of a voxel's points; below it they scatter (leaves, corners) and
+# have no two sides
 FLAT = 0.75
 FIXED = 1 << 20  # products of unit normals as integers
+NOTHING = -1
+MIXER = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: multiplicative hashing (Knuth)
+AROUND = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], np.int32)
 
 
-class LabelGrid:
-    """Counts of C channels for every voxel side.
+class VoxelIndex(NamedTuple):
+    """A `NumberedVoxels` for kernels, which cannot ask Open3D's hash map: its blocks once more, in a table.
 
-    grid: VoxelBlockGrid with attribute `votes` (blocks, 8, 8, 8, SIDES * C) int32
+    table: (T, 2) int64 open addressing, T a power of two: packed block position (-1 = free), slot of the block
+    numbers: (slots, 512) int32 number of each voxel of a block, or -1
+    low, high: (3,) int64 first block and one past the last
+    """
+
+    table: np.ndarray
+    numbers: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+class VoxelGrid:
+    """An attribute for every voxel in the blocks that hold one of the given voxels.
+
+    grid: VoxelBlockGrid with one attribute (slots, 8, 8, 8, channels); a block's slot is its row there
     voxel_size: world units; origin: (3,) float64 world position of the grid's zero
     """
 
-    def __init__(
-        self, grid: o3d.t.geometry.VoxelBlockGrid, voxel_size: float, origin: np.ndarray, num_channels: int
-    ) -> None:
-        self.grid, self.voxel_size, self.origin, self.num_channels = (
-            grid,
-            voxel_size,
-            np.asarray(origin, np.float64),
-            num_channels,
-        )
+    ATTRIBUTE = "value"
+    DTYPE = o3d.core.int32
+
+    def __init__(self, grid: o3d.t.geometry.VoxelBlockGrid, voxel_size: float, origin: np.ndarray) -> None:
+        self.grid, self.voxel_size, self.origin = grid, voxel_size, np.asarray(origin, np.float64)
 
     @classmethod
-    def around(cls, points: np.ndarray, voxel_size: float, num_channels: int) -> LabelGrid:
-        """An empty field with all blocks that hold one of the (N, 3) points."""
-        return cls.from_voxels(sort_by_voxel(points, voxel_size), num_channels)
-
-    @classmethod
-    def from_voxels(cls, sorting: VoxelOrder, num_channels: int) -> LabelGrid:
-        """An empty field with all blocks of points that are sorted already."""
-        keys = sorting.keys // VOXELS
-        blocks = _unpack(keys[np.flatnonzero(np.diff(keys, prepend=-1))])
+    def activate(cls, keys: np.ndarray, voxel_size: float, origin: np.ndarray, num_channels: int):
+        """A grid of zeros with all blocks of the (V,) int64 voxel keys (`voxel_keys`), rising."""
+        blocks = keys // VOXELS
+        positions = unpack_blocks(blocks[np.flatnonzero(np.diff(blocks, prepend=-1))])
+        channels, count = ((num_channels,),), max(len(positions), 1)
         grid = o3d.t.geometry.VoxelBlockGrid(
-            ("votes",),
-            (o3d.core.int32,),
-            ((SIDES * num_channels,),),
-            sorting.voxel_size,
-            BLOCK,
-            max(len(blocks), 1),
+            (cls.ATTRIBUTE,), (cls.DTYPE,), channels, voxel_size, BLOCK, count
         )
-        grid.hashmap().activate(o3d.core.Tensor(blocks))
-        return cls(grid, sorting.voxel_size, sorting.origin, num_channels)
+        grid.hashmap().activate(o3d.core.Tensor(positions))
+        return cls(grid, voxel_size, origin)
+
+    @property
+    def values(self) -> np.ndarray:
+        """(slots, 512, channels) view of the attribute, shared with the grid."""
+        values = self.grid.attribute(self.ATTRIBUTE).numpy()
+        return values.reshape(len(values), VOXELS, -1)
+
+    def slots(self, positions: np.ndarray) -> np.ndarray:
+        """(B,) int64 slot of each block at (B, 3) int32 positions, in blocks from the origin; -1 = not in the grid."""
+        if not len(positions):
+            return np.zeros(0, np.int64)
+        slots, found = self.grid.hashmap().find(o3d.core.Tensor(np.ascontiguousarray(positions, np.int32)))
+        return np.where(found.numpy(), slots.numpy().astype(np.int64), NOTHING)
+
+    def blocks(self) -> tuple[np.ndarray, np.ndarray]:
+        """(B,) int64 slots of all blocks and their (B, 3) int32 positions, ordered by position: z, y, x."""
+        slots = self.grid.hashmap().active_buf_indices().numpy().astype(np.int64)
+        positions = self.grid.hashmap().key_tensor().numpy()[slots]
+        order = np.lexsort(positions.T)
+        return slots[order], positions[order]
+
+    def neighbors(self) -> np.ndarray:
+        """(slots, 27) int64 slots of the blocks around each block, in the order of AROUND; -1 = none there."""
+        slots, positions = self.blocks()
+        result = np.full((len(self.values), len(AROUND)), NOTHING)
+        result[slots] = self.slots((positions[:, None] + AROUND).reshape(-1, 3)).reshape(-1, len(AROUND))
+        return result
+
+    def find_voxels(self, keys: np.ndarray) -> np.ndarray:
+        """(N,) int64 voxel of each voxel key, 512 x slot + place in the block; -1 where there is no block."""
+        blocks, block_of_key = np.unique(keys // VOXELS, return_inverse=True)
+        slots = self.slots(unpack_blocks(blocks))[block_of_key.ravel()]
+        return np.where(slots >= 0, slots * VOXELS + keys % VOXELS, NOTHING)
+
+
+class NumberedVoxels(VoxelGrid):
+    """Some voxels, each with a number. attribute `number`: (slots, 8, 8, 8, 1) int32, -1 = none of them."""
+
+    ATTRIBUTE = "number"
+
+    @classmethod
+    def from_keys(cls, keys: np.ndarray, voxel_size: float, origin: np.ndarray) -> NumberedVoxels:
+        """keys: (V,) int64 voxel keys (`voxel_keys`), rising; voxel k gets number k."""
+        grid = cls.activate(keys, voxel_size, origin, 1)
+        grid.values[:] = NOTHING
+        grid.values.reshape(-1)[grid.find_voxels(keys)] = np.arange(len(keys), dtype=np.int32)
+        return grid
+
+    def index(self) -> VoxelIndex:
+        """The same for kernels (`find_block`, `find_voxel`)."""
+        slots, positions = self.blocks()
+        table = np.full((1 << int(2 * len(slots)).bit_length(), 2), NOTHING, np.int64)
+        _enter(table, pack_blocks(positions.astype(np.int64)), slots)
+        low, high = (positions.min(axis=0), positions.max(axis=0) + 1) if len(slots) else np.zeros((2, 3))
+        return VoxelIndex(table, self.values[:, :, 0], low.astype(np.int64), high.astype(np.int64))
+
+
+class LabelGrid(VoxelGrid):
+    """The label field: counts of C channels for every side of every voxel. Its rows are what votes are added to.
+
+    attribute `votes`: (slots, 8, 8, 8, SIDES * C) int32
+    """
+
+    ATTRIBUTE = "votes"
+
+    @classmethod
+    def from_voxels(cls, voxels: VoxelOrder, num_channels: int) -> LabelGrid:
+        """An empty field with all blocks of points that are sorted already."""
+        return cls.activate(voxels.keys, voxels.voxel_size, voxels.origin, SIDES * num_channels)
 
     @property
     def votes(self) -> np.ndarray:
-        """(cells, C) int32 view of the counts, shared with the grid; row = what `find` returns."""
-        return self.grid.attribute("votes").numpy().reshape(-1, self.num_channels)
+        """(rows, C) int32 view of the counts, shared with the grid; row = what `find` returns."""
+        values = self.values
+        return values.reshape(-1, values.shape[2] // SIDES)
 
     def find(self, points: np.ndarray, sides: np.ndarray | None = None) -> np.ndarray:
-        """(N,) int64 cell of each (N, 3) point; -1 where there is no block. sides: (N,) 0 or 1; None = side
-        0.
-        """
+        """(N,) int64 row of each (N, 3) world point; -1 where there is no block. sides: (N,) 0 or 1; None = side 0."""
         keys = voxel_keys(points, self.origin, self.voxel_size)
-        cells = self.find_keys(np.maximum(keys, 0))
-        return np.where((keys >= 0) & (cells >= 0), cells if sides is None else cells + sides, -1)
-
-    def find_keys(self, keys: np.ndarray) -> np.ndarray:
-        """(N,) int64 cell, side 0, of each voxel key (`voxel_keys`); -1 where there is no block."""
-        blocks, block_of_key = np.unique(keys // VOXELS, return_inverse=True)
-        slots, found = self.grid.hashmap().find(o3d.core.Tensor(_unpack(blocks)))
-        slots = np.where(found.numpy(), slots.numpy().astype(np.int64), -1)[block_of_key.ravel()]
-        return np.where(slots >= 0, (slots * VOXELS + keys % VOXELS) * SIDES, -1)
-
-    def block_positions(self, blocks: np.ndarray) -> np.ndarray:
-        """(B, 3) int32 positions, in blocks from the origin, of packed block keys (B,)."""
-        return _unpack(blocks)
-
-    def block_votes(self, blocks: np.ndarray) -> np.ndarray:
-        """(B, 8, 8, 8, SIDES * C) int32 counts of packed block keys (B,), which must be in the field."""
-        votes = self.grid.attribute("votes").numpy()
-        return (
-            votes[self.grid.hashmap().find(o3d.core.Tensor(_unpack(blocks)))[0].numpy()]
-            if len(blocks)
-            else votes[:0]
+        voxels = self.find_voxels(np.maximum(keys, 0))
+        return np.where(
+            (keys >= 0) & (voxels >= 0), voxels * SIDES + (0 if sides is None else sides), NOTHING
         )
+
+    def add(self, rows: np.ndarray, counts: np.ndarray) -> None:
+        """Add (N, C) counts at (N,) rows, of which some may be the same."""
+        np.add.at(self.votes, rows, counts)
 
     def merge(self, other: LabelGrid) -> None:
         """Add the counts of another field of the same origin, voxel size and channels."""
-        if (other.voxel_size, other.num_channels) != (self.voxel_size, self.num_channels) or (
-            other.origin != self.origin
-        ).any():
+        same = (other.voxel_size, other.votes.shape[1]) == (self.voxel_size, self.votes.shape[1])
+        if not same or (other.origin != self.origin).any():
             raise ValueError("only fields with the same origin, voxel size and channels can be merged")
-        keys = other.grid.hashmap().key_tensor()[other.grid.hashmap().active_buf_indices().to(o3d.core.int64)]
-        self.grid.hashmap().activate(keys)
-        slots = self.grid.hashmap().find(keys)[0].numpy()
-        theirs = other.grid.attribute("votes").numpy()[other.grid.hashmap().active_buf_indices().numpy()]
-        self.grid.attribute("votes").numpy()[slots] += theirs
+        theirs, positions = other.blocks()
+        self.grid.hashmap().activate(o3d.core.Tensor(positions))
+        self.values[self.slots(positions)] += other.values[theirs]
 
     def save(self, path: Path) -> None:
-        """Write an npz that `VoxelBlockGrid.load` reads, blocks ordered by position. Not by
-        `VoxelBlockGrid.save`, which ends the process if the disk is full.
+        """Write an npz that `VoxelBlockGrid.load` reads, blocks ordered by position. Not by `VoxelBlockGrid.save`,
+        which ends the process if the disk is full.
         """
-        slots = self.grid.hashmap().active_buf_indices().numpy()
-        keys = self.grid.hashmap().key_tensor().numpy()[slots]
-        order = np.lexsort(keys.T)
-        np.savez(
-            path,
-            **{
-                "value_000": self.grid.attribute("votes").numpy()[slots[order]],
-                "key": keys[order],
-                "attr_name_votes": np.zeros(1, np.int32),
-                "CPU:0": np.uint8(0),
-                "block_resolution": np.int64([BLOCK]),
-                "voxel_size": np.float32([self.voxel_size]),
-            },
-        )
+        slots, positions = self.blocks()
+        votes = self.grid.attribute(self.ATTRIBUTE).numpy()[slots]
+        arrays = {"value_000": votes, "key": positions, **file_header(self.voxel_size)}
+        np.savez(path, **arrays)  # type: ignore[arg-type]  # the stub takes keywords for options
+
+
+def file_header(voxel_size: float) -> dict[str, np.ndarray]:
+    """What `VoxelBlockGrid.load` reads in the file of a label field beside `key` (B, 3) and `value_000`."""
+    return {
+        "attr_name_votes": np.zeros(1, np.int32),
+        "CPU:0": np.zeros((), np.uint8),
+        "block_resolution": np.array([BLOCK], np.int64),
+        "voxel_size": np.array([voxel_size], np.float32),
+    }
 
 
 @dataclass(frozen=True)
@@ -178,7 +233,7 @@ def voxel_keys(points: np.ndarray, origin: np.ndarray, voxel_size: float) -> np.
 
     The voxels of a block follow one another in the grid's own order in memory: z outermost, x innermost.
     """
-    return _pack(np.ascontiguousarray(points, np.float64), np.asarray(origin, np.float64), voxel_size)
+    return _key_of(np.ascontiguousarray(points, np.float64), np.asarray(origin, np.float64), voxel_size)
 
 
 def normal_sides(normals: np.ndarray, sorting: VoxelOrder) -> tuple[np.ndarray, np.ndarray]:
@@ -196,7 +251,7 @@ def normal_sides(normals: np.ndarray, sorting: VoxelOrder) -> tuple[np.ndarray, 
 
 
 @numba.njit(parallel=True, cache=True)
-def _pack(points, origin, voxel_size):
+def _key_of(points, origin, voxel_size):
     """Arrays as in voxel_keys."""
     keys = np.empty(len(points), np.int64)
     for row in numba.prange(len(points)):
@@ -212,12 +267,67 @@ def _pack(points, origin, voxel_size):
     return keys
 
 
-def _unpack(blocks: np.ndarray) -> np.ndarray:
+def unpack_blocks(blocks: np.ndarray) -> np.ndarray:
     """(B, 3) int32 block positions of packed ones (B,)."""
-    mask = (1 << AXIS_BITS) - 1
-    return np.stack([blocks >> 2 * AXIS_BITS, blocks >> AXIS_BITS & mask, blocks & mask], axis=1).astype(
-        np.int32
+    packed = [blocks >> 2 * AXIS_BITS, blocks >> AXIS_BITS & AXIS_MASK, blocks & AXIS_MASK]
+    return np.stack(packed, axis=1).astype(np.int32)
+
+
+def pack_blocks(positions: np.ndarray) -> np.ndarray:
+    """(B,) int64 packed block positions of (B, 3) int64 ones."""
+    return (positions[:, 0] << AXIS_BITS | positions[:, 1]) << AXIS_BITS | positions[:, 2]
+
+
+@numba.njit(cache=True)
+def _place(block, size):
+    return np.int64((np.uint64(block) * np.uint64(MIXER)) >> np.uint64(20)) & (size - 1)
+
+
+@numba.njit(cache=True)
+def _enter(table, blocks, slots):
+    """Fill the table of a `VoxelIndex`."""
+    for k in range(len(blocks)):
+        place = _place(blocks[k], len(table))
+        while table[place, 0] != NOTHING:
+            place = (place + 1) & (len(table) - 1)
+        table[place, 0], table[place, 1] = blocks[k], slots[k]
+
+
+@numba.njit(cache=True, inline="always")
+def find_block(table, x, y, z):
+    """Slot of the block at x, y, z (blocks), or -1."""
+    block = ((x << AXIS_BITS | y) << AXIS_BITS) | z
+    place = _place(block, len(table))
+    while table[place, 0] != NOTHING and table[place, 0] != block:
+        place = (place + 1) & (len(table) - 1)
+    return table[place, 1]
+
+
+@numba.njit(cache=True)
+def find_voxel(index, x, y, z):
+    """Number of the voxel at x, y, z >= 0 (voxels), or -1."""
+    block = find_block(index.table, x // BLOCK, y // BLOCK, z // BLOCK)
+    return (
+        index.numbers[block, ((z % BLOCK) * BLOCK + y % BLOCK) * BLOCK + x % BLOCK] if block >= 0 else NOTHING
     )
+
+
+@numba.njit(cache=True)
+def voxel_key(x, y, z):
+    """Key of the voxel at x, y, z >= 0 (voxels)."""
+    return (
+        ((((x // BLOCK << AXIS_BITS | y // BLOCK) << AXIS_BITS) | z // BLOCK) * VOXELS)
+        + ((z % BLOCK) * BLOCK + y % BLOCK) * BLOCK
+        + x % BLOCK
+    )
+
+
+@numba.njit(cache=True)
+def voxel_position(key):
+    """Returns x, y, z in voxels."""
+    block, place = key // VOXELS, key % VOXELS
+    x, y, z = block >> 2 * AXIS_BITS, block >> AXIS_BITS & AXIS_MASK, block & AXIS_MASK
+    return x * BLOCK + place % BLOCK, y * BLOCK + place // BLOCK % BLOCK, z * BLOCK + place // (BLOCK * BLOCK)
 
 
 @numba.njit(parallel=True, cache=True)

@@ -37,9 +37,12 @@ class Similarity:
         return float(np.arccos(np.clip((np.trace(self.rotation) - 1) / 2, -1, 1)))
 
 
-def fit_similarity(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> Similarity:
-    """Least-squares similarity from (N, 3) to (N, 3), N >= 3 (Umeyama 1991); weights (N,) >= 0."""
-    share = np.full(len(source), 1 / len(source)) if weights is None else weights / weights.sum()
+# pycolmap 4.2 has `estimate_sim3d` and `estimate_sim3d_robust`. The former gives the same to 1e-15 and takes 2 us
+# for 20 points instead of 26; the robust one takes 1 ms for 60 photos instead of 24, once per model. Both
+# refuse points that lie exactly on a plane or a line, as the cameras of a flight at one height do.
+def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
+    """Least-squares similarity from (N, 3) to (N, 3), N >= 3 (Umeyama 1991)."""
+    share = np.full(len(source), 1 / len(source))
     source_mean, target_mean = share @ source, share @ target
     source, target = source - source_mean, target - target_mean
     left, singular, right = np.linalg.svd((target * share[:, None]).T @ source)

@@ -17,6 +17,7 @@ import pycolmap
 
 from sc3d.georeferencing.geotags import read_dji_xmp
 from sc3d.georeferencing.gps import Flight
+from sc3d.io.colmap import registered_images
 from sc3d.io.images import open_image
 
 logger = logging.getLogger(__name__)
@@ -65,9 +66,7 @@ def anchor_focal(model: pycolmap.Reconstruction, photos: Path, flight: Flight | 
     returns: estimated and stated focal length (px) of the first camera; empty if EXIF states none
     """
     first = {}
-    for image in sorted(
-        (model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name
-    ):
+    for image in registered_images(model):
         first.setdefault(image.camera_id, image.name)
     stated = {camera_id: exif_focal(photos / name) for camera_id, name in first.items()}
     if not stated or any(focal is None for focal in stated.values()):
@@ -75,7 +74,7 @@ def anchor_focal(model: pycolmap.Reconstruction, photos: Path, flight: Flight | 
             "EXIF states no focal length to keep: where all photos look the same way from one height, heights may be wrong by a constant factor"
         )
         return {}
-    main = model.image(min(model.reg_image_ids(), key=lambda image_id: model.image(image_id).name)).camera_id
+    main = registered_images(model)[0].camera_id
     estimated = model.camera(main).mean_focal_length()
     if not tells_focal(model):
         logger.warning(

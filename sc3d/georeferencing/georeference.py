@@ -15,7 +15,7 @@ Heights pass through unchanged (ellipsoidal as the GPS gives them; drones often 
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -144,6 +144,19 @@ def from_origin(
             *origin[:2],
         )
     return Georeference(zone, offset, origin, altitude_offset=altitude_offset, figures=figures or {})
+
+
+def with_epsg(georeference: Georeference, epsg: int | None) -> Georeference:
+    """The same place in another projected CRS, None = as it is. InputError if the world is not local ENU."""
+    if epsg in (None, georeference.epsg):
+        return georeference
+    if georeference.origin is None:
+        raise InputError(
+            f"the scene's own coordinates are EPSG:{georeference.epsg}: they cannot become EPSG:{epsg} here, "
+            "but `sc3d export --epsg` converts them"
+        )
+    other = from_origin(georeference.origin, epsg)
+    return replace(georeference, epsg=other.epsg, offset=other.offset)
 
 
 def georeference_path(scene: Scene) -> Path:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sc3d.errors import InputError
 from sc3d.georeferencing.alignment import (
     Similarity,
     fit_similarity_robust,
@@ -24,6 +25,7 @@ from sc3d.georeferencing.georeference import (
     utm_epsg,
 )
 from sc3d.georeferencing.geotags import Geotag, enu_positions, read_geotags
+from sc3d.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
 
@@ -137,6 +139,25 @@ def residuals(flight: Flight, centers: dict[str, np.ndarray]) -> dict[str, float
         "rms_vertical": _meters(np.sqrt(squares[2])),
         "rtk_photos": sum(tag.rtk for tag in flight.tags.values()),
     }
+
+
+def georeference_photos(scene: Scene, epsg: int | None) -> Georeference:
+    """Georeference of a scene by the GPS of its photos; InputError if they are not there, or have none that fits
+    the cameras. epsg: None = the UTM zone
+    """
+    views = [view for view in scene.model.views if scene.photo(view.name).is_file()]
+    if not views:
+        raise InputError(
+            f"none of the photos is in {scene.images}: link their folder there, or pass --epsg and --offset"
+        )
+    flight = read_flight(scene.images, [view.name for view in views])
+    centers = {view.name: view.center for view in views}
+    found = find_georeference(flight, centers, scene.model.points, epsg) if flight else None
+    if found is None:
+        raise InputError(
+            f"the photos in {scene.images} have no GPS that fits the cameras: pass --epsg and --offset if the scene is in a CRS"
+        )
+    return found
 
 
 def find_georeference(

@@ -6,13 +6,16 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.georeferencing.georeference import Georeference, projected_crs
+from sc3d.georeferencing.georeference import Georeference, projected_crs, read_georeference
+from sc3d.importers.clouds import Geometry
 from sc3d.importers.project import Project
+from sc3d.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +49,33 @@ def near_origin(project: Project, epsg: int | None) -> Project:
 def whole_offset(points: np.ndarray) -> np.ndarray:
     """(3,) whole-number position near the points; the height stays as it is."""
     return np.round(np.median(points, axis=0)) * [1.0, 1.0, 0.0]
+
+
+def frame_of_scene(
+    scene: Scene, geometry: Geometry, epsg: int | None
+) -> tuple[list[View], Georeference | None]:
+    """Cameras and place of a scene that is there; for one without cameras, a place near a geometry that states
+    a CRS, or whose CRS is `epsg`.
+    """
+    has_cameras = any((scene.sparse / f"cameras{suffix}").exists() for suffix in (".bin", ".txt"))
+    views, georeference = scene.model.views if has_cameras else [], read_georeference(scene)
+    epsg = geometry.epsg or epsg
+    if georeference is None and not views and epsg is not None:
+        georeference = Georeference(epsg, tuple(whole_offset(geometry.positions).tolist()))
+    return views, georeference
+
+
+def place_geometries(
+    geometries: dict[Path, Geometry], georeference: Georeference | None, views: list[View], epsg: int | None
+) -> dict[Path, tuple[Geometry, str]]:
+    """The geometries in the scene's world, each with what its coordinates were taken for. epsg: the CRS of those
+    that state none
+    """
+    placed = {}
+    for path, geometry in geometries.items():
+        positions, frame = to_world(geometry.positions, geometry.epsg or epsg, georeference, views, str(path))
+        placed[path] = replace(geometry, positions=positions), frame
+    return placed
 
 
 def to_world(

@@ -65,7 +65,7 @@ def read(path: Path, settings: Import) -> Project:
     chunk = _chunk(path)
     cameras = {
         sensor.get("id"): to_camera(
-            _lens(sensor, path), settings.tolerance, f"{path}, sensor {sensor.get('label')!r}"
+            _distortion_model(sensor, path), settings.tolerance, f"{path}, sensor {sensor.get('label')!r}"
         )
         for sensor in chunk.iterfind("./sensors/sensor")
         if _calibration(sensor) is not None
@@ -118,7 +118,7 @@ def _calibration(sensor: ElementTree.Element) -> ElementTree.Element | None:
     )
 
 
-def _lens(sensor: ElementTree.Element, path: Path) -> DistortionModel:
+def _distortion_model(sensor: ElementTree.Element, path: Path) -> DistortionModel:
     where, calibration = f"{path}, sensor {sensor.get('label')!r}", _calibration(sensor)
     kind = calibration.get("type") or sensor.get("type", "frame")
     if kind != "frame" and kind not in FISHEYE:

@@ -8,8 +8,11 @@ import numpy as np
 import pycolmap
 
 from sc3d.geometry.cameras import View, in_image, project
+from sc3d.importers.clouds import Geometry
 from sc3d.importers.project import Project
-from sc3d.io.atomic import atomic_path
+from sc3d.io.colmap import build_model, registered_images, write_model
+from sc3d.io.images import link_photos
+from sc3d.scene.scene import Scene
 
 MAX_POINTS = 100_000  # sparse points that are made from a cloud
 # along the longer side of a photo: where tracks are guessed, the nearest points of a cell are seen
@@ -17,42 +20,43 @@ CELLS = 64
 NEAR = 0.03  # of the distance
 
 
-def write_model(
-    path: Path,
-    views: list[View],
-    points: np.ndarray,
-    colors: np.ndarray,
-    observations: list[tuple[np.ndarray, np.ndarray]],
-) -> None:
-    """Write a binary COLMAP model.
+def write_project(
+    scene: Scene, project: Project, photos: Path | None, geometries: list[Geometry]
+) -> dict[str, object]:
+    """Write cameras and points of a project, and link its photos.
 
-    points, colors: (P, 3) float64 and uint8; observations: per view rows (K,) of points and their pixels (K,
-        2)
+    photos: their folder, None = not found; geometries: in the scene's world, of which the first gives the
+        points where the project has none
+    returns: figures for the summary
     """
-    model, cameras = pycolmap.Reconstruction(), {}
-    for view in views:
-        key = (view.camera.model_name, view.width, view.height, *view.camera.params)
-        if key not in cameras:
-            cameras[key] = pycolmap.Camera(view.camera.todict())
-            cameras[key].camera_id = len(cameras)
-            cameras[key].has_prior_focal_length = True
-            model.add_camera_with_trivial_rig(cameras[key])
-        view_id = model.num_images() + 1
-        _, pixels = observations[view_id - 1]
-        keypoints = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
-        image = pycolmap.Image(
-            name=view.name, camera_id=cameras[key].camera_id, image_id=view_id, points2D=keypoints
-        )
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_world[:3]))
-    tracks = [pycolmap.Track() for _ in points]
-    for number, (rows, _) in enumerate(observations, start=1):
-        for position, row in enumerate(rows):
-            tracks[row].add_element(number, position)
-    for point, color, track in zip(points, colors, tracks):
-        model.add_point3D(point, track, color)
-    with atomic_path(path) as temporary:
-        temporary.mkdir(parents=True)
-        model.write_binary(str(temporary))
+    points, colors, observations = project.points, project.colors, project.observations
+    told = "from the project"
+    if not len(points) and geometries:
+        told = "drawn from the cloud, seen where they are nearest"
+        points, colors, observations = *_sparse_points(geometries[0]), None
+    if observations is None:
+        points, colors = sample(points, colors)
+        observations = guess_observations(project.views, points)
+        told = told.replace("from the project", "from the project, seen where they are nearest")
+    if project.model is not None and len(project.points):
+        write_copy(scene.sparse, project)
+    else:
+        write_model(scene.sparse, build_model(project.views, points, colors, observations))
+    if photos is not None:
+        link_photos(photos, scene.images)
+    return {
+        "program": project.program,
+        "photos": len(project.views),
+        "points": len(points),
+        "points_are": told if len(points) else "none",
+        "images": str(photos.resolve()) if photos else "not found: link them to SCENE/images",
+    } | project.notes
+
+
+def _sparse_points(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+    """A sample of the points of a cloud or mesh and their colors, gray without."""
+    gray = np.full((len(geometry.positions), 3), 128, np.uint8)
+    return sample(geometry.positions, gray if geometry.colors is None else geometry.colors)
 
 
 def write_copy(path: Path, project: Project) -> None:
@@ -60,16 +64,11 @@ def write_copy(path: Path, project: Project) -> None:
     else in it is kept.
     """
     model = project.model
-    images = sorted(
-        (model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name
-    )
-    for image, view in zip(images, project.views, strict=True):
+    for image, view in zip(registered_images(model), project.views, strict=True):
         image.name = view.name
     if project.offset.any():
         model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), -project.offset))
-    with atomic_path(path) as temporary:
-        temporary.mkdir(parents=True)
-        model.write_binary(str(temporary))
+    write_model(path, model)
 
 
 def sample(points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

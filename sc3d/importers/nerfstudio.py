@@ -50,7 +50,7 @@ def read(path: Path, settings: Import) -> Project:
         matrix = _matrix(frame.get("transform_matrix"), where)
         world_from_cam = original[:3, :3] @ matrix[:3, :3] * OPENGL
         center = original[:3, :3] @ (matrix[:3, 3] / scale) + original[:3, 3]
-        distortion = _lens(content, frame, file.parent / name, where)
+        distortion = _distortion_model(content, frame, file.parent / name, where)
         camera = cameras.setdefault(distortion, None) or to_camera(distortion, settings.tolerance, where)
         cameras[distortion] = camera
         views.append(View(_tidy(name), camera, rigid(world_from_cam.T, center, where)))
@@ -65,7 +65,7 @@ def read(path: Path, settings: Import) -> Project:
     )
 
 
-def _lens(content: dict, frame: dict, photo: Path, where: str) -> DistortionModel:
+def _distortion_model(content: dict, frame: dict, photo: Path, where: str) -> DistortionModel:
     """Parameters of a frame: those at the top of the file count first, as in nerfstudio."""
 
     def number(key: str, default: float | None = None) -> float | None:

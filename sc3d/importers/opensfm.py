@@ -84,7 +84,7 @@ def read(path: Path, settings: Import) -> Project:
     cameras = {}
     for name, camera in part["cameras"].items():
         where = f"{file}, camera {name!r}"
-        cameras[name] = to_camera(_lens(camera, where), settings.tolerance, where)
+        cameras[name] = to_camera(_distortion_model(camera, where), settings.tolerance, where)
     views = [_view(name, shot, cameras, f"{file}, shot {name!r}") for name, shot in part["shots"].items()]
     points, colors, rows = _points(part.get("points", {}), file)
     root = folder.parent if folder.name == "opensfm" else folder
@@ -116,7 +116,7 @@ def _folder(path: Path) -> Path | None:
     )
 
 
-def _lens(camera: dict, where: str) -> DistortionModel:
+def _distortion_model(camera: dict, where: str) -> DistortionModel:
     kind = camera.get("projection_type", "perspective")
     if kind not in PERSPECTIVE | FISHEYE:
         raise InputError(

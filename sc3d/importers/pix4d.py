@@ -89,7 +89,7 @@ def _header_length(lines: list[tuple[int, str]], file: Path) -> int:
 
 
 def _block(lines: list[tuple[int, str]], file: Path) -> tuple[str, DistortionModel, np.ndarray, np.ndarray]:
-    """Name, lens, rotation (3, 3) and center (3,) of a photo."""
+    """Name, distortion, rotation (3, 3) and center (3,) of a photo."""
     name, *size = lines[0][1].rsplit(maxsplit=2)
     try:
         width, height = (int(word) for word in size)

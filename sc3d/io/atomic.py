@@ -37,7 +37,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     temporary = path.with_name(temporary_name(path.stem) + path.suffix)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if not os.access(path.parent, os.W_OK, effective_ids=True):
+        if not _is_writable(path.parent):
             raise PermissionError
     except (PermissionError, NotADirectoryError, FileExistsError):
         raise InputError(
@@ -99,13 +99,21 @@ def require_room(path: Path, num_bytes: int = 0) -> None:
     """OSError if there is no room for so many bytes, or none at all: some libraries then fail in other words,
     do not notice, or end the process.
     """
-    try:
-        found = os.statvfs(path.parent)
-    except OSError:
-        return
-    free = found.f_bfree if os.geteuid() == 0 else found.f_bavail
-    if found.f_blocks and free * found.f_frsize < num_bytes + ROOM:
+    free = _free_bytes(path.parent)
+    if free is not None and free < num_bytes + ROOM:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from None
+
+
+def _free_bytes(folder: Path) -> int | None:
+    """Room on the disk of a folder; None where it is not known."""
+    try:
+        if not hasattr(os, "statvfs"):  # Windows
+            return shutil.disk_usage(folder).free
+        found = os.statvfs(folder)
+    except OSError:
+        return None
+    free = found.f_bfree if os.geteuid() == 0 else found.f_bavail
+    return free * found.f_frsize if found.f_blocks else None
 
 
 @contextmanager
@@ -133,6 +141,10 @@ def require_inside(folder: Path, path: Path) -> None:
         )
 
 
+def _is_writable(folder: Path) -> bool:
+    return os.access(folder, os.W_OK, effective_ids=os.access in os.supports_effective_ids)
+
+
 def _is_dead(host: str, process: int, entry: Path) -> bool:
     if host == HOST and process != os.getpid() and not _runs(process):
         return True
@@ -143,6 +155,8 @@ def _is_dead(host: str, process: int, entry: Path) -> bool:
 
 
 def _runs(process: int) -> bool:
+    if os.name == "nt":  # where a signal ends the process, whichever it is
+        return True
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -180,6 +194,8 @@ def _sync(path: Path) -> None:
 
 
 def _sync_one(path: Path) -> None:
+    if os.name == "nt":  # which opens no folders, and brings no file to the disk that is open for reading
+        return
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -193,5 +209,5 @@ def _sync_one(path: Path) -> None:
 def require_writable(folder: Path) -> None:
     """Raise InputError, before any work, if a scene folder cannot be written."""
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK, effective_ids=True):
+    if not existing.is_dir() or not _is_writable(existing):
         raise InputError(f"cannot write to {existing}: check its permissions or choose another folder")

@@ -1,4 +1,4 @@
-"""Tables of points on disk: PLY (binary) and LAS/LAZ in chunks, and binary PLY written in chunks."""
+"""Tables of points on disk, read in chunks: PLY (binary), LAS and LAZ."""
 
 from __future__ import annotations
 
@@ -9,21 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.atomic import atomic_path
+from sc3d.io.las import check_las
 from sc3d.io.limits import FARTHEST
-from sc3d.io.ply import Header, check_ply
+from sc3d.io.ply import check_ply
 
 CHUNK = 1_000_000  # rows held at a time
-TYPES = {
-    "i1": "char",
-    "u1": "uchar",
-    "i2": "short",
-    "u2": "ushort",
-    "i4": "int",
-    "u4": "uint",
-    "f4": "float",
-    "f8": "double",
-}
 LAS_FIELDS = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
 LAS_COLORS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 
@@ -44,20 +34,21 @@ class CloudFile:
         """InputError if the file is damaged, empty, or of a kind that cannot be read in chunks."""
         kind = path.suffix.lower()
         if kind in (".las", ".laz"):
-            return _open_las(path)
+            header = check_las(path)
+            return cls(path, np.dtype(LAS_FIELDS + LAS_COLORS * header.has_colors), header.count)
         if kind != ".ply":
             raise InputError(
                 f"{path} does not fit into --max-memory, and can be read in parts as PLY, LAS or LAZ only: convert it, or allow more memory"
             )
         header = check_ply(path)
-        vertex = header.element("vertex")
-        if not header.order or vertex is None or vertex.has_lists or header.elements[0] is not vertex:
+        if header.record is None:
             raise InputError(
                 f"{path} does not fit into --max-memory, and can be read in parts as binary PLY with the vertices first only: write it anew"
             )
-        if not vertex.rows or not {"x", "y", "z"} <= {entry.name for entry in vertex.properties}:
+        num_points = header.elements[0].rows
+        if not num_points or not {"x", "y", "z"} <= set(header.record.names):
             raise InputError(f"{path} holds no points")
-        return cls(path, _record(header), vertex.rows, header.size)
+        return cls(path, header.record, num_points, header.size)
 
     def chunks(self) -> Iterator[tuple[int, np.ndarray]]:
         """First row and records of each chunk; InputError at positions that are not finite or too far away."""
@@ -77,23 +68,6 @@ class CloudFile:
             file.seek(self.offset)
             for start in range(0, self.num_points, CHUNK):
                 yield start, np.fromfile(file, self.dtype, min(CHUNK, self.num_points - start))
-
-
-def _record(header: Header) -> np.dtype:
-    return np.dtype([(entry.name, header.order + entry.dtype) for entry in header.elements[0].properties])
-
-
-def _open_las(path: Path) -> CloudFile:
-    import laspy
-
-    try:
-        with laspy.open(path) as file:
-            colored = {"red", "green", "blue"} <= set(file.header.point_format.dimension_names)
-            return CloudFile(
-                path, np.dtype(LAS_FIELDS + (LAS_COLORS if colored else [])), file.header.point_count
-            )
-    except (OSError, ValueError, laspy.errors.LaspyException) as error:
-        raise InputError(f"cannot read {path}: {error}") from None
 
 
 def _read_las(cloud: CloudFile) -> Iterator[tuple[int, np.ndarray]]:
@@ -122,27 +96,3 @@ def columns(records: np.ndarray, names: Iterable[str]) -> np.ndarray | None:
     if not set(names) <= set(records.dtype.names):
         return None
     return np.stack([records[name] for name in names], axis=1)
-
-
-def write_ply(path: Path, dtype: np.dtype, num_points: int, chunks: Iterable[np.ndarray]) -> None:
-    """Write records of `dtype` (native fields without byte order) as a binary PLY, atomically."""
-    lines = [f"property {TYPES[dtype[name].str[1:]]} {name}" for name in dtype.names]
-    header = "\n".join(
-        [
-            "ply",
-            "format binary_little_endian 1.0",
-            "comment sc3d",
-            f"element vertex {num_points}",
-            *lines,
-            "end_header",
-            "",
-        ]
-    )
-    written = 0
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(header.encode("ascii"))
-        for records in chunks:
-            file.write(np.ascontiguousarray(records, dtype))  # not tofile, which hides a full disk
-            written += len(records)
-        if written != num_points:
-            raise ValueError(f"{written} records instead of {num_points}")

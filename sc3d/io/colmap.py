@@ -1,4 +1,4 @@
-"""COLMAP models, read by pycolmap after a look at them.
+"""COLMAP models, read by pycolmap after a look at them, taken apart, put together and written.
 
 pycolmap believes the counts in binary files: one that is too large makes it fill the memory, or read on
 behind the end for ever. In text files a
@@ -11,15 +11,17 @@ from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import pycolmap
 
 from sc3d.errors import InputError
-from sc3d.io.limits import FARTHEST, MAX_PIXELS, MAX_SIDE
+from sc3d.io.atomic import atomic_path
+from sc3d.io.limits import FARTHEST, MAX_PIXELS, MAX_SIDE, DamagedFileError
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")  # rigs and frames only in newer models
 LARGEST = 1 << 62  # count of a list: bounded by the size of the file alone
@@ -28,11 +30,8 @@ POINT = np.array([[0, 43, 0, 0, 0], [8, 8, 0, LARGEST, 0]])
 # id, rig, rotation, translation; sensor and photo
 FRAME = np.array([[0, 64, 0, 0, 0], [4, 16, 0, LARGEST, 0]])
 MAX_NAME = 4096  # bytes of a photo name
+NO_POINTS = np.zeros((0, 3))
 NOT_RIGID = 0.01  # largest error of R R^T: text models are rounded
-
-
-class _Damage(ValueError):
-    """Completes "<file> of the COLMAP model in <folder>"."""
 
 
 def load_model(folder: Path) -> pycolmap.Reconstruction:
@@ -61,6 +60,91 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
         _check_camera(model.camera(camera_id), folder)
     _check_poses(poses, names, folder)
     return model
+
+
+class Photo(Protocol):
+    """A photo's camera; cam_from_world: (4, 4) rigid transform. `geometry.cameras.View` is one."""
+
+    name: str
+    camera: pycolmap.Camera
+    cam_from_world: np.ndarray
+
+
+def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    """The photos that have a pose, by name; they die with the model."""
+    return sorted((model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name)
+
+
+def copy_cameras(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
+    """The cameras by id, which do not die with the model."""
+    return {camera_id: pycolmap.Camera(model.camera(camera_id).todict()) for camera_id in model.cameras}
+
+
+def cam_from_world(image: pycolmap.Image) -> np.ndarray:
+    """(4, 4) float64 rigid transform."""
+    matrix = np.eye(4)
+    matrix[:3] = image.cam_from_world().matrix()
+    return matrix
+
+
+def point_arrays(model: pycolmap.Reconstruction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(P,) uint64 ids of the points in order, (P, 3) float64 world positions, (P, 3) uint8 RGB."""
+    ids = np.array(sorted(model.point3D_ids()), np.uint64)
+    points = [model.point3D(int(point_id)) for point_id in ids]
+    xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
+    return ids, xyz, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
+
+
+def observed_rows(image: pycolmap.Image, point_ids: np.ndarray) -> np.ndarray:
+    """(K,) row of the point that each of a photo's `get_observation_points2D` shows; -1 for those that were
+    filtered out of the model. point_ids: (P,) in order
+    """
+    seen = np.array([keypoint.point3D_id for keypoint in image.get_observation_points2D()], np.uint64)
+    rows = np.searchsorted(point_ids, seen)
+    known = np.append(point_ids, np.uint64(0))[rows] == seen
+    return np.where(known & (rows < len(point_ids)), rows, -1)
+
+
+def build_model(
+    views: Sequence[Photo],
+    points: np.ndarray = NO_POINTS,
+    colors: np.ndarray = NO_POINTS,
+    observations: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
+) -> pycolmap.Reconstruction:
+    """A model of views, of which those with equal cameras share one; photos are numbered from 1 in their order.
+
+    points, colors: (P, 3) float64 world and uint8 RGB
+    observations: per view the rows (K,) of points that it sees and their pixels (K, 2); None = nothing
+    """
+    model, cameras = pycolmap.Reconstruction(), {}
+    observations = [((), ())] * len(views) if observations is None else observations
+    for number, (view, (_, pixels)) in enumerate(zip(views, observations, strict=True), start=1):
+        key = (view.camera.model_name, view.camera.width, view.camera.height, *view.camera.params)
+        if key not in cameras:
+            cameras[key] = pycolmap.Camera(view.camera.todict())
+            cameras[key].camera_id, cameras[key].has_prior_focal_length = len(cameras), True
+            model.add_camera_with_trivial_rig(cameras[key])
+        image = pycolmap.Image(
+            name=view.name,
+            camera_id=cameras[key].camera_id,
+            image_id=number,
+            points2D=pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels]),
+        )
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_world[:3]))
+    tracks = [pycolmap.Track() for _ in points]
+    for number, (rows, _) in enumerate(observations, start=1):
+        for position, row in enumerate(rows):
+            tracks[row].add_element(number, position)
+    for point, color, track in zip(points, colors, tracks, strict=True):
+        model.add_point3D(point, track, color)
+    return model
+
+
+def write_model(path: Path, model: pycolmap.Reconstruction) -> None:
+    """Write a binary model as the folder `path`, atomically."""
+    with atomic_path(path) as temporary:
+        temporary.mkdir()
+        model.write_binary(str(temporary))
 
 
 def _check_camera(camera: pycolmap.Camera, folder: Path) -> None:
@@ -114,8 +198,8 @@ def check_counts(folder: Path) -> None:
             continue
         try:
             _check_file(file, walks[name])
-        except (_Damage, struct.error) as error:
-            what = str(error) if isinstance(error, _Damage) else "is cut off"
+        except (DamagedFileError, struct.error) as error:
+            what = str(error) if isinstance(error, DamagedFileError) else "is cut off"
             raise InputError(
                 f"{file.name} of the COLMAP model in {folder} {what}: it is damaged, write or copy it again"
             ) from None
@@ -123,16 +207,16 @@ def check_counts(folder: Path) -> None:
 
 def _check_file(file: Path, walk: Callable[[mmap.mmap, int], int]) -> None:
     if not file.is_file():
-        raise _Damage("is no file")
+        raise DamagedFileError("is no file")
     if file.stat().st_size < 8:
-        raise _Damage("is cut off")
+        raise DamagedFileError("is cut off")
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         count = _read("<Q", data, 0)[0]
         if count > len(data) // 8:  # no record is shorter
-            raise _Damage(f"announces {count} entries in {len(data)} bytes")
+            raise DamagedFileError(f"announces {count} entries in {len(data)} bytes")
         end = walk(data, count)
         if end != len(data):
-            raise _Damage(
+            raise DamagedFileError(
                 "is cut off" if end > len(data) else f"has {len(data) - end} bytes more than it announces"
             )
 
@@ -155,7 +239,7 @@ def _num_params(model: int) -> int:
     try:
         return len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1).params)
     except (ValueError, TypeError):
-        raise _Damage(f"has a camera of the unknown model {model}") from None
+        raise DamagedFileError(f"has a camera of the unknown model {model}") from None
 
 
 def _walk_rigs(data: mmap.mmap, count: int) -> int:
@@ -187,7 +271,7 @@ def _walk_records(data: mmap.mmap, count: int, fields: np.ndarray) -> int:
     end, row = kernels.walk_bytes(view, 8, count, fields, False)
     del view  # it would keep the file mapped
     if end < 0:
-        raise _Damage(f"is cut off in entry {row} of {count}")
+        raise DamagedFileError(f"is cut off in entry {row} of {count}")
     return end
 
 
@@ -197,15 +281,15 @@ def _walk_images(data: mmap.mmap, count: int) -> int:
         _once(_read("<I", data, position)[0], ids, "photo")
         end = data.find(b"\0", position + 64, position + 64 + MAX_NAME)
         if end < 0:
-            raise _Damage(f"has a photo whose name does not end within {MAX_NAME} bytes")
+            raise DamagedFileError(f"has a photo whose name does not end within {MAX_NAME} bytes")
         points = _read("<Q", data, end + 1)[0]
         position = end + 9 + 24 * points
         if position > len(data):
-            raise _Damage(f"is cut off: photo {len(ids)} of {count} announces {points} keypoints")
+            raise DamagedFileError(f"is cut off: photo {len(ids)} of {count} announces {points} keypoints")
     return position
 
 
 def _once(number: int, ids: set[int], what: str) -> None:
     if number in ids:
-        raise _Damage(f"has the {what} {number} twice")
+        raise DamagedFileError(f"has the {what} {number} twice")
     ids.add(number)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import mmap
+import os
+import shutil
 import struct
 import warnings
 from collections.abc import Iterator
@@ -125,6 +128,26 @@ def find_photos(folder: Path) -> list[Path]:
     return photos
 
 
+def require_place(photos: Path, images: Path) -> None:
+    """InputError if `images` already holds other photos than those of the folder `photos`."""
+    if images.exists() and not images.is_symlink() and images.resolve() != photos.resolve():
+        raise InputError(f"{images} already holds other photos: choose another scene folder")
+
+
+def link_photos(photos: Path, images: Path) -> None:
+    """Make `images` a link to a folder of photos, a copy where links are not possible; nothing if it is that
+    folder. InputError if it already holds others.
+    """
+    require_place(photos, images)
+    if images.exists() and images.resolve() == photos.resolve():
+        return
+    with atomic_path(images) as temporary:
+        try:
+            os.symlink(photos.resolve(), temporary, target_is_directory=True)
+        except (OSError, NotImplementedError):  # Windows asks for a privilege
+            shutil.copytree(photos, temporary)
+
+
 def require_within(file: Path, folder: Path) -> None:
     """InputError if a file of a folder is a link to a file outside of it; the folder itself may be a link."""
     if not file.resolve().is_relative_to(folder.resolve()):
@@ -172,6 +195,20 @@ def read_index_image(path: Path) -> np.ndarray:
                 f"{path} has colors ({image.mode}): an 8-bit PNG with one id per pixel is expected"
             )
         return np.array(image.convert("L") if image.mode == "1" else image, dtype=np.uint8)
+
+
+def data_uri(image: np.ndarray, suffix: str = ".jpg") -> str:
+    """A picture as an address that holds it, for pages of one file.
+
+    image: (H, W, 3) uint8 RGB, or (H, W, 4) with opacity for PNG; suffix: ".jpg", of quality 85, or ".png"
+    """
+    import cv2
+
+    channels = [2, 1, 0, 3][: image.shape[2]]  # OpenCV's order
+    options = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, 85], ".png": [cv2.IMWRITE_PNG_COMPRESSION, 9]}[suffix]
+    encoded = cv2.imencode(suffix, np.ascontiguousarray(image[..., channels]), options)[1]
+    kind = {".jpg": "jpeg", ".png": "png"}[suffix]
+    return f"data:image/{kind};base64,{base64.b64encode(encoded.tobytes()).decode()}"
 
 
 def write_image(path: Path, image: np.ndarray) -> None:

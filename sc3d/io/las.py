@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sc3d.errors import InputError
+from sc3d.io.limits import DamagedFileError
 
 HEADER, HEADER_14 = 227, 375  # bytes, of versions up to 1.2 and of 1.4
 VLR, EVLR = 54, 60  # bytes of the header of a record
 POINT_SIZES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)  # bytes, smallest possible per point format
+COLORED = (2, 3, 5, 7, 8, 10)  # point formats that have red, green and blue
 LASZIP = (b"laszip encoded\0\0", 22204)
 # bytes per type of item; 0 and 14 are bytes of any number
 ITEM_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
@@ -29,11 +31,12 @@ VARIABLE, LARGEST_CHUNK = 2**32 - 1, 64 << 20
 STREAMED = -1  # the chunk table's position is at the end of the file
 
 
-class _Damage(ValueError):
-    """Completes "<file>"."""
+class LasHeader(NamedTuple):
+    """size: bytes, then num_vlrs records up to `offset`, where the points begin; form: point format, 128 more if
+    they are compressed; record: bytes of a point; count: of points; evlrs: position and number of extended
+    records.
+    """
 
-
-class _Header(NamedTuple):
     size: int
     offset: int
     num_vlrs: int
@@ -42,41 +45,48 @@ class _Header(NamedTuple):
     count: int
     evlrs: tuple[int, int]
 
+    @property
+    def has_colors(self) -> bool:
+        return self.form & 63 in COLORED
 
-def check_las(path: Path) -> None:
-    """InputError unless a LAS or LAZ file holds what its header announces."""
+
+def check_las(path: Path) -> LasHeader:
+    """The header; InputError unless a LAS or LAZ file holds what it announces."""
     if not path.is_file():
         raise InputError(f"{path} is missing")
     if path.stat().st_size < HEADER:
         raise InputError(f"{path} is not a LAS file: it is shorter than a header")
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         try:
-            _check(data)
-        except (_Damage, struct.error) as error:
-            what = str(error) if isinstance(error, _Damage) else "is cut off"
+            return _check(data)
+        except (DamagedFileError, struct.error) as error:
+            what = str(error) if isinstance(error, DamagedFileError) else "is cut off"
             raise InputError(f"cannot read {path}: it {what}; write or copy it again") from None
 
 
-def _check(data: mmap.mmap) -> None:
+def _check(data: mmap.mmap) -> LasHeader:
     header = _read_header(data)
     laszip = _walk_vlrs(data, header)
     _walk_evlrs(data, *header.evlrs)
     room = len(data) - header.offset
     if header.form < 128:
         if header.count * header.record > room:
-            raise _Damage(f"announces {header.count} points of {header.record} bytes, {room} bytes are there")
-        return
+            raise DamagedFileError(
+                f"announces {header.count} points of {header.record} bytes, {room} bytes are there"
+            )
+        return header
     if header.count * header.record > RATIO * room + SLACK:
-        raise _Damage(f"announces {header.count} points in {room} compressed bytes, which cannot be")
+        raise DamagedFileError(f"announces {header.count} points in {room} compressed bytes, which cannot be")
     if laszip is None:
-        raise _Damage("is compressed, but does not say how")
+        raise DamagedFileError("is compressed, but does not say how")
     if header.count:
         _check_chunks(data, header, laszip)
+    return header
 
 
-def _read_header(data: mmap.mmap) -> _Header:
+def _read_header(data: mmap.mmap) -> LasHeader:
     if data[:4] != b"LASF":
-        raise _Damage("is not a LAS file")
+        raise DamagedFileError("is not a LAS file")
     minor = data[25]
     size, offset, num_vlrs, form, record, count = struct.unpack_from("<HIIBHI", data, 94)
     evlrs = (0, 0)
@@ -84,22 +94,22 @@ def _read_header(data: mmap.mmap) -> _Header:
         start, number, count = struct.unpack_from("<QIQ", data, 235)
         evlrs = (start, number)
     if size < (HEADER_14 if minor >= 4 else HEADER) or not size <= offset <= len(data):
-        raise _Damage("has a header of an impossible size")
+        raise DamagedFileError("has a header of an impossible size")
     if form & 63 >= len(POINT_SIZES) or record < POINT_SIZES[form & 63]:
-        raise _Damage(f"has points of an impossible format ({form & 63}, {record} bytes)")
-    return _Header(size, offset, num_vlrs, form, record, count, evlrs)
+        raise DamagedFileError(f"has points of an impossible format ({form & 63}, {record} bytes)")
+    return LasHeader(size, offset, num_vlrs, form, record, count, evlrs)
 
 
-def _walk_vlrs(data: mmap.mmap, header: _Header) -> bytes | None:
+def _walk_vlrs(data: mmap.mmap, header: LasHeader) -> bytes | None:
     """The content of LASzip's record, if there is one."""
     position, found = header.size, None
     if header.num_vlrs * VLR > header.offset - header.size:
-        raise _Damage(f"announces {header.num_vlrs} records in {header.offset - header.size} bytes")
+        raise DamagedFileError(f"announces {header.num_vlrs} records in {header.offset - header.size} bytes")
     for _ in range(header.num_vlrs):
         user, number, length = struct.unpack_from("<16sHH", data, position + 2)
         position += VLR + length
         if position > header.offset:
-            raise _Damage("has a record that reaches into the points")
+            raise DamagedFileError("has a record that reaches into the points")
         if (user, number) == LASZIP:
             found = data[position - length : position]
     return found
@@ -107,14 +117,14 @@ def _walk_vlrs(data: mmap.mmap, header: _Header) -> bytes | None:
 
 def _walk_evlrs(data: mmap.mmap, position: int, count: int) -> None:
     if count and (position < HEADER_14 or count * EVLR > len(data) - position):
-        raise _Damage(f"announces {count} extended records that are not there")
+        raise DamagedFileError(f"announces {count} extended records that are not there")
     for _ in range(count):
         position += EVLR + struct.unpack_from("<Q", data, position + 20)[0]
         if position > len(data):
-            raise _Damage("has an extended record that is cut off")
+            raise DamagedFileError("has an extended record that is cut off")
 
 
-def _check_chunks(data: mmap.mmap, header: _Header, laszip: bytes) -> None:
+def _check_chunks(data: mmap.mmap, header: LasHeader, laszip: bytes) -> None:
     kind, chunk = struct.unpack_from("<H10xI", laszip)
     num_items = struct.unpack_from("<H", laszip, 32)[0]
     items = [struct.unpack_from("<HHH", laszip, 34 + 6 * row) for row in range(num_items)]
@@ -125,31 +135,31 @@ def _check_chunks(data: mmap.mmap, header: _Header, laszip: bytes) -> None:
         or one_size
         and not 0 < chunk * header.record <= max(LARGEST_CHUNK, header.count * header.record)
     ):
-        raise _Damage(f"has compressed chunks of {chunk} points, which cannot be")
+        raise DamagedFileError(f"has compressed chunks of {chunk} points, which cannot be")
     if kind not in (POINTWISE, LAYERED) or sum(size for _, size, _ in items) != header.record:
-        raise _Damage("has points that are compressed in an unknown way")
+        raise DamagedFileError("has points that are compressed in an unknown way")
     if any(ITEM_SIZES.get(item, size if item in (0, 14) else 0) != size for item, size, _ in items):
-        raise _Damage("has points that are compressed in an unknown way")
+        raise DamagedFileError("has points that are compressed in an unknown way")
     table = struct.unpack_from("<q", data, header.offset)[0]
     table = struct.unpack_from("<q", data, len(data) - 8)[0] if table == STREAMED else table
     if not header.offset + 8 <= table <= len(data) - 8:
-        raise _Damage("has no table of compressed chunks")
+        raise DamagedFileError("has no table of compressed chunks")
     num_chunks = struct.unpack_from("<I", data, table + 4)[0]
     if num_chunks > header.count or (one_size and num_chunks != -(-header.count // chunk)):
-        raise _Damage(f"announces {num_chunks} compressed chunks for {header.count} points")
+        raise DamagedFileError(f"announces {num_chunks} compressed chunks for {header.count} points")
     if kind == LAYERED:
         _walk_layers(
             data, header, (table, num_chunks), sum(LAYERS.get(item, size) for item, size, _ in items)
         )
 
 
-def _walk_layers(data: mmap.mmap, header: _Header, chunks: tuple[int, int], num_layers: int) -> None:
+def _walk_layers(data: mmap.mmap, header: LasHeader, chunks: tuple[int, int], num_layers: int) -> None:
     """Every chunk: its first point, the number of its points, the sizes of its layers, the layers."""
     position, (table, num_chunks), total = header.offset + 8, chunks, 0
     for _ in range(num_chunks):
         count, *sizes = struct.unpack_from(f"<I{num_layers}I", data, position + header.record)
         position, total = position + header.record + 4 + 4 * num_layers + sum(sizes), total + count
         if position > table:
-            raise _Damage("has a compressed chunk that is cut off")
+            raise DamagedFileError("has a compressed chunk that is cut off")
     if position != table or total != header.count:
-        raise _Damage(f"has {total} points in its compressed chunks, {header.count} are announced")
+        raise DamagedFileError(f"has {total} points in its compressed chunks, {header.count} are announced")

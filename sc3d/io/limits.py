@@ -1,13 +1,14 @@
-"""How files are built: counts and sizes are compared with what is there before a native library, which may
-crash or fill the memory, reads them.
+"""What a file may announce at most. Counts and sizes are compared with what is there before a native library,
+which may crash or fill the memory, reads them.
 """
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    pass
-
 FARTHEST = 1e10  # world units from the origin: float64 has no millimeters beyond
-# the largest cameras of drones have 151 megapixels; what a few bytes can announce must fit into the memory
+# of a photo: the largest cameras of drones have 151 megapixels; what a few bytes can announce must fit into
+# the memory
 MAX_PIXELS = 160_000_000
-MAX_SIDE = 100_000
+MAX_SIDE = 100_000  # px
+MAX_MASK_PIXELS = 100_000_000  # of a mask that is larger than its photo: sharper masks are of no use
+
+
+class DamagedFileError(ValueError):
+    """Says what is wrong in words that complete "<file>"; who knows the file makes an InputError of it."""

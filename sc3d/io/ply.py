@@ -1,4 +1,4 @@
-"""PLY files: the header, and whether the rest is what the header announces.
+"""PLY files: the header, whether the rest is what the header announces, and tables of records written.
 
 Open3D reads them with RPly, which writes beyond its buffer for long names, runs for ever over elements
 without properties, follows vertex numbers that
@@ -9,6 +9,8 @@ before.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.io.atomic import atomic_path
 
 TYPES = {
     "char": "i1",
@@ -35,6 +38,7 @@ TYPES = {
     "double": "f8",
     "float64": "f8",
 }
+NAMES = {code: name for name, code in reversed(TYPES.items())}  # those that RPly and Open3D write
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 MAX_HEADER = 1 << 16  # bytes
 MAX_WORD, MAX_LINE = 250, 1000  # characters that RPly has room for
@@ -80,6 +84,14 @@ class Header:
 
     def element(self, name: str) -> Element | None:
         return next((element for element in self.elements if element.name == name), None)
+
+    @property
+    def record(self) -> np.dtype | None:
+        """Of a vertex of a binary PLY; None unless the vertices come first and have no lists."""
+        first = self.elements[0] if self.elements else None
+        if not self.order or first is None or first.name != "vertex" or first.has_lists:
+            return None
+        return np.dtype([(entry.name, self.order + entry.dtype) for entry in first.properties])
 
 
 def read_header(path: Path) -> Header:
@@ -215,28 +227,32 @@ def check_ply(path: Path) -> Header:
     return header
 
 
+def read_records(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    """(N,) structured vertices of a binary PLY that is checked before, and its comments; InputError for any
+    other, or if the vertices do not come first or have lists.
+    """
+    header = check_ply(path)
+    if header.record is None:
+        raise InputError(f"{path}: a binary PLY with the vertices first is expected")
+    return np.fromfile(path, header.record, header.elements[0].rows, offset=header.size), header.comments
+
+
 def read_positions(path: Path, header: Header) -> np.ndarray | None:
     """(V, 3) float64 x, y, z of the vertices of a checked PLY, which Open3D keeps for clouds only; None
     unless they are doubles and come first.
     """
     vertex = header.elements[0] if header.elements else None
-    names = (
-        []
-        if vertex is None or vertex.name != "vertex" or vertex.has_lists
-        else [entry.name for entry in vertex.properties if entry.dtype == "f8"]
-    )
-    if not {"x", "y", "z"} <= set(names):
+    if vertex is None or vertex.name != "vertex" or vertex.has_lists:
+        return None
+    columns = [entry.name for entry in vertex.properties]
+    if not {"x", "y", "z"} <= {entry.name for entry in vertex.properties if entry.dtype == "f8"}:
         return None
     if header.order:
-        dtype = np.dtype([(entry.name, header.order + entry.dtype) for entry in vertex.properties])
-        table = np.fromfile(path, dtype, vertex.rows, offset=header.size)
+        table = np.fromfile(path, header.record, vertex.rows, offset=header.size)
         return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     with path.open("rb") as file:
         file.seek(header.size)
-        table = np.fromfile(file, np.float64, vertex.rows * len(vertex.properties), sep=" ").reshape(
-            vertex.rows, -1
-        )
-    columns = [entry.name for entry in vertex.properties]
+        table = np.fromfile(file, np.float64, vertex.rows * len(columns), sep=" ").reshape(vertex.rows, -1)
     return np.stack([table[:, columns.index(axis)] for axis in "xyz"], axis=1)
 
 
@@ -330,3 +346,82 @@ def _check_types(path: Path, element: Element, table: np.ndarray) -> None:
             raise InputError(
                 f"{path}: {entry.name} of {element.name!r} {int(np.argmax(wrong))} is {column[np.argmax(wrong)]:g}, which its type cannot hold"
             )
+
+
+def write_records(
+    path: Path,
+    records: np.ndarray | Iterable[np.ndarray],
+    dtype: np.dtype | None = None,
+    count: int | None = None,
+    comments: Sequence[str] = (),
+) -> None:
+    """Write records as the vertices of a binary little endian PLY, atomically.
+
+    records: (N,) structured, or chunks of such, one after the other; fields are numbers, in the file's order
+    dtype: of all records, in any byte order; count: of all records; both known from `records` if that is
+        one array
+    comments: lines of the header; a text of several lines makes several
+    ValueError if there are more or fewer records, or a field that a PLY cannot have.
+    """
+    if isinstance(records, np.ndarray):
+        dtype, count, records = records.dtype if dtype is None else dtype, len(records), [records]
+    if dtype is None or count is None:
+        raise ValueError("chunks need a dtype and a count")
+    with record_writer(path, dtype, count, comments) as append:
+        for chunk in records:
+            append(chunk)
+
+
+@contextmanager
+def record_writer(
+    path: Path, dtype: np.dtype, count: int, comments: Sequence[str] = ()
+) -> Iterator[Callable[[np.ndarray], None]]:
+    """Yield the function that appends (N,) records; the file gets its name when the block succeeds. Arguments
+    as in `write_records`.
+    """
+    vertex = vertex_element(dtype, count)
+    packed = np.dtype([(entry.name, "<" + entry.dtype) for entry in vertex.properties])
+    written = 0
+    with atomic_path(Path(path)) as temporary, temporary.open("wb") as file:
+        file.write(format_header([vertex], comments))
+
+        def append(records: np.ndarray) -> None:
+            nonlocal written
+            if records.dtype.names != packed.names:
+                raise ValueError(f"records of {records.dtype.names} instead of {packed.names}")
+            file.write(np.ascontiguousarray(records, packed))  # not tofile, which hides a full disk
+            written += len(records)
+
+        yield append
+        if written != count:
+            raise ValueError(f"{written} records instead of {count}")
+
+
+def vertex_element(dtype: np.dtype, count: int) -> Element:
+    """The element "vertex" of structured records; ValueError for a field that a PLY cannot have."""
+    for name in dtype.names:
+        if dtype[name].str[1:] not in NAMES:
+            raise ValueError(f"{name!r} is of type {dtype[name]}, which PLY does not have")
+    return Element("vertex", count, tuple(Property(name, dtype[name].str[1:]) for name in dtype.names))
+
+
+def format_header(elements: Iterable[Element], comments: Sequence[str] = (), size: int = 0) -> bytes:
+    """The header of a binary little endian PLY, which `read_header` takes; ValueError for a name or a line
+    that it would not.
+
+    size: bytes that the header shall have at least, by dots behind the last comment; for counts that are
+        known at the end only
+    """
+    elements, lines = tuple(elements), ["format binary_little_endian 1.0"]
+    lines += [f"comment {line}" for text in comments for line in text.splitlines()]
+    last = len(lines) - 1
+    for element in elements:
+        lines.append(f"element {element.name} {element.rows}")
+        for entry in element.properties:
+            kind = f"list {NAMES[entry.count]} {NAMES[entry.dtype]}" if entry.count else NAMES[entry.dtype]
+            lines.append(f"property {kind} {entry.name}")
+    lines[last] += "." * (size - len("\n".join(["ply", *lines, "end_header", ""]).encode())) if last else ""
+    header = "\n".join(["ply", *lines, "end_header", ""]).encode()
+    if _parse(lines, len(header)).elements != elements or len(header) > MAX_HEADER:
+        raise ValueError("a PLY cannot have these names, or so long a header")
+    return header

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import platform
-import resource
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -58,4 +57,13 @@ def peak_memory_mb() -> int:
     with suppress(OSError, StopIteration):
         lines = Path("/proc/self/status").read_text().splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) // 1024
+    return process_peak_mb()
+
+
+def process_peak_mb() -> int:
+    """Largest resident memory since the process began, MB; 0 where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return 0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024

@@ -15,9 +15,10 @@ from sc3d.geometry.cameras import View
 from sc3d.io.clouds import read_cloud
 from sc3d.io.images import image_size, read_index_image
 from sc3d.labelling.density import GaussianField, gaussian_density, kernel_density
-from sc3d.labelling.fusion import Mask
+from sc3d.labelling.observation import Mask
 from sc3d.scene.labelled_cloud import spacing_of
 from sc3d.scene.scene import Scene
+from sc3d.scene.splats import read_scene_splats
 
 FOOTPRINT_SAMPLE = 1000
 
@@ -44,26 +45,16 @@ class Masks:
         scene.require(scene.masks, hint="run `sc3d segment SCENE` first, with --masks if you have some")
         files = scene.mask_files(scene.masks, scene.class_table())
         confidences = scene.mask_files(confidence) if confidence is not None and confidence.is_dir() else {}
-        different = next(
-            (
-                name
-                for name, path in confidences.items()
-                if name in files and image_size(path) != image_size(files[name])
-            ),
-            None,
-        )
-        if different:
-            raise InputError(
-                f"{confidences[different]} has another size than its mask: both must be the same"
-            )
+        for name, path in confidences.items():
+            if name in files and image_size(path) != image_size(files[name]):
+                raise InputError(f"{path} has another size than its mask: both must be the same")
         return cls(files, confidences, [view for view in scene.model.views if view.name in files])
 
     def read(self, view: View) -> Mask:
         """As `fuse` wants it."""
         confidence = self.confidences.get(view.name)
-        return read_index_image(self.files[view.name]), None if confidence is None else read_index_image(
-            confidence
-        )
+        sure = None if confidence is None else read_index_image(confidence)
+        return read_index_image(self.files[view.name]), sure
 
 
 def best_confidence(scene: Scene) -> Path:
@@ -107,14 +98,4 @@ def point_density(
     """
     if not scene.gaussians.exists():
         return kernel_density(points, voxel_size, origin)
-    from sc3d.splatting.dataset import load_gaussians  # loads torch
-
-    gaussians, origin = load_gaussians(scene)
-    rotations, scales, opacities = (
-        values.numpy() for values in (gaussians.rotations, gaussians.scales, gaussians.opacities)
-    )
-    return gaussian_density(
-        points,
-        GaussianField(gaussians.means.numpy().astype(np.float64) + origin, rotations, scales, opacities),
-        voxel_size,
-    )
+    return gaussian_density(points, GaussianField.from_arrays(*read_scene_splats(scene)), voxel_size)

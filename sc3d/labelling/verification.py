@@ -17,22 +17,12 @@ from typing import BinaryIO
 import numba
 import numpy as np
 
-from sc3d.geometry.voxels import AXIS_BITS
+from sc3d.geometry.voxels import SIDES, VOXELS, LabelGrid
 
 # belief in a view where it says little: as if so many of its votes had been right at this rate
 PRIOR_VIEWS, PRIOR_SHARE = 2.0, 0.8
 MIN_RELIABILITY = 0.05
 NEIGHBOR_WEIGHTS = (8, 4, 2, 1)  # of the blocks around a place, by the number of axes along which they differ
-
-
-@dataclass(frozen=True)
-class Places:
-    """Where a view's reliability is judged: B blocks. of_cell: (K,) int64 block of each cell; neighbors: (B,
-    27) as `neighbor_blocks` gives.
-    """
-
-    of_cell: np.ndarray
-    neighbors: np.ndarray
 
 
 @dataclass
@@ -55,43 +45,34 @@ class VoteLog:
         """Cells int32, labels uint8 and weights uint16 of each view, in turn."""
         self.file.seek(0)
         for count in self.counts:
-            yield tuple(
+            cells, labels, weights = (
                 np.frombuffer(self.file.read(count * np.dtype(kind).itemsize), kind)
                 for kind in (np.int32, np.uint8, np.uint16)
             )
+            yield cells, labels, weights
 
 
-def verify(log: VoteLog, winner: np.ndarray, places: Places, full_vote: int, votes: np.ndarray) -> np.ndarray:
-    """Vote again: each view's vote times the square of its reliability there, the share of its votes nearby
-    that agree with the winners.
+def verify(
+    log: VoteLog, winner: np.ndarray, grid: LabelGrid, rows: np.ndarray, full_vote: int, reweigh: bool
+) -> np.ndarray:
+    """Hold each view's votes against the winners around each place; a place is a block of the grid.
 
-    winner: (K,) uint8 fused labels; full_vote: the largest weight
-    votes: (K, C) int32, overwritten except for channel 0
-    returns: (K,) bool, at least half of the views that voted for the winner are reliable (above 1/2) around
-        the cell
+    A view's reliability there is the share of its votes in the block and the 26 around it that agree with the winners.
+    winner: (K,) uint8 fused labels; rows: (K,) int64 rows of the cells in the grid's votes; full_vote: largest weight
+    reweigh: vote again, in the grid: each view's vote times the square of its reliability
+    returns: (K,) bool, at least half of the views that voted for the winner are reliable (above 1/2) around the cell
     """
-    votes[:, 1:] = 0
-    balance = np.zeros(len(winner), np.int32)
-    prior = PRIOR_VIEWS * full_vote * NEIGHBOR_WEIGHTS[0]
+    block_of_cell, neighbors, votes = rows // (VOXELS * SIDES), grid.neighbors(), grid.votes
+    balance, prior = np.zeros(len(winner), np.int32), PRIOR_VIEWS * full_vote * NEIGHBOR_WEIGHTS[0]
+    if reweigh:
+        votes[rows, 1:] = 0
     for cells, labels, weights in log:
-        reliability = _reliability(cells, labels, weights, winner, places.of_cell, places.neighbors, prior)
-        _add(cells, labels, weights, winner, reliability[places.of_cell[cells]], votes, balance)
+        reliability = _reliability(cells, labels, weights, winner, block_of_cell, neighbors, prior)
+        reliability = reliability[block_of_cell[cells]]
+        _weigh_views(cells, labels, winner, reliability, balance)
+        if reweigh:
+            _add_again(rows[cells], labels, weights, reliability, votes)
     return balance >= 0
-
-
-def neighbor_blocks(keys: np.ndarray) -> np.ndarray:
-    """(B, 27) int64 rows of the blocks around each of the packed blocks (B,), rising; -1 where there is none."""
-    steps = np.array(
-        [
-            (x << AXIS_BITS << AXIS_BITS) + (y << AXIS_BITS) + z
-            for x in (-1, 0, 1)
-            for y in (-1, 0, 1)
-            for z in (-1, 0, 1)
-        ]
-    )
-    wanted = keys[:, None] + steps
-    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return np.where(keys[rows] == wanted, rows, -1)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -120,12 +101,16 @@ def _reliability(cells, labels, weights, winner, block_of_cell, neighbors, prior
 
 
 @numba.njit(cache=True)
-def _add(cells, labels, weights, winner, reliability, votes, balance):
-    """Add a view's votes (channel `label`) and whether it is reliable where it voted for the winner
-    (balance).
-    """
+def _weigh_views(cells, labels, winner, reliability, balance):
+    """Count for and against each cell whether a view is reliable where it voted for the winner."""
     for k in range(len(cells)):
-        trusted = max(reliability[k], MIN_RELIABILITY)
-        votes[cells[k], labels[k]] += np.int32(weights[k] * trusted * trusted + 0.5)
         if labels[k] == winner[cells[k]]:
             balance[cells[k]] += 1 if reliability[k] >= 0.5 else -1
+
+
+@numba.njit(cache=True)
+def _add_again(rows, labels, weights, reliability, votes):
+    """Add a view's votes, weighed by its reliability, to channel `label` of its rows."""
+    for k in range(len(rows)):
+        trusted = max(reliability[k], MIN_RELIABILITY)
+        votes[rows[k], labels[k]] += np.int32(weights[k] * trusted * trusted + 0.5)

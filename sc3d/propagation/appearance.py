@@ -1,4 +1,4 @@
-"""Color and relief as two more raters (METHOD section 6): what agreed points of each class look like, as
+"""Color and relief of the classes as two more voters (METHOD section 6): what agreed points of each class look like, as
 joint histograms.
 
 The masks' errors are shared between views, so no voting removes them. Color and relief (height above the
@@ -13,22 +13,30 @@ and parts of a cloud add up to the whole.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from sc3d.geometry.graph import Graph
+from sc3d.propagation.labelled_points import MIN_EXAMPLES, LabelledPoints
 from sc3d.propagation.quantile_sketch import QuantileSketch
+from sc3d.propagation.terrain import relief_features
+from sc3d.settings.labels import Propagate
 
 COLOR_BINS, RELIEF_BINS = 24, 12  # per feature; 24^3 and 12^4 cells
 COLOR_BLUR, RELIEF_BLUR = 1.0, 0.7  # standard deviation, bins
 PRIOR_WEIGHT = 2.0  # points of the overall mixture added to each cell
-MIN_EXAMPLES = 500  # agreed points of a class; with fewer the raters do not know it
 UNKNOWN = np.log(0.05)  # their probability of a class they do not know
 MIN_SKILL = 0.5  # share of the errors of "always the commonest class" that they must avoid on points held out
 FOLD_BLOCKS = 8  # blocks along the longest side of the cloud; every other one is held out, as on a chessboard
 
-# per group of features, (cells, C) int64 examples of each class; lessons of parts add up
+IMPLAUSIBLE = np.log(0.5)  # a seed whose class the model gives less is a conflict
+
+logger = logging.getLogger(__name__)
+
+# per group of features, (cells, C) int64 examples of each class; statistics of parts add up
 AppearanceStatistics = tuple[np.ndarray, ...]
 
 
@@ -112,8 +120,8 @@ class AppearanceModel:
         """(N, C) float32 log-probability of the classes as color and relief see them; None where there is
         too little to learn from.
 
-        label: (N,) uint8. Points of a class without enough examples get zeros: the raters do not contradict
-            what they do not know.
+        label: (N,) uint8. Points of a class without enough examples get zeros: the model does not contradict
+            what it does not know.
         """
         counts = statistics[0].sum(axis=0)
         known = counts >= MIN_EXAMPLES
@@ -133,12 +141,8 @@ class AppearanceModel:
         result[np.append(False, ~known)[label]] = 0
         return np.maximum(result, np.float32(np.log(1e-4)), out=result)
 
-    def fit(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> np.ndarray | None:
-        """`log_likelihood` of a whole cloud by its own examples (N,) bool."""
-        return self.log_likelihood(self.statistics(label, examples, num_classes), label)
-
     def errors(self, statistics: AppearanceStatistics, label: np.ndarray, asked: np.ndarray) -> int | None:
-        """How many of the points asked (N,) bool, whose label is taken for true, the lesson rates wrong; None
+        """How many of the points asked (N,) bool, whose label is taken for true, the statistics get wrong; None
         if it is too short.
         """
         rating = self.log_likelihood(statistics, label)
@@ -162,9 +166,69 @@ def folds_of(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarra
 
 
 def skill_score(wrong: list[int | None], counts: np.ndarray) -> float:
-    """Share of the errors of the best constant answer that the raters avoid on blocks held out; 0 where they
+    """Share of the errors of the best constant answer that the model avoids on blocks held out; 0 where it
     cannot learn.
 
     wrong: errors of each fold, asked about points that it has not seen; counts: (C,) examples of each class
     """
-    return 0.0 if None in wrong else 1 - sum(wrong) / max(int(counts.sum() - counts.max()), 1)
+    errors = [number for number in wrong if number is not None]
+    if len(errors) < len(wrong):
+        return 0.0
+    return 1 - sum(errors) / max(int(counts.sum() - counts.max()), 1)
+
+
+def sum_statistics(parts: list[AppearanceStatistics]) -> AppearanceStatistics:
+    """The statistics of all parts."""
+    return tuple(np.sum(group, axis=0) for group in zip(*parts, strict=True))
+
+
+def is_skillful(wrong: list[int | None], statistics: AppearanceStatistics) -> bool:
+    """Whether the model does well enough; wrong: its errors on each fold held out."""
+    skill = skill_score(wrong, statistics[0].sum(axis=0))
+    logger.info(
+        "color and relief avoid %.0f%% of errors on held-out agreed points%s",
+        100 * skill,
+        "" if skill >= MIN_SKILL else ": not used",
+    )
+    return skill >= MIN_SKILL
+
+
+def plausible(start: np.ndarray, rating: np.ndarray | None) -> np.ndarray:
+    """The seeds (N,) without those that look like another class: conflicts that all views share.
+
+    rating: (N, C) log-likelihood of the classes; None = nothing is known
+    """
+    if rating is None:
+        return start
+    given = rating[np.arange(len(start)), np.maximum(start, 1).astype(np.int64) - 1]
+    return np.where((start > 0) & (given < IMPLAUSIBLE), 0, start).astype(np.uint8)
+
+
+def uses_appearance(settings: Propagate) -> bool:
+    return settings.appearance and (settings.method == "map" or settings.verify_seeds)
+
+
+@dataclass(frozen=True)
+class LearnedAppearance:
+    """A model of a cloud, and what its examples teach."""
+
+    model: AppearanceModel
+    statistics: AppearanceStatistics
+
+    def log_likelihood(self, label: np.ndarray) -> np.ndarray | None:
+        """As `AppearanceModel.log_likelihood`."""
+        return self.model.log_likelihood(self.statistics, label)
+
+
+def learn_appearance(graph: Graph, known: LabelledPoints) -> LearnedAppearance | None:
+    """Color and relief of the classes from the agreed points, if that does well on agreed points that it has not seen.
+
+    known: in the order of the graph
+    """
+    model = AppearanceModel.from_features(relief_features(graph, known.points), known.colors)
+    start, examples = known.seed_labels, known.agreed
+    folds = folds_of(known.points, known.points.min(axis=0), known.points.max(axis=0))
+    halves = [model.statistics(start, examples & (folds == fold), known.num_classes) for fold in (0, 1)]
+    wrong = [model.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1)]
+    statistics = sum_statistics(halves)
+    return LearnedAppearance(model, statistics) if is_skillful(wrong, statistics) else None

@@ -4,12 +4,95 @@ step.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 
 from sc3d.geometry.graph import Graph
+from sc3d.propagation.appearance import LearnedAppearance
+from sc3d.propagation.labelled_points import LabelledPoints
+from sc3d.propagation.region_growing import grow_regions
+from sc3d.settings.labels import Propagate
 
+MAX_EVIDENCE = 5.0  # a point's votes count as at most this many
+SMOOTHING = 0.25  # added to the votes of each class
+TRUST = 0.5  # weight of the votes beside the appearance, which sees what the views' shared errors hide
+SURE = 0.95  # later rounds learn from points of this probability
+# confidence: weight of the evidence and of the neighbors; full weights would be sure everywhere
+CAUTION, SUPPORT = 0.5, 0.1
 STEPS = 10
+
+
+def minimize_energy(
+    graph: Graph, known: LabelledPoints, appearance: LearnedAppearance | None, settings: Propagate
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) uint8 labels of the smallest Potts energy, and (N,) float32 their confidences.
+
+    appearance: votes beside the views; what it teaches is learned again from each round's result. None = votes alone
+    """
+    offered = np.bincount(known.seed_labels, minlength=known.num_classes + 1)[1:] > 0
+    found, label, rounds = None, known.seed_labels, max(settings.rounds, 1)
+    while appearance is not None and rounds:
+        rating = appearance.log_likelihood(label)
+        if rating is None:
+            break  # too little is sure; what was learned before stands
+        found = appearance_marginals(graph, known, offered, rating, settings)
+        label = (found[1].argmax(axis=1) + 1).astype(np.uint8)
+        statistics = appearance.model.statistics(label, sure_examples(found[1], known), known.num_classes)
+        appearance, rounds = replace(appearance, statistics=statistics), rounds - 1
+    return decided(graph, *(found or vote_marginals(graph, known, offered, settings)))
+
+
+def vote_marginals(
+    graph: Graph, known: LabelledPoints, offered: np.ndarray, settings: Propagate
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log-evidence and marginals (N, C) from the votes alone; offered: (C,) bool, a class without a single seed
+    is not.
+    """
+    likelihood = vote_likelihood(known.known_votes)
+    likelihood[:, ~offered] = -np.inf
+    # else the votes would take one edge per step to reach points without any
+    grown, _ = grow_regions(graph, known.seed_labels)
+    marginals = softmax(likelihood)
+    silent = np.flatnonzero(~known.known_votes[:, 1:].any(axis=1) & (grown > 0))
+    marginals[silent] = np.eye(likelihood.shape[1], dtype=np.float32)[grown[silent] - 1]
+    return likelihood, mean_field(graph, likelihood, settings.smoothness, marginals)
+
+
+def appearance_marginals(
+    graph: Graph, known: LabelledPoints, offered: np.ndarray, rating: np.ndarray, settings: Propagate
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same from votes and appearance; rating: (N, C) of the appearance, overwritten."""
+    rating += np.float32(TRUST) * vote_likelihood(known.known_votes)
+    rating[:, ~offered] = -np.inf
+    return rating, mean_field(graph, rating, settings.smoothness)  # afresh: sure marginals would not move
+
+
+def sure_examples(marginals: np.ndarray, known: LabelledPoints) -> np.ndarray:
+    """(N,) bool points that a later round learns from."""
+    return (marginals.max(axis=1) > SURE) & (known.seeds.num_views > 0)
+
+
+def decided(graph: Graph, evidence: np.ndarray, marginals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) uint8 labels and (N,) float32 confidences of marginals (N, C); evidence (N, C) is overwritten."""
+    label = marginals.argmax(axis=1) + 1
+    evidence *= np.float32(CAUTION)
+    cautious = mean_field(graph, evidence, SUPPORT, marginals, steps=1)
+    return label.astype(np.uint8), cautious[np.arange(len(label)), label - 1]
+
+
+def vote_likelihood(votes: np.ndarray) -> np.ndarray:
+    """(N, C) float32 log-likelihood of the classes 1..C from the votes (N, C + 1); 0 for points without
+    votes.
+    """
+    total = votes[:, 1:].sum(axis=1, keepdims=True)
+    result = votes[:, 1:] + np.float32(SMOOTHING)
+    result /= total + np.float32(SMOOTHING * (votes.shape[1] - 1))
+    np.log(result, out=result)
+    result *= np.minimum(1 + total, np.float32(MAX_EVIDENCE))
+    result -= result.max(axis=1, keepdims=True)
+    return result.astype(np.float32, copy=False)
 
 
 def mean_field(
@@ -22,8 +105,8 @@ def mean_field(
     """Minimize sum_i -log p_i(l_i) + smoothness sum_(i,j) w_ij [l_i != l_j], all points at once in each step.
 
     log_likelihood: (N, C) float32, column c = class id c + 1; -inf = class not offered
-    start: (N, C) first belief; None = as the likelihood says
-    returns: (N, C) float32 belief, rows sum to 1. Each row is summed in a fixed order: the same for any
+    start: (N, C) first marginals; None = as the likelihood says
+    returns: (N, C) float32 marginals, rows sum to 1. Each row is summed in a fixed order: the same for any
         number of threads.
     """
     marginals = softmax(log_likelihood) if start is None else np.ascontiguousarray(start, np.float32)
@@ -63,7 +146,7 @@ def potts_energy(graph: Graph, log_likelihood: np.ndarray, label: np.ndarray, sm
 
 
 def free_energy(graph: Graph, log_likelihood: np.ndarray, marginals: np.ndarray, smoothness: float) -> float:
-    """Expected energy minus entropy of independent beliefs (N, C): what mean field minimizes."""
+    """Expected energy minus entropy of independent marginals (N, C): what mean field minimizes."""
     marginals = marginals.astype(np.float64)
     cost = -(np.where(marginals > 0, log_likelihood, 0) * marginals).sum()
     entropy = -(marginals * np.log(np.maximum(marginals, 1e-300))).sum()

@@ -84,3 +84,29 @@ def vote_nearest(points: np.ndarray, label: np.ndarray, count: int) -> tuple[np.
     result[open_rows] = votes.argmax(axis=1)
     confidence[open_rows] = votes.max(axis=1) / nearest.shape[1]
     return result, confidence
+
+
+def reachable(graph: Graph, start: np.ndarray) -> np.ndarray:
+    """(N,) bool: some path of edges leads to a point whose start label is not 0."""
+    return _flood(graph.starts, graph.neighbors, start > 0)
+
+
+@numba.njit(cache=True)
+def _flood(starts, neighbors, reached):
+    """See reachable; changes and returns `reached` (N,) bool."""
+    stack = np.empty(len(reached), np.int64)
+    size = 0
+    for i in range(len(reached)):
+        if reached[i]:
+            stack[size] = i
+            size += 1
+    while size:
+        size -= 1
+        i = stack[size]
+        for edge in range(starts[i], starts[i + 1]):
+            j = neighbors[edge]
+            if not reached[j]:
+                reached[j] = True
+                stack[size] = j
+                size += 1
+    return reached

@@ -37,8 +37,8 @@ class NormalStatistics:
     @classmethod
     def merge(cls, parts: list[NormalStatistics]) -> NormalStatistics:
         return cls(
-            sum(part.products for part in parts),
-            sum(part.sums for part in parts),
+            np.sum([part.products for part in parts], axis=0),
+            np.sum([part.sums for part in parts], axis=0),
             QuantileSketch.merge([part.spacings for part in parts]),
         )
 
@@ -82,7 +82,7 @@ class GroundModel:
             corners.min(axis=0),
             cell,
             spacing,
-            tuple(int(count) for count in extent // cell + 1),
+            (int(extent[0] // cell) + 1, int(extent[1] // cell) + 1),
         )
 
     def place(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,8 +107,8 @@ class GroundModel:
         raster = np.full(self.shape[0] * self.shape[1], np.inf)
         for cells, heights in parts:
             raster[cells] = np.minimum(raster[cells], heights)
-        bottom, raster = raster[np.isfinite(raster)].min(), raster.reshape(self.shape)
-        filtered = (minimum_filter(raster, window) for window in WINDOWS)
+        bottom, image = raster[np.isfinite(raster)].min(), raster.reshape(self.shape)
+        filtered = (minimum_filter(image, window) for window in WINDOWS)
         return [np.where(np.isfinite(ground), ground, bottom) for ground in filtered]
 
     def features(self, graph: Graph, points: np.ndarray, grounds: list[np.ndarray]) -> np.ndarray:

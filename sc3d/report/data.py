@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.geometry.raster import Raster, highest_points, spacing_of_all
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.json_files import read_json
 from sc3d.scene.class_table import ClassTable
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+_CELL = 2.0  # side of the cells that areas are counted in, point spacings
 _STAGES = (
     "synthesize",
     "reconstruct",
@@ -83,7 +85,7 @@ class ReportData:
         return Path(folder) if isinstance(folder, str) and Path(folder).is_dir() else self.scene.truth
 
     @property
-    def training_sheet(self) -> Path:
+    def contact_sheet_file(self) -> Path:
         """The contact sheet that training writes; may not exist."""
         return self.scene.path / "train.jpg"
 
@@ -95,14 +97,13 @@ class ReportData:
 
 def load_report_data(scene: Scene) -> ReportData:
     """Read whatever of a scene exists; InputError for files that exist and are broken."""
-    cloud_file = next((path for path in (scene.labelled, scene.seeds, scene.cloud) if path.exists()), None)
     metrics = read_json(scene.metrics) if scene.metrics.exists() else {}
     if not isinstance(metrics, dict):
         raise InputError(f"{scene.metrics} must hold an object: run `sc3d evaluate {scene.path} --overwrite`")
     return ReportData(
         scene=scene,
         class_table=scene.class_table() if scene.classes.exists() else None,
-        cloud=None if cloud_file is None else read_cloud(cloud_file),
+        cloud=None if scene.best_cloud is None else read_cloud(scene.best_cloud),
         mesh=read_mesh(scene.mesh) if scene.mesh.exists() else None,
         views=scene.model.views if scene.sparse.is_dir() else [],
         metrics=metrics,
@@ -129,3 +130,23 @@ def _read_sidecars(folder: Path) -> list[dict]:
         records.values(),
         key=lambda record: (order.get(record["stage"], len(order)), record["stage"], record["outputs"]),
     )
+
+
+def class_areas(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """(256,) float64 area of each class seen from above, squared world units: cells of the ground plane, by
+    the label of their highest point.
+
+    points: (N, 3) world, z up; labels: (N,) uint8
+    """
+    grid = Raster.around(points, _CELL * spacing_of_all(points))
+    rows = highest_points(grid, points).ravel()
+    return np.bincount(labels[rows[rows >= 0]], minlength=256) * grid.pixel**2
+
+
+def read_features(file: Path) -> list[dict] | None:
+    """Properties of the features of a GeoJSON file; None if it does not exist or is another kind of file."""
+    try:
+        features = json.loads(file.read_text(encoding="utf-8"))["features"]
+        return [feature["properties"] for feature in features if isinstance(feature["properties"], dict)]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None

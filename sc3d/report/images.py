@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import logging
 from contextlib import suppress
 from dataclasses import replace
@@ -13,12 +12,11 @@ import numpy as np
 
 from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View
-from sc3d.io.images import read_image, read_index_image
+from sc3d.io.images import data_uri, read_image, read_index_image
 from sc3d.report.data import ReportData
 from sc3d.scene.labelled_cloud import LabelledSurface
-from sc3d.view import screenshot
 from sc3d.view.colors import COLORINGS, color_points
-from sc3d.view.screenshot import Style, draw_points
+from sc3d.view.screenshot import Style, draw_points, screenshot
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +69,7 @@ def comparison(data: ReportData, view: View, labelled: LabelledSurface | None) -
         panels.append(
             (
                 "photo",
-                jpeg(cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA)),
+                data_uri(cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA)),
             )
         )
     if data.class_table is None:
@@ -88,7 +86,7 @@ def comparison(data: ReportData, view: View, labelled: LabelledSurface | None) -
             labels = cv2.resize(read_index_image(file), size, interpolation=cv2.INTER_NEAREST)
         else:
             continue
-        panels.append((caption, png(palette[labels])))
+        panels.append((caption, data_uri(palette[labels], ".png")))
     return panels
 
 
@@ -114,30 +112,12 @@ def ground_picture(
     for _ in range(2):  # close single holes between the points
         holes = picture[..., 3] == 0
         picture[holes] = cv2.dilate(picture, np.ones((3, 3), np.uint8))[holes]
-    return _png_uri(picture[..., [2, 1, 0, 3]]), (
+    return data_uri(picture, ".png"), (
         low[0],
         high[1] - height * cell,
         low[0] + width * cell,
         high[1],
     )
-
-
-def jpeg(image: np.ndarray, quality: int = 85) -> str:
-    """Data URI of (H, W, 3) uint8 RGB."""
-    encoded = cv2.imencode(
-        ".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality]
-    )[1]
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
-
-
-def png(image: np.ndarray) -> str:
-    """Data URI of (H, W, 3) uint8 RGB with few colors."""
-    return _png_uri(image[..., ::-1])
-
-
-def _png_uri(image: np.ndarray) -> str:
-    encoded = cv2.imencode(".png", np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
-    return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
 def _picture(image: np.ndarray) -> tuple[str, float]:
@@ -146,4 +126,4 @@ def _picture(image: np.ndarray) -> tuple[str, float]:
     rows, columns = np.flatnonzero(filled.any(axis=1)), np.flatnonzero(filled.any(axis=0))
     if len(rows):
         image = image[max(0, rows[0] - 20) : rows[-1] + 21, max(0, columns[0] - 20) : columns[-1] + 21]
-    return jpeg(image), image.shape[1] / image.shape[0]
+    return data_uri(image), image.shape[1] / image.shape[0]

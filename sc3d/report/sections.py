@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from html import escape
 from pathlib import Path
 
 import numpy as np
 
-from sc3d.io.images import read_image
-from sc3d.report.certainty import certainty_section
-from sc3d.report.charts import css_color, flight_map, number, paired_bars
-from sc3d.report.data import ReportData
-from sc3d.report.images import cloud_pictures, comparison, ground_picture, jpeg
-from sc3d.report.objects import found_section, iou_of
-from sc3d.report.processing import processing_section
+from sc3d.io.images import data_uri, read_image
+from sc3d.report.charts import (
+    css_color,
+    flight_map,
+    formatted,
+    histogram,
+    number,
+    paired_bars,
+    reliability_curve,
+    stacked_bar,
+)
+from sc3d.report.data import ReportData, class_areas, read_features
+from sc3d.report.images import cloud_pictures, comparison, ground_picture
 from sc3d.scene.labelled_cloud import LabelledSurface
-from sc3d.view.colors import color_points, confidence_colors, legend_entries
+from sc3d.view.colors import STATES, color_points, confidence_colors, legend_entries
 
 _NUM_PHOTOS = 4
 _COLORING_NAMES = {
@@ -25,6 +32,14 @@ _COLORING_NAMES = {
     "confidence": "Confidence",
     "state": "Origin of the label",
     "mesh": "Mesh",
+}
+# file names of `sc3d export --format objects`, and what they hold
+_LAYERS = {"buildings": "buildings", "trees": "trees"}
+_BLOCKS = {
+    "settings": "Settings",
+    "summary": "Results",
+    "inputs": "Inputs and their hashes",
+    "versions": "Versions",
 }
 
 
@@ -169,12 +184,12 @@ def flight_section(data: ReportData) -> str:
 
 def training_section(data: ReportData) -> str:
     """The contact sheet of the training."""
-    if not data.training_sheet.exists():
+    if not data.contact_sheet_file.exists():
         return ""
     text = "Photos of the flight, and the Gaussians seen by the same cameras: rendering, depth and normals"
     return (
         f'<p class="note">{text}. Where a rendering is blurred, or its depth stands out from its surroundings, too few photos overlap.</p>'
-        f'<figure><img src="{jpeg(read_image(data.training_sheet))}" alt="{text}"></figure>'
+        f'<figure><img src="{data_uri(read_image(data.contact_sheet_file))}" alt="{text}"></figure>'
     )
 
 
@@ -264,3 +279,186 @@ def _count(amount: int, noun: str, plural: str | None = None) -> str:
 
 def _short(amount: int) -> str:
     return f"{amount / 1e6:.2f} M" if amount >= 1e6 else f"{amount:,}"
+
+
+def found_section(data: ReportData) -> str:
+    """Area, points and confidence of each class; number and size of the objects, where `export --format
+    objects` counted them.
+    """
+    return _class_table(data) + _object_table(data)
+
+
+def iou_of(data: ReportData, source: str) -> dict[str, float | None]:
+    """IoU by class name of "labels" or "masks"; empty without metrics."""
+    found = data.figures(source).get("iou")
+    return {str(name): number(value) for name, value in found.items()} if isinstance(found, dict) else {}
+
+
+def _class_table(data: ReportData) -> str:
+    counts = data.label_counts
+    if counts is None or data.class_table is None or not len(data.points):
+        return ""
+    labels, confidence, iou = (
+        data.values("label"),
+        data.values("confidence"),
+        iou_of(data, "labels"),
+    )
+    areas = class_areas(data.points, labels.astype(np.uint8))
+    sums, rows = (
+        None if confidence is None else np.bincount(labels, np.nan_to_num(confidence), minlength=256),
+        [],
+    )
+    for label in [*(entry.id for entry in data.class_table), *([0] if counts[0] else [])]:
+        name = data.class_table.name(label)
+        mean = "–" if sums is None or not counts[label] else f"{sums[label] / counts[label]:.2f}"
+        cells = [
+            f"{areas[label]:,.0f}",
+            f"{areas[label] / max(areas.sum(), 1e-12):.1%}",
+            f"{counts[label]:,}",
+        ] + ([mean] if sums is not None else [])
+        cells += [formatted(iou.get(name), ".3f")] if iou else []
+        swatch = f'<i style="background:{css_color(data.class_table.palette[label])}"></i>'
+        rows.append([f"{swatch}{escape(name)}", *cells])
+    heads = (
+        ["Class", "Area, m²", "Share", "Points"]
+        + (["Confidence"] if sums is not None else [])
+        + (["IoU"] if iou else [])
+    )
+    return (
+        '<p class="note">Areas as seen straight from above; square meters if the model is metric.</p>'
+        + _table(heads, rows)
+    )
+
+
+def _object_table(data: ReportData) -> str:
+    rows = []
+    for stem, name in _LAYERS.items():
+        objects = next(
+            (
+                found
+                for file in (f"{stem}.geojson", f"{stem}_local.geojson")
+                if (found := read_features(data.scene.export / file)) is not None
+            ),
+            None,
+        )
+        if objects is not None:
+            area, height = (
+                np.array([number(item.get(key)) or 0.0 for item in objects])
+                for key in ("area_m2", "height_m")
+            )
+            sizes = (
+                [
+                    f"{area.sum():,.0f}",
+                    f"{np.median(area):,.0f}",
+                    f"{np.median(height):.1f}",
+                    f"{height.max():.1f}",
+                ]
+                if len(objects)
+                else ["–"] * 4
+            )
+            rows.append([name, f"{len(objects):,}", *sizes])
+    if not rows:
+        return ""
+    heads = ["Objects", "Number", "Area, m²", "Median area, m²", "Median height, m", "Highest, m"]
+    return "<h3>Counted</h3>" + _table(heads, rows)
+
+
+def _table(heads: list[str], rows: list[list[str]]) -> str:
+    head = "".join(f"<th>{name}</th>" for name in heads)
+    body = "".join(
+        f"<tr><th>{row[0]}</th>{''.join(f'<td>{cell}</td>' for cell in row[1:])}</tr>" for row in rows
+    )
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def certainty_section(data: ReportData) -> str:
+    """Confidence of the points, whether it can be believed, and how their labels came about."""
+    confidence, states, parts = data.values("confidence"), data.values("state"), []
+    if confidence is not None:
+        colors = confidence_colors((np.arange(20) + 0.5) / 20)
+        parts.append(
+            f'<div><h3>Confidence</h3><p class="note">Share of the points by confidence; median {np.nanmedian(confidence):.2f}.</p>'
+            f"{histogram(confidence, colors)}</div>"
+        )
+    parts += _reliability(data)
+    if states is not None and len(states):
+        shares = np.bincount(states.astype(np.uint8), minlength=256)[: len(STATES)] / len(states)
+        rows = [(state.name, state.color, float(share)) for state, share in zip(STATES, shares, strict=True)]
+        items = "".join(
+            f'<li><i style="background:{css_color(color)}"></i>{escape(name)} <b>{share:.1%}</b></li>'
+            for name, color, share in rows
+        )
+        parts.append(
+            f'<div><h3>Origin of the labels</h3><p class="note">Seeds come from the photos, propagated labels from their neighbors; '
+            f'locked points were contradictory.</p>{stacked_bar(rows)}<ul class="legend">{items}</ul></div>'
+        )
+    return f'<div class="columns">{"".join(parts)}</div>' if parts else ""
+
+
+def _reliability(data: ReportData) -> list[str]:
+    """The reliability curve as a list of one block; empty without truth."""
+    figures = data.figures("reliability")
+    rows = figures.get("bins")
+    if (
+        not isinstance(rows, list)
+        or not any(rows)
+        or not all(row is None or isinstance(row, list) and len(row) == 3 for row in rows)
+    ):
+        return []
+    bins = [(None, None, None) if row is None else tuple(number(value) for value in row) for row in rows]
+    if any(None in row and any(value is not None for value in row) for row in bins):
+        return []
+    pixels = sum(count or 0 for _, _, count in bins)
+    bins = [(confidence, accuracy, count and count / max(pixels, 1)) for confidence, accuracy, count in bins]
+    error = number(figures.get("ece"))
+    note = "Share of right pixels (dots) against the confidence of their label; on the line, confidence is exactly that share. Bars: share of the pixels."
+    if error is not None:
+        note += f" Expected calibration error {error:.3f}."
+    return [f'<div><h3>Reliability</h3><p class="note">{note}</p>{reliability_curve(bins)}</div>']
+
+
+def processing_section(data: ReportData) -> str:
+    """Time and memory per stage, then every setting and version."""
+    if not data.records:
+        return ""
+    rows, details = [], []
+    for record in data.records:
+        summary = record.get("summary") if isinstance(record.get("summary"), dict) else {}
+        text = "; ".join(
+            f"{key} {_plain(value)}" for key, value in summary.items() if not isinstance(value, dict | list)
+        )
+        rows.append(
+            f"<tr><th>{escape(record['stage'])}</th><td>{formatted(number(record.get('seconds')), ',.1f')}</td>"
+            f'<td>{formatted(number(record.get("peak_memory_mb")), ",.0f")}</td><td class="text">{escape(text)}</td></tr>'
+        )
+        blocks = "".join(
+            f"<h4>{title}</h4>{_pairs(record[key])}" for key, title in _BLOCKS.items() if record.get(key)
+        )
+        details.append(
+            f"<details><summary>{escape(record['stage'])} <span>{escape(', '.join(record['outputs']))}</span></summary>{blocks}</details>"
+        )
+    head = '<tr><th>Stage</th><th>Time, s</th><th>Memory, MB</th><th class="text">Results</th></tr>'
+    table = f'<div class="scroll"><table><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table></div>'
+    return f"{table}<h3>Settings and versions</h3>{''.join(details)}"
+
+
+def _pairs(content: object) -> str:
+    if not isinstance(content, dict):
+        return f"<p>{escape(_plain(content))}</p>"
+    return (
+        "<dl>"
+        + "".join(
+            f"<dt>{escape(str(key))}</dt><dd>{escape(_plain(value))}</dd>" for key, value in content.items()
+        )
+        + "</dl>"
+    )
+
+
+def _plain(value: object) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, int) and not isinstance(value, bool):
+        return f"{value:,}"
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

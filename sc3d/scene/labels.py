@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +13,19 @@ STATE_NAMES = ("unseen", "seed", "locked", "propagated", "unlocked")
 
 @dataclass(frozen=True)
 class Labels:
-    """One entry per point: label uint8 (0 = none), confidence float32 in [0, 1], state uint8, num_views
-    int32.
-    """
+    """One entry per point: label uint8 (0 = none), confidence float32 in [0, 1], state uint8, num_views int32."""
 
     label: np.ndarray
     confidence: np.ndarray
     state: np.ndarray
     num_views: np.ndarray
+
+    def map(self, function: Callable[[np.ndarray], np.ndarray]) -> Labels:
+        """The labels with a function applied to each array."""
+        return Labels(
+            *(function(values) for values in (self.label, self.confidence, self.state, self.num_views))
+        )
+
+    def __getitem__(self, rows: np.ndarray) -> Labels:
+        """Labels of some points, or of all in another order."""
+        return self.map(lambda values: values[rows])

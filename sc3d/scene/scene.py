@@ -10,10 +10,8 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.images import check_photo, find_photos, image_size, read_index_image, require_within
-from sc3d.io.limits import FARTHEST
+from sc3d.io.limits import FARTHEST, MAX_MASK_PIXELS
 from sc3d.scene.class_table import CONTROL, ClassTable, read_classes
-
-MAX_MASK = 100_000_000  # pixels of a mask that is larger than its photo
 
 
 @dataclass(frozen=True)
@@ -71,6 +69,10 @@ class Scene:
         return self.path / "export"
 
     @property
+    def labelled_splats(self) -> Path:
+        return self.export / "splats.ply"
+
+    @property
     def truth(self) -> Path:
         return self.path / "truth"
 
@@ -97,6 +99,11 @@ class Scene:
     @property
     def report(self) -> Path:
         return self.path / "report.html"
+
+    @property
+    def best_cloud(self) -> Path | None:
+        """The labelled cloud, else the seeds, else the bare cloud; None if there is none."""
+        return next((path for path in (self.labelled, self.seeds, self.cloud) if path.exists()), None)
 
     def require(self, *paths: Path, hint: str) -> None:
         """Raise InputError naming the first of `paths` that is missing, and what to do."""
@@ -149,41 +156,28 @@ def read_sparse_model(path: Path) -> SparseModel:
     """Read a COLMAP model, binary or text; InputError if it is missing, broken or names photos outside the
     scene.
     """
-    import pycolmap
-
     from sc3d.geometry.cameras import View
-    from sc3d.io.colmap import load_model
+    from sc3d.io import colmap
 
-    reconstruction = load_model(path)
-    images = sorted(
-        (reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()),
-        key=lambda image: image.name,
-    )
-    point_ids = np.array(sorted(reconstruction.point3D_ids()), dtype=np.uint64)
-    points = [reconstruction.point3D(int(point_id)) for point_id in point_ids]
+    model = colmap.load_model(path)
+    cameras = colmap.copy_cameras(model)
+    point_ids, xyz, colors = colmap.point_arrays(model)
     views, tracks = [], []
-    for image in images:
+    for image in colmap.registered_images(model):
         _check_name(image.name, path)
-        cam_from_world = np.eye(4)
-        cam_from_world[:3] = image.cam_from_world().matrix()
-        # a copy: image.camera dies with the model
-        views.append(View(image.name, pycolmap.Camera(image.camera.todict()), cam_from_world))
-        seen = np.array([point.point3D_id for point in image.get_observation_points2D()], dtype=np.uint64)
-        # without points that were filtered out of the model
-        tracks.append(np.searchsorted(point_ids, np.intersect1d(seen, point_ids)))
+        views.append(View(image.name, cameras[image.camera_id], colmap.cam_from_world(image)))
+        rows = colmap.observed_rows(image, point_ids)
+        tracks.append(np.unique(rows[rows >= 0]))
     stems = [Path(view.name).stem for view in views]
     if len(set(stems)) < len(stems):
         raise InputError(
             f"{path}: two photos share a name up to the suffix, by which masks are found; rename one"
         )
-    xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     if not (np.abs(xyz) < FARTHEST).all():
         raise InputError(
             f"{path} holds positions that are not finite numbers, or more than {FARTHEST:g} from the origin"
         )
-    return SparseModel(
-        views, xyz, np.array([point.color for point in points], np.uint8).reshape(-1, 3), tracks
-    )
+    return SparseModel(views, xyz, colors, tracks)
 
 
 def match_masks(
@@ -225,12 +219,12 @@ def match_masks(
     return matched
 
 
-def check_mask_aspect(file: Path, mask_size: tuple[int, int], photo_size: tuple[int, int]) -> None:
+def check_mask_aspect(file: Path | str, mask_size: tuple[int, int], photo_size: tuple[int, int]) -> None:
     """Raise InputError unless a mask has the aspect of its photo within 1 px of the smaller of the two."""
     (width, height), (photo_width, photo_height) = mask_size, photo_size
-    if width * height > max(MAX_MASK, photo_width * photo_height):
+    if width * height > max(MAX_MASK_PIXELS, photo_width * photo_height):
         raise InputError(
-            f"{file} is {width}x{height}, but its photo is {photo_width}x{photo_height}: more than {MAX_MASK // 10**6} megapixels are refused"
+            f"{file} is {width}x{height}, but its photo is {photo_width}x{photo_height}: more than {MAX_MASK_PIXELS // 10**6} megapixels are refused"
         )
     scale = min(1.0, min(photo_width / width, photo_height / height))
     if abs(width * photo_height - height * photo_width) * scale > max(photo_width, photo_height):

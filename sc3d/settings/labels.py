@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -61,9 +61,9 @@ class Segment:
     """Share of a tile that it has in common with the next."""
     refine: bool = False
     """One more round on the masks that are in the scene (needs its cloud): what contradicts the fused labels
-    loses confidence, if that brings the
-    labels nearer to the masks of photos that were left out. Writes SCENE/confidence_refined, which label then
-    takes instead of SCENE/confidence."""
+    loses confidence, if that brings the labels nearer to the masks of photos that were left out. Writes
+    SCENE/confidence_refined, which label then takes instead of SCENE/confidence.
+    """
     half: bool = False
     """Compute in half precision (bfloat16; float16 on older GPUs); needs CUDA (grounded-sam, sam3)."""
     device: str = "auto"
@@ -71,50 +71,65 @@ class Segment:
 
 
 @dataclass(frozen=True)
-class Label(Resources):
-    """Fuse masks into the voxel label field and the cloud."""
+class PaperMechanisms:
+    """Mechanisms of the paper, one by one. `--method paper` switches all on; elsewhere they change next to nothing."""
 
-    method: Literal["direct", "majority", "conflict-lock", "paper"] = "conflict-lock"
-    """direct: last photo wins; majority: most votes win; conflict-lock: disagreeing voxels are reset and
-    locked; paper: the same with any
-    disagreement and the paper's weights, whatever the other options say."""
-    depth_filter: bool = True
-    """Only the first surface along each ray is labelled; --no-depth-filter lets labels penetrate."""
-    surface: Literal["auto", "surfels", "voxels"] = "auto"
-    """What hides the points behind it. auto: mesh.ply if there is one, else as voxels; voxels: the grid of
-    the cloud's own points, traversed coarse to fine;
-    surfels: a square around every point (more memory), which clouds in tiles have instead of voxels."""
-    consensus: float = 0.66
-    """Share of the votes that the winning class needs, else the voxel is locked (conflict-lock)."""
-    voxel_size: float = 0.0
-    """Label voxel, world units; 0 = 2 times the median point spacing, at least 1.5 times the median mask
-    pixel on the ground.
-    """
-    use_confidence: bool = True
-    """Weigh mask pixels by the confidence maps, where there are any."""
-    edge_width: float = 3.0
-    """Mask pixels closer than this to a label boundary count less, px; 0 = off."""
     depth_excess: bool = True
     """Weigh votes less, the farther a point lies behind the first surface (within the tolerance)."""
     incidence: bool = False
     """Weigh votes by the cosine of the incidence angle."""
     range: bool = True
     """Weigh votes by the inverse distance, so that near photos count more."""
-    verify: Literal["no", "lock", "weigh"] = "weigh"
-    """Hold the fused labels against each view's masks, place by place. lock: labels that rest on views which
-    contradict them nearby are locked;
-    weigh: such views count less as well."""
     density: bool = False
-    """Inside a voxel, weigh points by the density of the Gaussians around them (gaussians.ply), or by their
-    distance to the points' mean without it.
+    """Inside a voxel, weigh points by the density of the Gaussians around them (gaussians.ply), or by their distance
+    to the points' mean without it.
     """
     reproject: bool = False
-    """Vote once more on locked voxels with half the depth tolerance and without mask edges and grazing views.
+    """Vote once more on locked voxels with half the depth tolerance and without mask edges and grazing views."""
+
+
+@dataclass(frozen=True)
+class Label(Resources):
+    """Fuse masks into the voxel label field and the cloud."""
+
+    method: Literal["direct", "majority", "conflict-lock", "paper"] = "conflict-lock"
+    """direct: last photo wins; majority: most votes win; conflict-lock: disagreeing voxels are reset and locked; paper:
+    the same with any disagreement, and every mechanism and weight of the paper, whatever the other options say.
+    """
+    depth_filter: bool = True
+    """Only the first surface along each ray is labelled; --no-depth-filter lets labels penetrate."""
+    surface: Literal["auto", "surfels", "voxels"] = "auto"
+    """What hides the points behind it. auto: mesh.ply if there is one, else as voxels; voxels: a grid of the cloud's
+    own points, traversed coarse to fine; surfels: a square around every point (more memory), which clouds in tiles
+    have instead of voxels.
+    """
+    consensus: float = 0.66
+    """Share of the votes that the winning class needs, else the voxel is locked (conflict-lock)."""
+    voxel_size: float = 0.0
+    """Label voxel, world units; 0 = 2 times the median point spacing, at least 1.5 times the median mask pixel on the
+    ground.
+    """
+    use_confidence: bool = True
+    """Weigh mask pixels by the confidence maps, where there are any."""
+    edge_width: float = 3.0
+    """Mask pixels closer than this to a label boundary count less, px; 0 = off."""
+    verify: Literal["no", "lock", "weigh"] = "weigh"
+    """Hold the fused labels against each view's masks, place by place. lock: labels that rest on views which contradict
+    them nearby are locked; weigh: such views count less as well.
     """
     cloud: Path | None = None
     """Cloud to label; SCENE/cloud.ply otherwise."""
     output: Path | None = None
     """Labelled cloud to write; SCENE/seeds.ply otherwise."""
+    mechanisms: PaperMechanisms = PaperMechanisms()
+
+    @property
+    def resolved(self) -> Label:
+        """What counts: the paper's own choices where `method` is paper."""
+        if self.method != "paper":
+            return self
+        every = PaperMechanisms(*(True for _ in fields(PaperMechanisms)))
+        return replace(self, consensus=1.0, edge_width=3.0, verify="lock", mechanisms=every)
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ class Reconstruct:
 
 
 @dataclass(frozen=True)
-class Georeference:
+class GeoreferenceOptions:
     """Say where a scene lies on Earth (georeference.json), from the GPS of its photos or by hand; or choose
     another CRS for exports.
     """

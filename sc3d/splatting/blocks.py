@@ -77,7 +77,9 @@ def train_blocks(job: BlockJob, data: TrainingData, tasks: Executor) -> tuple[Tr
     indices = range(len(job.blocks))
     for index in indices:
         if len(job.views(data, index)) < 2:
-            raise InputError(f"block {index} of {len(indices)} is seen by fewer than 2 photos: lower --blocks")
+            raise InputError(
+                f"block {index} of {len(indices)} is seen by fewer than 2 photos: lower --blocks"
+            )
     job.folder.mkdir(exist_ok=True)
     tasks.run("blocks", partial(train_block, job), indices, GPU if job.settings.device == "cuda" else None)
     parts = [Gaussians.from_arrays(read_splat_ply(job.file(index, "ply"))[0]) for index in indices]

@@ -13,8 +13,8 @@ import torch
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, local_origin, project, resample, undistorted
 from sc3d.io.images import read_image
-from sc3d.io.splats import origin_comment, read_splat_ply
 from sc3d.scene.scene import Scene
+from sc3d.scene.splats import read_scene_splats
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.gaussians import Gaussians
 
@@ -115,16 +115,6 @@ def scene_data(scene: Scene, settings: TrainSettings) -> tuple[TrainingData, np.
 
 
 def load_gaussians(scene: Scene) -> tuple[Gaussians, np.ndarray]:
-    """The trained Gaussians of a scene and the (3,) world position of their local origin.
-
-    Raises InputError that says what to run if there are none, or if they belong to other cameras than the
-    scene's.
-    """
-    scene.require(scene.gaussians, hint=f"run `sc3d train {scene.path}` first")
-    arrays, comments = read_splat_ply(scene.gaussians)
-    origin = local_origin(scene.model.views)
-    if any(line.startswith("sc3d origin") for line in comments) and origin_comment(origin) not in comments:
-        raise InputError(
-            f"{scene.gaussians} was trained with other cameras than those in {scene.sparse}: run `sc3d train {scene.path} --overwrite`"
-        )
+    """The trained Gaussians of a scene and the (3,) world position of their local origin, see `read_scene_splats`."""
+    arrays, origin = read_scene_splats(scene)
     return Gaussians.from_arrays(arrays), origin

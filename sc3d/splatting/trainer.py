@@ -12,7 +12,7 @@ import torch
 from tqdm import tqdm
 
 from sc3d.errors import InputError
-from sc3d.geometry.view_selection import neighbor_views
+from sc3d.geometry.view_selection import neighbor_views, scene_extent
 from sc3d.io.atomic import atomic_path
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses, strategy
@@ -274,12 +274,3 @@ class Trainer:
 
     def _elapsed(self) -> float:
         return self._seconds + time.perf_counter() - self._started
-
-
-def scene_extent(centers: np.ndarray, points: np.ndarray) -> float:
-    """E, world units: 1.1 x the largest distance of a camera from their mean, but at least half the median
-    distance to the points. centers: (V, 3) of the cameras
-    """
-    middle = centers.mean(0)
-    spread = np.linalg.norm(centers - middle, axis=1).max()
-    return float(max(1.1 * spread, 0.5 * np.median(np.linalg.norm(points - middle, axis=1))))

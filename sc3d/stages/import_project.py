@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import View
-from sc3d.georeferencing.georeference import (
-    Georeference,
-    georeference_path,
-    projected_crs,
-    read_georeference,
-    write_georeference,
-)
-from sc3d.importers.clouds import CLOUDS, MESHES, Geometry, is_mesh, read_geometry, to_open3d
-from sc3d.importers.frames import near_origin, to_world, whole_offset
-from sc3d.importers.model import guess_observations, sample, write_copy, write_model
+from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
+from sc3d.importers.clouds import CLOUDS, MESHES, is_mesh, read_geometry, to_open3d
+from sc3d.importers.frames import frame_of_scene, near_origin, place_geometries
+from sc3d.importers.model import write_project
 from sc3d.importers.photos import locate_photos
-from sc3d.importers.project import Project, project_files, read_project
-from sc3d.io.atomic import atomic_path, require_writable
+from sc3d.importers.project import project_files, read_project
+from sc3d.io.atomic import require_writable
 from sc3d.io.clouds import write_geometry
+from sc3d.io.images import require_place
 from sc3d.runner import execute
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import, ImportCommand
@@ -70,19 +60,19 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
         raise InputError("--cloud takes one cloud and one mesh: merge them first")
     if settings.epsg is not None:
         projected_crs(settings.epsg)
+    project, photos, figures = None, None, {}
     if settings.project in settings.cloud:
-        views, georeference, figures = *_present(scene, geometries, settings), {}
-        placed = _place(geometries, georeference, views, settings)
+        views, georeference = frame_of_scene(scene, next(iter(geometries.values())), settings.epsg)
     else:
         project, photos = locate_photos(
             near_origin(read_project(settings.project, settings), settings.epsg), settings.images
         )
-        _require_place_for_photos(scene, photos)
-        placed = _place(geometries, project.georeference, project.views, settings)
-        georeference, figures = (
-            project.georeference,
-            _write_project(scene, project, photos, [geometry for geometry, _ in placed.values()]),
-        )
+        views, georeference = project.views, project.georeference
+        if photos is not None:
+            require_place(photos, scene.images)
+    placed = place_geometries(geometries, georeference, views, settings.epsg)
+    if project is not None:
+        figures = write_project(scene, project, photos, [geometry for geometry, _ in placed.values()])
         georeference_path(scene).unlink(missing_ok=True)
     if georeference is not None:
         write_georeference(scene, georeference)
@@ -93,92 +83,3 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
         f"{path.name}": f"{len(geometry.positions):,} points, read as {frame}"
         for path, (geometry, frame) in placed.items()
     }
-
-
-def _present(
-    scene: Scene, geometries: dict[Path, Geometry], settings: Import
-) -> tuple[list[View], Georeference | None]:
-    """Cameras and place of a scene that is there; for one without cameras, a place near its first cloud if
-    that states a CRS.
-    """
-    has_cameras = any((scene.sparse / f"cameras{suffix}").exists() for suffix in (".bin", ".txt"))
-    views, georeference = scene.model.views if has_cameras else [], read_georeference(scene)
-    first = next(iter(geometries.values()))
-    epsg = first.epsg or settings.epsg
-    if georeference is None and not views and epsg is not None:
-        georeference = Georeference(epsg, tuple(whole_offset(first.positions).tolist()))
-    return views, georeference
-
-
-def _place(
-    geometries: dict[Path, Geometry], georeference: Georeference | None, views: list[View], settings: Import
-) -> dict[Path, tuple[Geometry, str]]:
-    """The geometries in the scene's world, each with what its coordinates were taken for."""
-    placed = {}
-    for path, geometry in geometries.items():
-        positions, frame = to_world(
-            geometry.positions, geometry.epsg or settings.epsg, georeference, views, str(path)
-        )
-        placed[path] = replace(geometry, positions=positions), frame
-    return placed
-
-
-def _write_project(
-    scene: Scene, project: Project, photos: Path | None, geometries: list[Geometry]
-) -> dict[str, object]:
-    """Write cameras and points, and link the photos; returns figures."""
-    points, colors, observations, told = (
-        project.points,
-        project.colors,
-        project.observations,
-        "from the project",
-    )
-    if not len(points) and geometries:
-        positions, told = geometries[0].positions, "drawn from the cloud, seen where they are nearest"
-        points, colors = sample(
-            positions,
-            np.full((len(positions), 3), 128, np.uint8)
-            if geometries[0].colors is None
-            else geometries[0].colors,
-        )
-        observations = None
-    if observations is None:
-        points, colors = sample(points, colors)
-        observations, told = (
-            guess_observations(project.views, points),
-            told.replace("from the project", "from the project, seen where they are nearest"),
-        )
-    if project.model is not None and len(project.points):
-        write_copy(scene.sparse, project)
-    else:
-        write_model(scene.sparse, project.views, points, colors, observations)
-    if photos is not None:
-        _link(photos, scene.images)
-    return {
-        "program": project.program,
-        "photos": len(project.views),
-        "points": len(points),
-        "points_are": told if len(points) else "none",
-        "images": str(photos.resolve()) if photos else "not found: link them to SCENE/images",
-    } | project.notes
-
-
-def _require_place_for_photos(scene: Scene, photos: Path | None) -> None:
-    if (
-        photos is not None
-        and scene.images.exists()
-        and not scene.images.is_symlink()
-        and scene.images.resolve() != photos.resolve()
-    ):
-        raise InputError(f"{scene.images} already holds other photos: choose another scene folder")
-
-
-def _link(photos: Path, images: Path) -> None:
-    """Make `images` a link to the photos; a copy where links are not possible."""
-    if images.exists() and images.resolve() == photos.resolve():
-        return
-    with atomic_path(images) as temporary:
-        try:
-            os.symlink(photos.resolve(), temporary, target_is_directory=True)
-        except OSError:
-            shutil.copytree(photos, temporary)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.georeferencing.control_points import read_control_points
 from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
-from sc3d.io.atomic import atomic_path, require_writable
-from sc3d.io.images import find_photos, image_size
+from sc3d.io.atomic import require_writable
+from sc3d.io.images import find_photos, image_size, link_photos
 from sc3d.runner import execute
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Reconstruct, ReconstructCommand
@@ -24,23 +22,14 @@ def main(command: ReconstructCommand) -> None:
 
 
 def prepare(photos: Path, scene: Scene) -> None:
-    """Check all photos, then make SCENE/images a link to their folder (a copy where links are not possible)."""
+    """Check all photos, then make SCENE/images a link to their folder."""
     files = find_photos(photos)
     for file in files:
         image_size(file)
     if len(files) < 2:
         raise InputError(f"{photos} holds one photo: at least two that overlap are needed")
     require_writable(scene.path)
-    if scene.images.exists() and scene.images.resolve() == photos.resolve():
-        return
-    if scene.images.exists() and not scene.images.is_symlink():
-        raise InputError(f"{scene.images} already holds other photos: choose another scene folder")
-    scene.path.mkdir(parents=True, exist_ok=True)
-    with atomic_path(scene.images) as temporary:
-        try:
-            os.symlink(photos.resolve(), temporary, target_is_directory=True)
-        except OSError:
-            shutil.copytree(photos, temporary)
+    link_photos(photos, scene.images)
 
 
 def inputs(scene: Scene, settings: Reconstruct) -> list[Path]:

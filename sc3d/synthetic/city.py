@@ -18,7 +18,7 @@ from sc3d.io.images import write_image
 from sc3d.io.json_files import write_json
 from sc3d.scene.scene import Scene
 from sc3d.settings.synthesize import Synthesize, SynthesizeCity
-from sc3d.synthetic.city_files import CloudFile, MeshFile, open_cloud, open_mesh, write_cameras
+from sc3d.synthetic.city_files import CloudWriter, MeshWriter, open_cloud, open_mesh, write_cameras
 from sc3d.synthetic.city_flight import fly_over
 from sc3d.synthetic.cloud import truth_cloud
 from sc3d.synthetic.generate import CLASSES
@@ -141,10 +141,9 @@ def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
     """
     scene, city = Scene(settings.scene), City(o3d.t.geometry.RaycastingScene(), [])
     columns, rows = settings.sites
+    num_points = columns * rows * settings.points_per_site
     with ExitStack() as files:
-        cloud = files.enter_context(
-            open_cloud(scene.path / "truth.ply", columns * rows * settings.points_per_site)
-        )
+        cloud = files.enter_context(open_cloud(scene.path / "truth.ply", num_points))
         mesh = files.enter_context(open_mesh(scene.mesh))
         for site in tqdm(
             make_sites(settings), total=columns * rows, desc="building", unit="site", disable=None
@@ -156,10 +155,10 @@ def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
     accuracy = _write_masks(scene, city, views, settings.seed)
     scene.cloud.symlink_to("truth.ply")
     write_json(scene.classes, CLASSES)
-    return {"points": cloud.rows, "views": len(views), "triangles": mesh.triangles, "mask_accuracy": accuracy}
+    return {"points": num_points, "views": len(views), "triangles": mesh.triangles, "mask_accuracy": accuracy}
 
 
-def _write_site(site: Site, settings: SynthesizeCity, cloud: CloudFile, mesh: MeshFile) -> None:
+def _write_site(site: Site, settings: SynthesizeCity, cloud: CloudWriter, mesh: MeshWriter) -> None:
     made = truth_cloud(
         site.world, settings.points_per_site, np.random.default_rng([settings.seed, 5, site.number])
     )

@@ -4,18 +4,18 @@ COLMAP model.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-import pycolmap
 
 from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
-from sc3d.synthetic.flight import camera_in_model
+from sc3d.io.colmap import build_model, write_model
+from sc3d.io.ply import Element, Property, format_header, record_writer, vertex_element
 
 CLOUD = np.dtype(
     [
@@ -33,17 +33,17 @@ CLOUD = np.dtype(
 )
 VERTEX = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8")])
 FACE = np.dtype([("count", "u1"), ("corners", "<u4", 3)])
-NAMES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
+FACES = Property("vertex_indices", "u4", "u1")
+COMMENTS = ["sc3d synthetic city"]
 ROOM = 512  # bytes of a mesh's header, whose counts are known at the end only
 TOGETHER = 1 << 20  # triangles written at a time
 
 
 @dataclass
-class CloudFile:
-    """A cloud that grows. rows: points so far."""
+class CloudWriter:
+    """A cloud that grows. write: takes (N,) records."""
 
-    stream: BinaryIO
-    rows: int = 0
+    write: Callable[[np.ndarray], None]
 
     def append(
         self, positions: np.ndarray, normals: np.ndarray, colors: np.ndarray, label: np.ndarray
@@ -51,15 +51,14 @@ class CloudFile:
         """positions: (N, 3) float64; normals: (N, 3) float32; colors: (N, 3) uint8; label: (N, 1) uint8."""
         table = np.empty(len(positions), CLOUD)
         for name, column in zip(
-            CLOUD.names, [*positions.T, *normals.T, *colors.T, label.ravel()], strict=True
+            CLOUD.names or (), [*positions.T, *normals.T, *colors.T, label.ravel()], strict=True
         ):
             table[name] = column
-        self.stream.write(table.tobytes())
-        self.rows += len(table)
+        self.write(table)
 
 
 @dataclass
-class MeshFile:
+class MeshWriter:
     """A triangle soup that grows. triangles: so far."""
 
     stream: BinaryIO
@@ -72,23 +71,18 @@ class MeshFile:
 
 
 @contextmanager
-def open_cloud(path: Path, num_points: int) -> Iterator[CloudFile]:
+def open_cloud(path: Path, num_points: int) -> Iterator[CloudWriter]:
     """A cloud of `num_points`, all of which must be appended; it gets its name when the block succeeds."""
-    with atomic_path(path) as temporary:
-        with temporary.open("wb") as stream:
-            stream.write(_header([f"element vertex {num_points}", *_properties(CLOUD)]))
-            cloud = CloudFile(stream)
-            yield cloud
-        if cloud.rows != num_points:
-            raise ValueError(f"{cloud.rows} points were appended, {num_points} announced")
+    with record_writer(path, CLOUD, num_points, COMMENTS) as write:
+        yield CloudWriter(write)
 
 
 @contextmanager
-def open_mesh(path: Path) -> Iterator[MeshFile]:
+def open_mesh(path: Path) -> Iterator[MeshWriter]:
     """A triangle soup with three vertices per triangle; it gets its name when the block succeeds."""
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         stream.write(bytes(ROOM))
-        mesh = MeshFile(stream)
+        mesh = MeshWriter(stream)
         yield mesh
         for first in range(0, mesh.triangles, TOGETHER):
             numbers = np.arange(first, min(first + TOGETHER, mesh.triangles), dtype=np.int64)
@@ -96,33 +90,10 @@ def open_mesh(path: Path) -> Iterator[MeshFile]:
             faces["count"], faces["corners"] = 3, 3 * numbers[:, None] + np.arange(3)
             stream.write(faces.tobytes())
         stream.seek(0)
-        elements = [
-            f"element vertex {3 * mesh.triangles}",
-            *_properties(VERTEX),
-            f"element face {mesh.triangles}",
-            "property list uchar uint vertex_indices",
-        ]
-        stream.write(_header(elements, ROOM))
+        elements = [vertex_element(VERTEX, 3 * mesh.triangles), Element("face", mesh.triangles, (FACES,))]
+        stream.write(format_header(elements, COMMENTS, ROOM))
 
 
 def write_cameras(path: Path, views: list[View]) -> None:
     """Views that share the camera of the first, as a COLMAP model without points."""
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera_in_model(views[0]))
-    for number, view in enumerate(views, start=1):
-        image = pycolmap.Image(name=view.name, camera_id=1, image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_world[:3]))
-    with atomic_path(path) as temporary:
-        temporary.mkdir(parents=True)
-        model.write(str(temporary))
-
-
-def _properties(dtype: np.dtype) -> list[str]:
-    return [f"property {NAMES[dtype[name].str]} {name}" for name in dtype.names]
-
-
-def _header(lines: list[str], room: int = 0) -> bytes:
-    """A PLY header; with `room`, of exactly so many bytes by a long enough comment."""
-    start, end = "ply\nformat binary_little_endian 1.0\n", "\n".join([*lines, "end_header\n"])
-    comment = "comment sc3d synthetic city"
-    return (start + comment.ljust(room - len(start) - len(end) - 1, ".") + "\n" + end).encode("ascii")
+    write_model(path, build_model(views))

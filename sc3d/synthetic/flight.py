@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pycolmap
 
 from sc3d.geometry.cameras import View, look_at, pinhole_view
 from sc3d.settings.synthesize import Synthesize
@@ -71,10 +70,3 @@ def _ring_poses(
         center = radius * direction + [0, 0, height] + rng.normal(0, 0.4, 3)
         poses.append(look_at(center, near * direction + [0, 0, 1.0] + rng.normal(0, [1.5, 1.5, 0.3])))
     return poses
-
-
-def camera_in_model(view: View) -> pycolmap.Camera:
-    """The view's camera with id 1, focal length marked as known."""
-    camera = pycolmap.Camera(view.camera.todict())
-    camera.camera_id, camera.has_prior_focal_length = 1, True
-    return camera

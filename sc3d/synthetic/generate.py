@@ -10,19 +10,19 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
-import pycolmap
 from PIL import Image
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
 from sc3d.io.clouds import write_geometry
+from sc3d.io.colmap import build_model, write_model
 from sc3d.io.images import write_image
 from sc3d.io.json_files import write_json
 from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.cloud import find_tracks, truth_cloud
 from sc3d.synthetic.exif import drone_exif, geodetic
-from sc3d.synthetic.flight import camera_in_model, fly
+from sc3d.synthetic.flight import fly
 from sc3d.synthetic.masks import noisy_mask
 from sc3d.synthetic.mesh import OTHER
 from sc3d.synthetic.photos import Photo, photograph
@@ -31,24 +31,14 @@ from sc3d.synthetic.world import World, build_world
 
 logger = logging.getLogger(__name__)
 
+# fmt: off
 CLASSES = [
-    {
-        "id": 1,
-        "name": "building",
-        "color": [214, 60, 60],
-        "prompts": ["building", "house", "roof"],
-        "asprs": 6,
-    },
+    {"id": 1, "name": "building", "color": [214, 60, 60], "prompts": ["building", "house", "roof"], "asprs": 6},
     {"id": 2, "name": "tree", "color": [40, 150, 60], "prompts": ["tree", "bush"], "asprs": 5},
-    {
-        "id": 3,
-        "name": "road",
-        "color": [150, 150, 160],
-        "prompts": ["road", "street", "parking lot"],
-        "asprs": 11,
-    },
+    {"id": 3, "name": "road", "color": [150, 150, 160], "prompts": ["road", "street", "parking lot"], "asprs": 11},
     {"id": 4, "name": "grass", "color": [170, 220, 110], "prompts": ["grass", "lawn"], "asprs": 3},
 ]
+# fmt: on
 FOLDERS = ("images", "depth", "truth", "masks", "confidence")
 NUM_SPARSE = 16_000  # candidates for sparse points; those seen by three views are kept
 
@@ -86,8 +76,7 @@ def synthesize(
     num_sparse = _write_sparse(scene_path / "sparse" / "0", world, views, settings)
     report(0.93, "truth cloud")
     cloud = truth_cloud(world, settings.num_points, np.random.default_rng([settings.seed, 5]))
-    with atomic_path(scene_path / "truth.ply") as temporary:
-        o3d.t.io.write_point_cloud(str(temporary), cloud)
+    write_geometry(scene_path / "truth.ply", cloud)
     write_geometry(scene_path / "truth_mesh.ply", _mesh(world))
     write_json(scene_path / "classes.json", CLASSES)
     report(1.0, "done")
@@ -148,22 +137,5 @@ def _write_sparse(path: Path, world: World, views: list[View], settings: Synthes
         world, views, NUM_SPARSE, np.random.default_rng([settings.seed, 7])
     )
     colors = display(world.light(points.astype(np.float32), triangles, np.full(len(points), 0.1, np.float32)))
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera_in_model(views[0]))
-    tracks = [pycolmap.Track() for _ in points]
-    for number, (view, (index, pixels)) in enumerate(zip(views, observations), start=1):
-        image = pycolmap.Image(
-            name=view.name,
-            camera_id=1,
-            image_id=number,
-            points2D=pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels]),
-        )
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_world[:3]))
-        for position, point in enumerate(index):
-            tracks[point].add_element(number, position)
-    for xyz, track, color in zip(points, tracks, colors):
-        model.add_point3D(xyz, track, color)
-    with atomic_path(path) as temporary:
-        temporary.mkdir(parents=True)
-        model.write(str(temporary))
+    write_model(path, build_model(views, points, colors, observations))
     return len(points)

@@ -16,16 +16,24 @@ from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import FirstSurface, first_surface, surface_points
 from sc3d.io.chunked_clouds import CloudFile, positions
 from sc3d.io.images import image_size, read_index_image
+from sc3d.metrics import EvaluationSummary, judge, truth_masks
 from sc3d.scene.labelled_cloud import REACH
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Evaluate
-from sc3d.tiling.executor import Executor
+from sc3d.tiling.executor import Executor, open_executor
+from sc3d.tiling.first_surfaces import (
+    RangeJob,
+    RangeMaps,
+    compute_ranges,
+    split_mesh,
+    split_surfels,
+    views_of,
+)
 from sc3d.tiling.label import sample_spacing
-from sc3d.tiling.memory import WorkFolder, max_points, memory_of
-from sc3d.tiling.ranges import RangeMaps
+from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, mesh_triangles, num_points
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
-from sc3d.tiling.surfaces import RangeJob, compute_ranges, split_mesh, split_surfels, views_of
+from sc3d.tiling.work_folder import WorkFolder
 
 BYTES = 260  # of a point while pixels look for the nearest one
 
@@ -50,7 +58,6 @@ class TiledSurface:
     """Stands for `labelled.LabelledSurface` where only pixels with truth are asked for."""
 
     job: EvaluateJob
-    parts: WorkFolder
 
     def rows(self, view: View, size: tuple[int, int], wanted: np.ndarray) -> tuple[np.ndarray, FirstSurface]:
         """(H, W) int64 row of the cloud at each wanted pixel, -1 = nothing near; the first surface. size:
@@ -65,51 +72,61 @@ class TiledSurface:
         return np.where(wanted, rows.reshape(size[::-1]), -1), first_surface(job.maps, view.resized(*size))
 
 
-def find_points_by_tiles(scene: Scene, settings: Evaluate, cloud: CloudFile, tasks: Executor) -> TiledSurface:
-    """Find the cloud's point at all pixels that have truth, tile by tile."""
-    truth = scene.mask_files(settings.truth or scene.truth, scene.class_table())
-    views = [view for view in scene.model.views if view.name in truth]
-    parts = WorkFolder(
-        settings.output or scene.metrics,
-        "evaluate",
+def evaluate_fits(scene: Scene, settings: Evaluate) -> bool:
+    """Whether cloud and mesh fit into memory as a whole, and nobody asked for workers."""
+    path = settings.labelled or scene.labelled
+    count = num_points(path) if path.exists() else None
+    return count is None or fits(count * BYTES + mesh_triangles(scene.mesh) * TRIANGLE, settings)
+
+
+def evaluate_scene(scene: Scene, settings: Evaluate) -> EvaluationSummary:
+    """As `metrics.evaluate_scene`, tile by tile, here or on the workers that the settings ask for."""
+    cloud, output = CloudFile.open(settings.labelled or scene.labelled), settings.output or scene.metrics
+    labels, decisive = (
+        read_labels(cloud),
         [scene.sparse, scene.mesh, settings.truth or scene.truth, cloud.path],
-        settings,
     )
-    survey = CloudStatistics.from_cloud(cloud)
-    store = TileStore.build(
-        cloud, survey.grid(max_points(settings, BYTES), REACH * survey.spacing), parts.subfolder("tiles")
-    )
-    spacing, _ = sample_spacing(store, survey)
-    origin = local_origin(scene.model.views)
-    mesh = (
-        split_mesh(scene.mesh, parts.subfolder("surface"), origin, memory_of(settings))
-        if scene.mesh.exists()
-        else split_surfels(store, spacing, parts.subfolder("surface"), origin)
-    )
-    maps = RangeMaps(parts.subfolder("ranges"), {view.name: number for number, view in enumerate(views)})
-    compute_ranges(
-        RangeJob(scene.path, mesh, maps, {view.name: image_size(truth[view.name]) for view in views}), tasks
-    )
-    results = Results(parts.subfolder("results"), store)
-    job = EvaluateJob(
-        scene.path,
+    folder = WorkFolder(output, "evaluate", decisive, settings)
+    with open_executor(settings) as executor:
+        surface = find_points(scene, settings, cloud, folder, executor)
+    summary = judge(scene, settings, surface, labels)
+    folder.remove()
+    return summary
+
+
+def find_points(
+    scene: Scene, settings: Evaluate, cloud: CloudFile, folder: WorkFolder, executor: Executor
+) -> TiledSurface:
+    """Find the cloud's point at all pixels that have truth, tile by tile."""
+    truth = truth_masks(scene, settings)
+    views = [view for view in scene.model.views if view.name in truth]
+    statistics = CloudStatistics.from_cloud(cloud)
+    grid = statistics.grid(max_points(settings, BYTES), REACH * statistics.spacing)
+    store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
+    spacing, _ = sample_spacing(store, statistics)
+    parts, origin = folder.subfolder("surface"), local_origin(scene.model.views)
+    if scene.mesh.exists():
+        mesh = split_mesh(scene.mesh, parts, origin, memory_of(settings))
+    else:
+        mesh = split_surfels(store, spacing, parts, origin)
+    maps = RangeMaps(folder.subfolder("ranges"), {view.name: number for number, view in enumerate(views)})
+    sizes = {view.name: image_size(truth[view.name]) for view in views}
+    compute_ranges(RangeJob(scene.path, mesh, maps, sizes), executor)
+    results, files = (
+        Results(folder.subfolder("results"), store),
         {view.name: truth[view.name] for view in views},
-        survey.extent.low,
-        store,
-        results,
-        maps,
-        REACH * spacing,
     )
-    tasks.run("looking", partial(find_points_in_tile, job), store.tiles)
-    return TiledSurface(job, parts)
+    job = EvaluateJob(scene.path, files, statistics.extent.low, store, results, maps, REACH * spacing)
+    executor.run("looking", partial(find_points_in_tile, job), store.tiles)
+    return TiledSurface(job)
 
 
 def find_points_in_tile(job: EvaluateJob, tile: int) -> None:
     """Pixels whose first surface lies in the tile, and the nearest point of each: (2, K) int64 pixel and row
     of the cloud, for every view.
     """
-    window = job.store.window(tile, job.reach)
-    points = positions(window.gather(job.store.records))
+    halo = job.store.with_halo(tile, job.reach)
+    points = positions(halo.gather(job.store.records))
     low, high, index, views = (
         points.min(axis=0) - job.reach,
         points.max(axis=0) + job.reach,
@@ -130,7 +147,7 @@ def find_points_in_tile(job: EvaluateJob, tile: int) -> None:
             near = distance[:, 0] <= job.reach
             pixels = (rows * truth.shape[1] + columns)[mine][near]
             job.results.write(
-                tile, **{f"seen{job.maps.numbers[name]}": np.stack([pixels, window.rows[nearest[near, 0]]])}
+                tile, **{f"seen{job.maps.numbers[name]}": np.stack([pixels, halo.rows[nearest[near, 0]]])}
             )
 
 

@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 from tqdm import tqdm
 
@@ -47,7 +47,7 @@ class SerialExecutor:
 class DaskExecutor:
     """On the workers of a Dask cluster."""
 
-    def __init__(self, client: object) -> None:
+    def __init__(self, client: Any) -> None:
         self._client = client
 
     def run(

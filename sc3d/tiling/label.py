@@ -13,20 +13,24 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.geometry.neighbors import NeighborIndex, point_spacing
-from sc3d.geometry.voxels import BLOCK, VOXELS, sort_by_voxel, voxel_origin
-from sc3d.io.chunked_clouds import CloudFile, columns, positions, write_ply
+from sc3d.geometry.voxels import BLOCK, VOXELS, sort_by_voxel, unpack_blocks, voxel_origin
+from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.io.images import image_size
-from sc3d.labelling.fusion import Cloud, Extent, Fusion, fuse
+from sc3d.io.ply import write_records
+from sc3d.labelling.cloud import Cloud, CloudExtent
+from sc3d.labelling.fusion import Fusion, fuse
 from sc3d.labelling.inputs import FOOTPRINT_SAMPLE, Masks, best_confidence, point_density, voxel_size_for
+from sc3d.labelling.label import LabelSummary
 from sc3d.scene.labelled_cloud import SPACING_NEIGHBORS, SPACING_SAMPLE, VOTES, unit_normals
+from sc3d.scene.labels import STATE_NAMES
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
-from sc3d.tiling.executor import Executor
-from sc3d.tiling.memory import WorkFolder, max_points, memory_of
-from sc3d.tiling.ranges import RangeMaps
+from sc3d.tiling.executor import Executor, open_executor
+from sc3d.tiling.first_surfaces import RangeJob, RangeMaps, compute_ranges, split_mesh, split_surfels
+from sc3d.tiling.label_grid_file import write_field
+from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, mesh_triangles, num_points
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
-from sc3d.tiling.surfaces import RangeJob, compute_ranges, split_mesh, split_surfels
-from sc3d.tiling.voxel_file import write_field
+from sc3d.tiling.work_folder import WorkFolder
 
 BYTES = 420  # of a point while its tile votes
 VOXEL = 2.2  # of a label voxel, in point spacings, while neither is known exactly
@@ -44,7 +48,7 @@ class LabelJob:
 
     scene: Path
     settings: Label
-    extent: Extent
+    extent: CloudExtent
     store: TileStore
     results: Results
     maps: RangeMaps | None
@@ -55,53 +59,55 @@ class LabelJob:
         return BLOCKS * BLOCK * self.settings.voxel_size
 
 
-def label_tiles(
-    scene: Scene, settings: Label, cloud: CloudFile, tasks: Executor
-) -> tuple[np.ndarray, Label, int]:
-    """Label a cloud tile by tile and write it; returns the number of points in each state, the settings with
-    the voxel size, and the number of views.
+def label_fits(scene: Scene, settings: Label) -> bool:
+    """Whether cloud and mesh fit into memory as a whole, and nobody asked for workers. LAS and LAZ are read in parts in
+    any case.
     """
+    source = settings.cloud or scene.cloud
+    count = num_points(source)
+    if count is None or not source.exists():
+        return True  # cannot be read in parts
+    needed = count * BYTES + mesh_triangles(scene.mesh) * TRIANGLE
+    return source.suffix.lower() == ".ply" and fits(needed, settings)
+
+
+def label_scene(scene: Scene, settings: Label) -> LabelSummary:
+    """As `labelling.label.label_scene`, tile by tile, here or on the workers that the settings ask for."""
+    settings = settings.resolved
     if settings.surface == "voxels" and settings.depth_filter:
         raise InputError(
-            "--surface voxels needs the cloud in memory as a whole: take surfels, or allow more with --max-memory"
+            "--surface voxels needs the whole cloud in memory: take surfels, or raise --max-memory"
         )
+    cloud = CloudFile.open(settings.cloud or scene.cloud)
     confidence = best_confidence(scene) if settings.use_confidence else None
-    masks = Masks.load(scene, confidence)
-    output = settings.output or scene.seeds
-    parts = WorkFolder(
-        output,
-        "label",
-        [
-            scene.sparse,
-            scene.classes,
-            scene.masks,
-            *([confidence] if confidence else []),
-            scene.mesh,
-            cloud.path,
-        ],
-        settings,
-    )
-    survey = CloudStatistics.from_cloud(cloud)
-    margin = BLOCKS * BLOCK * (settings.voxel_size or VOXEL * survey.spacing)
-    store = TileStore.build(cloud, survey.grid(max_points(settings, BYTES), margin), parts.subfolder("tiles"))
-    spacing, sample = sample_spacing(store, survey)
+    masks, output = Masks.load(scene, confidence), settings.output or scene.seeds
+    decisive = [
+        scene.sparse,
+        scene.classes,
+        scene.masks,
+        *([confidence] if confidence else []),
+        scene.mesh,
+        cloud.path,
+    ]
+    folder = WorkFolder(output, "label", decisive, settings)
+    statistics = CloudStatistics.from_cloud(cloud)
+    margin = BLOCKS * BLOCK * (settings.voxel_size or VOXEL * statistics.spacing)
+    grid = statistics.grid(max_points(settings, BYTES), margin)
+    store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
+    spacing, sample = sample_spacing(store, statistics)
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=voxel_size_for(spacing, sample, masks))
-    maps = _ranges(scene, masks, store, spacing, settings, parts, tasks) if settings.depth_filter else None
-    job = LabelJob(
-        scene.path,
-        settings,
-        survey.extent,
-        store,
-        Results(parts.subfolder("results"), store),
-        maps,
-        confidence,
-    )
-    tasks.run("voting", partial(label_tile, job), store.tiles)
+    with open_executor(settings) as executor:
+        maps = None
+        if settings.depth_filter:
+            maps = _ranges(scene, masks, store, spacing, settings, folder, executor)
+        results = Results(folder.subfolder("results"), store)
+        job = LabelJob(scene.path, settings, statistics.extent, store, results, maps, confidence)
+        executor.run("voting", partial(label_tile, job), store.tiles)
     write_field(job.results, store.tiles, settings.voxel_size, scene.votes_of(settings.output))
     counts = _write(output, cloud, job, scene.class_table().num_ids)
-    parts.remove()
-    return counts, settings, len(masks.views)
+    folder.remove()
+    return LabelSummary(counts, settings.voxel_size, len(masks.views))
 
 
 def _ranges(
@@ -111,7 +117,7 @@ def _ranges(
     spacing: float,
     settings: Label,
     parts: WorkFolder,
-    tasks: Executor,
+    executor: Executor,
 ) -> RangeMaps:
     origin = local_origin(masks.views)
     if scene.mesh.exists() and settings.surface == "auto":
@@ -129,26 +135,26 @@ def _ranges(
         RangeJob(
             scene.path, mesh, maps, {view.name: image_size(masks.files[view.name]) for view in masks.views}
         ),
-        tasks,
+        executor,
     )
 
 
-def sample_spacing(store: TileStore, survey: CloudStatistics) -> tuple[float, np.ndarray]:
+def sample_spacing(store: TileStore, statistics: CloudStatistics) -> tuple[float, np.ndarray]:
     """Sampling distance as `labelled.spacing_of` has it, and the points (S, 3) by which `default_voxel_size`
     measures mask pixels.
     """
     rows, distances, footprint_rows, footprints = [], [], [], []
     num_points = sum(store.counts.values())
     for tile in store.tiles:
-        window = store.window(tile, SAMPLE_MARGIN * survey.spacing)
-        points = positions(window.gather(store.records))
-        mine = window.core & (window.rows % max(1, num_points // SPACING_SAMPLE) == 0)
-        rows.append(window.rows[mine])
+        halo = store.with_halo(tile, SAMPLE_MARGIN * statistics.spacing)
+        points = positions(halo.gather(store.records))
+        mine = halo.core & (halo.rows % max(1, num_points // SPACING_SAMPLE) == 0)
+        rows.append(halo.rows[mine])
         distances.append(
-            NeighborIndex(points, survey.extent.low).nearest(points[mine], SPACING_NEIGHBORS + 1)[1]
+            NeighborIndex(points, statistics.extent.low).nearest(points[mine], SPACING_NEIGHBORS + 1)[1]
         )
-        mine = window.core & (window.rows % max(1, num_points // FOOTPRINT_SAMPLE) == 0)
-        footprint_rows.append(window.rows[mine])
+        mine = halo.core & (halo.rows % max(1, num_points // FOOTPRINT_SAMPLE) == 0)
+        footprint_rows.append(halo.rows[mine])
         footprints.append(points[mine])
     ordered = [
         np.concatenate(values)[np.argsort(np.concatenate(keys))]
@@ -164,8 +170,8 @@ def label_tile(job: LabelJob, tile: int) -> None:
     if job.results.has(tile, "field"):
         return
     scene, store = Scene(job.scene), job.store
-    window = store.window(tile, job.margin)
-    records = window.gather(store.records)
+    halo = store.with_halo(tile, job.margin)
+    records = halo.gather(store.records)
     points, masks = positions(records), Masks.load(scene, job.confidence)
     normals = unit_normals(
         columns(records, ("nx", "ny", "nz")),
@@ -174,7 +180,9 @@ def label_tile(job: LabelJob, tile: int) -> None:
         job.extent.low,
     )
     origin = voxel_origin(job.extent.low, job.settings.voxel_size)
-    density = point_density(scene, points, job.settings.voxel_size, origin) if job.settings.density else None
+    density = None
+    if job.settings.mechanisms.density:
+        density = point_density(scene, points, job.settings.voxel_size, origin)
     fusion = fuse(
         Cloud(points, normals, density, job.extent),
         masks.views,
@@ -183,7 +191,7 @@ def label_tile(job: LabelJob, tile: int) -> None:
         scene.class_table().num_ids,
         job.settings,
     )
-    core = window.core
+    core = halo.core
     labels = fusion.labels
     job.results.write(
         tile,
@@ -199,33 +207,33 @@ def label_tile(job: LabelJob, tile: int) -> None:
 
 
 def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (B, 3) int32 and counts of the field's blocks whose first point, by row, lies in the tile:
-    each block belongs to one tile.
+    """Positions (B, 3) int32 and counts of the field's blocks whose first point, by row, lies in the tile: each block
+    belongs to one tile.
     """
-    field = fusion.field
-    sorting = sort_by_voxel(points, field.voxel_size, field.origin)
-    blocks, first_voxel = np.unique(sorting.keys // VOXELS, return_index=True)
-    mine = blocks[core[np.minimum.reduceat(sorting.order, sorting.starts[first_voxel])]]
-    return field.block_positions(mine), field.block_votes(mine)
+    grid = fusion.grid
+    voxels = sort_by_voxel(points, grid.voxel_size, grid.origin)
+    blocks, first_voxel = np.unique(voxels.keys // VOXELS, return_index=True)
+    mine = unpack_blocks(blocks[core[np.minimum.reduceat(voxels.order, voxels.starts[first_voxel])]])
+    return mine, grid.grid.attribute(grid.ATTRIBUTE).numpy()[grid.slots(mine)]
 
 
 def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndarray:
     """The cloud with the labels of its tiles; returns the number of points in each state."""
-    sum_statistics = [
+    added = [
         ("label", "u1"),
         ("confidence", "f4"),
         ("state", "u1"),
         ("num_views", "i4"),
         *((f"{VOTES}{label}", "f4") for label in range(num_ids)),
     ]
-    names = {name for name, _ in sum_statistics} | {"nx", "ny", "nz"}
+    names = {name for name, _ in added} | {"nx", "ny", "nz"}
     kept = [
         (name, cloud.dtype[name].str[1:])
         for name in cloud.dtype.names
         if name not in names and not name.startswith(VOTES)
     ]
-    dtype = np.dtype([*kept, ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), *sum_statistics])
-    counts = np.zeros(8, np.int64)
+    dtype = np.dtype([*kept, ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), *added])
+    counts = np.zeros(len(STATE_NAMES), np.int64)
 
     def chunks():
         fused = job.results.in_order(["label", "confidence", "state", "num_views", "votes", "normals"])
@@ -239,8 +247,8 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndar
                 result[f"{VOTES}{label}"] = values["votes"][:, label]
             for name in ("label", "confidence", "state", "num_views"):
                 result[name] = values[name]
-            counts[:] += np.bincount(values["state"], minlength=8)
+            counts[:] += np.bincount(values["state"], minlength=len(STATE_NAMES))
             yield result
 
-    write_ply(path, dtype, cloud.num_points, chunks())
+    write_records(path, chunks(), dtype, cloud.num_points, ["sc3d"])
     return counts

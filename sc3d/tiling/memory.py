@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
-import shutil
-from dataclasses import asdict, fields
 from pathlib import Path
 
 from sc3d.errors import InputError
-from sc3d.io.atomic import require_room
 from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.ply import read_header
 from sc3d.settings.common import Resources
@@ -62,43 +58,3 @@ def mesh_triangles(path: Path) -> int:
     """Triangles of a mesh file, 0 if there is none."""
     face = read_header(path).element("face") if path.is_file() else None
     return face.rows if face is not None else 0
-
-
-class WorkFolder:
-    """A folder for what a stage has finished, beside its output: hidden, named after all that decides its
-    content, and removed with the last output.
-    """
-
-    def __init__(self, output: Path, stage: str, inputs: list[Path], settings: object) -> None:
-        ignored = {field.name for field in fields(Resources)}
-        decisive = [
-            sorted(
-                (name, str(value))
-                for name, value in asdict(settings).items()
-                if name not in ignored | {"output"}
-            )
-        ]
-        state = hashlib.sha256(
-            repr((stage, decisive, [_identity(path) for path in inputs])).encode()
-        ).hexdigest()[:12]
-        self.folder = output.absolute().parent / f".{output.name}.{state}.parts"
-        for other in self.folder.parent.glob(f".{output.name}.*.parts"):
-            if other != self.folder:
-                shutil.rmtree(other, ignore_errors=True)
-
-    def subfolder(self, name: str) -> Path:
-        folder = self.folder / name
-        folder.mkdir(parents=True, exist_ok=True)
-        require_room(folder / "any")
-        return folder
-
-    def remove(self) -> None:
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-
-def _identity(path: Path) -> tuple:
-    """Of a file, or of all files of a folder: names, sizes and times."""
-    files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    return str(path), tuple(
-        (str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file()
-    )

@@ -20,40 +20,33 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sc3d.errors import InputError
-from sc3d.io.chunked_clouds import CloudFile, write_ply
+from sc3d.io.chunked_clouds import CloudFile
+from sc3d.io.ply import write_records
 from sc3d.propagation.appearance import (
-    MIN_EXAMPLES,
     AppearanceModel,
     AppearanceStatistics,
     feature_counts,
     folds_of,
-)
-from sc3d.propagation.potts import STEPS
-from sc3d.propagation.propagate import (
-    appearance_marginals,
-    decided,
-    examples_in,
-    final_labels,
     is_skillful,
-    needs_appearance,
-    spread,
+    plausible,
     sum_statistics,
-    verified,
-    views_to_agree,
-    vote_marginals,
+    uses_appearance,
 )
+from sc3d.propagation.labelled_points import MIN_EXAMPLES, views_to_agree
+from sc3d.propagation.potts import STEPS, appearance_marginals, decided, sure_examples, vote_marginals
+from sc3d.propagation.propagate import PropagateSummary, fill_from_nearest, no_seeds, spread, with_states
 from sc3d.propagation.quantile_sketch import QuantileSketch
-from sc3d.propagation.region_growing import vote_nearest
 from sc3d.propagation.terrain import WINDOWS, GroundModel, NormalStatistics
 from sc3d.scene.labelled_cloud import VOTES
 from sc3d.scene.labels import PROPAGATED
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
-from sc3d.tiling.executor import Executor
+from sc3d.tiling.executor import Executor, open_executor
 from sc3d.tiling.label import sample_spacing
-from sc3d.tiling.memory import WorkFolder, max_points
-from sc3d.tiling.propagation_tiles import PropagateJob, TileGraph, cells_of
+from sc3d.tiling.memory import fits, max_points, num_points
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
+from sc3d.tiling.tile_graph import PropagateJob, TileGraph, cells_of
+from sc3d.tiling.work_folder import WorkFolder
 
 logger = logging.getLogger(__name__)
 
@@ -62,64 +55,48 @@ EDGE = 2.6  # an edge is hardly longer, point spacings
 HOPS = STEPS + 3  # how far a round of mean field looks, and what the edges at that distance depend on
 
 
-@dataclass(frozen=True)
-class Summary:
-    """Of a finished cloud: points, those with a label, those that got it here, and the sum of the labelled
-    points' confidences.
-    """
-
-    num_points: int
-    labelled: int
-    propagated: int
-    confidence: float
+def propagate_fits(scene: Scene, settings: Propagate) -> bool:
+    """Whether the cloud fits into memory as a whole, and nobody asked for workers."""
+    count = num_points(settings.seeds or scene.seeds)
+    return count is None or fits(count * BYTES, settings)
 
 
-def propagate_tiles(scene: Scene, settings: Propagate, cloud: CloudFile, tasks: Executor) -> Summary:
-    """Complete the labels of a cloud that `label` wrote, and write it."""
-    output = settings.output or scene.labelled
+def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
+    """As `propagation.propagate.propagate_scene`, tile by tile, here or on the workers that the settings ask for."""
+    cloud, output = CloudFile.open(settings.seeds or scene.seeds), settings.output or scene.labelled
     num_ids = sum(name.startswith(VOTES) for name in cloud.dtype.names)
-    missing = [
-        name
-        for name in ("nx", "label", "confidence", "state", "num_views", f"{VOTES}0")
-        if name not in cloud.dtype.names
-    ]
-    if missing:
-        raise InputError(f"{cloud.path} has no attribute {missing[0]!r}: it was not written by `sc3d label`")
-    parts = WorkFolder(output, "propagate", [cloud.path], settings)
-    survey = CloudStatistics.from_cloud(cloud)
-    grid = survey.grid(max_points(settings, BYTES), HOPS * EDGE * survey.spacing)
-    store = TileStore.build(cloud, grid, parts.subfolder("tiles"))
-    margin = HOPS * EDGE * sample_spacing(store, survey)[0]
-    job = PropagateJob(
-        settings,
-        survey.extent,
-        store,
-        Results(parts.subfolder("results"), store),
-        margin,
-        num_ids,
-        parts.subfolder("shared"),
+    for name in ("nx", "label", "confidence", "state", "num_views", f"{VOTES}0"):
+        if name not in cloud.dtype.names:
+            raise InputError(f"{cloud.path} has no attribute {name!r}: it was not written by `sc3d label`")
+    folder, statistics = (
+        WorkFolder(output, "propagate", [cloud.path], settings),
+        CloudStatistics.from_cloud(cloud),
     )
-    _solve(job, tasks, cloud.path)
+    grid = statistics.grid(max_points(settings, BYTES), HOPS * EDGE * statistics.spacing)
+    store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
+    margin = HOPS * EDGE * sample_spacing(store, statistics)[0]
+    results, shared = Results(folder.subfolder("results"), store), folder.subfolder("shared")
+    job = PropagateJob(settings, statistics.extent, store, results, margin, num_ids, shared)
+    with open_executor(settings) as executor:
+        _solve(job, executor, cloud.path)
     summary = _write(output, cloud, job)
-    parts.remove()
+    folder.remove()
     return summary
 
 
-def _solve(job: PropagateJob, tasks: Executor, path: Path) -> None:
+def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
     """All passes; leaves arrays `label`, `confidence` and `state` of every tile."""
     tiles = job.store.tiles
-    looks = tasks.run("graph", partial(_graph_task, job), tiles)
+    summaries = executor.run("graph", partial(_graph_task, job), tiles)
     offered, least = (
-        sum(look.seeds for look in looks) > 0,
-        views_to_agree(sum(look.agreement for look in looks)),
+        sum(summary.seeds for summary in summaries) > 0,
+        views_to_agree(sum(summary.agreement for summary in summaries)),
     )
     if not offered.any():
-        raise InputError(
-            f"{path} has no labelled point to start from: check that masks and cloud belong together, or lower --consensus in label"
-        )
+        raise no_seeds(path)
     statistics = (
-        _learn(job, tasks, NormalStatistics.merge([look.lean for look in looks]), least)
-        if needs_appearance(job.settings)
+        _learn(job, executor, NormalStatistics.merge([summary.lean for summary in summaries]), least)
+        if uses_appearance(job.settings)
         else None
     )
     source = "once"
@@ -129,12 +106,12 @@ def _solve(job: PropagateJob, tasks: Executor, path: Path) -> None:
                 break
             source = f"round{turn}"
             statistics = sum_statistics(
-                tasks.run(f"round {turn + 1}", partial(_turn_task, job, offered, statistics, turn), tiles)
+                executor.run(f"round {turn + 1}", partial(_turn_task, job, offered, statistics, turn), tiles)
             )
     else:
-        tasks.run("labels", partial(_once_task, job, offered, statistics), tiles)
-    reached = _reached(job, tasks) if job.settings.method == "map" else None
-    tasks.run("states", partial(_state_task, job, source, reached, statistics), tiles)
+        executor.run("labels", partial(_once_task, job, offered, statistics), tiles)
+    reached = _reached(job, executor) if job.settings.method == "map" else None
+    executor.run("states", partial(_state_task, job, source, reached, statistics), tiles)
 
 
 @dataclass(frozen=True)
@@ -150,7 +127,7 @@ class TileSummary:
 
 def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
     part = TileGraph.load(job, tile)
-    core, start = part.core, part.known.start
+    core, start = part.core, part.known.seed_labels
     return TileSummary(
         np.bincount(start[core], minlength=job.num_ids)[1 : job.num_ids],
         part.known.agreement(core),
@@ -159,25 +136,27 @@ def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
 
 
 def _learn(
-    job: PropagateJob, tasks: Executor, lean: NormalStatistics, least: int
+    job: PropagateJob, executor: Executor, lean: NormalStatistics, least: int
 ) -> AppearanceStatistics | None:
     """What the agreed points of all tiles teach, if that does well on points held out."""
     tiles, terrain = job.store.tiles, GroundModel.from_statistics(lean, job.extent.low, job.extent.high)
     for window, ground in zip(
-        WINDOWS, terrain.grounds(tasks.run("ground", partial(_lowest_task, job, terrain), tiles)), strict=True
+        WINDOWS,
+        terrain.grounds(executor.run("ground", partial(_lowest_task, job, terrain), tiles)),
+        strict=True,
     ):
         np.save(job.shared / f"ground{window}.npy", ground)
     counts = [
         QuantileSketch.merge(list(parts))
-        for parts in zip(*tasks.run("relief", partial(_relief_task, job, terrain), tiles), strict=True)
+        for parts in zip(*executor.run("relief", partial(_relief_task, job, terrain), tiles), strict=True)
     ]
     halves = [
         sum_statistics(list(parts))
         for parts in zip(
-            *tasks.run("examples", partial(_lesson_task, job, counts, least), tiles), strict=True
+            *executor.run("examples", partial(_statistics_task, job, counts, least), tiles), strict=True
         )
     ]
-    errors = tasks.run("held-out errors", partial(_error_task, job, halves, least), tiles)
+    errors = executor.run("held-out errors", partial(_error_task, job, halves, least), tiles)
     wrong = [None if None in fold else sum(fold) for fold in zip(*errors, strict=True)]
     statistics = sum_statistics(halves)
     return statistics if is_skillful(wrong, statistics) else None
@@ -198,7 +177,7 @@ def _relief_task(job: PropagateJob, terrain: GroundModel, tile: int) -> list[Qua
     )
 
 
-def _lesson_task(
+def _statistics_task(
     job: PropagateJob, counts: list[QuantileSketch], least: int, tile: int
 ) -> tuple[AppearanceStatistics, AppearanceStatistics]:
     part = TileGraph.load(job, tile)
@@ -211,7 +190,7 @@ def _lesson_task(
         folds_of(part.known.points, job.extent.low, job.extent.high),
     )
     return tuple(
-        appearance.statistics(part.known.start, examples & (folds == fold), part.known.num_classes)
+        appearance.statistics(part.known.seed_labels, examples & (folds == fold), part.known.num_classes)
         for fold in (0, 1)
     )
 
@@ -220,7 +199,7 @@ def _error_task(
     job: PropagateJob, halves: list[AppearanceStatistics], least: int, tile: int
 ) -> tuple[int | None, int | None]:
     part = TileGraph.load(job, tile)
-    appearance, start = part.appearance(job), part.known.start
+    appearance, start = part.appearance(job), part.known.seed_labels
     examples, folds = (
         part.known.agreed_by(least) & part.core,
         folds_of(part.known.points, job.extent.low, job.extent.high),
@@ -235,11 +214,11 @@ def _turn_task(
     part = TileGraph.load(job, tile)
     appearance, known = part.appearance(job), part.known
     if not job.results.has(tile, f"round{turn}_examples"):
-        label = part.around(job, f"round{turn - 1}_label") if turn else known.start
+        label = part.around(job, f"round{turn - 1}_label") if turn else known.seed_labels
         evidence, marginals = appearance_marginals(
             part.graph, known, offered, appearance.log_likelihood(statistics, label), job.settings
         )
-        examples = examples_in(marginals, known)
+        examples = sure_examples(marginals, known)
         label, confidence = decided(part.graph, evidence, marginals)
         names = (f"round{turn}_label", f"round{turn}_confidence", f"round{turn}_examples")
         job.results.write(
@@ -258,7 +237,7 @@ def _turn_task(
 def _once_task(
     job: PropagateJob, offered: np.ndarray, statistics: AppearanceStatistics | None, tile: int
 ) -> None:
-    """map without raters, geometry or knn, within the margin."""
+    """map without appearance, geometry or knn, within the margin."""
     part = TileGraph.load(job, tile)
     if job.settings.method == "map":
         label, confidence = decided(
@@ -272,22 +251,22 @@ def _once_task(
 
 def _start(job: PropagateJob, part: TileGraph, statistics: AppearanceStatistics | None) -> np.ndarray:
     """The labels of the seeds; for geometry and knn without those that look like another class."""
-    start = part.known.start
+    start = part.known.seed_labels
     return (
         start
         if statistics is None or job.settings.method == "map"
-        else verified(start, part.appearance(job).log_likelihood(statistics, start))
+        else plausible(start, part.appearance(job).log_likelihood(statistics, start))
     )
 
 
-def _reached(job: PropagateJob, tasks: Executor) -> dict[int, np.ndarray]:
+def _reached(job: PropagateJob, executor: Executor) -> dict[int, np.ndarray]:
     """Per tile, (K,) bool: the connected groups of its points from which some path, through whatever tiles,
     leads to a seed.
     """
     tiles = job.store.tiles
-    sizes = np.cumsum([0, *tasks.run("connections", partial(_component_task, job), tiles)])
+    sizes = np.cumsum([0, *executor.run("connections", partial(_component_task, job), tiles)])
     first = dict(zip(tiles, sizes[:-1].tolist(), strict=True))
-    found = tasks.run("links", partial(_link_task, job, first), tiles)
+    found = executor.run("links", partial(_link_task, job, first), tiles)
     links = np.concatenate([pairs for pairs, _ in found])
     graph = coo_matrix((np.ones(len(links), np.int8), links.T), shape=(sizes[-1], sizes[-1]))
     group, seeded = connected_components(graph, directed=False)[1], np.zeros(sizes[-1], bool)
@@ -321,11 +300,11 @@ def _link_task(job: PropagateJob, first: dict[int, int], tile: int) -> tuple[np.
     """
     part = TileGraph.load(job, tile)
     mine = job.results.read(tile, "all_groups").astype(np.int64) + first[tile]
-    others = part.window.gather(
+    others = part.halo.gather(
         lambda other: job.results.read(other, "group", mapped=True).astype(np.int64) + first[other]
     )[part.graph.order]
     pairs = np.unique(np.stack([mine[~part.core], others[~part.core]], axis=1), axis=0)
-    return pairs, np.unique(mine[part.core & (part.known.start > 0)])
+    return pairs, np.unique(mine[part.core & (part.known.seed_labels > 0)])
 
 
 def _state_task(
@@ -338,23 +317,17 @@ def _state_task(
     part = TileGraph.load(job, tile)
     label, confidence = (part.around(job, f"{source}_{name}") for name in ("label", "confidence"))
     if reached is not None:
-        groups = part.window.gather(
-            lambda other: reached[other][job.results.read(other, "group", mapped=True)]
-        )
+        groups = part.halo.gather(lambda other: reached[other][job.results.read(other, "group", mapped=True)])
         label = np.where(groups[part.graph.order], label, 0)
-    if job.settings.fill and (label == 0).any() and (label > 0).any():
-        filled, filled_confidence = vote_nearest(part.known.points, label.astype(np.uint8), 1)
-        label, confidence = (
-            np.where(label == 0, filled, label),
-            np.where(label == 0, 0.5 * filled_confidence, confidence),
-        )
-    final = final_labels(part.known.seeds, _start(job, part, statistics), label, confidence, job.settings)
+    if job.settings.fill:
+        label, confidence = fill_from_nearest(part.known.points, label, confidence)
+    final = with_states(part.known.seeds, _start(job, part, statistics), (label, confidence), job.settings)
     job.results.write(
         tile, label=part.own(final.label), confidence=part.own(final.confidence), state=part.own(final.state)
     )
 
 
-def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> Summary:
+def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
     kept = [(name, cloud.dtype[name].str[1:]) for name in cloud.dtype.names if not name.startswith(VOTES)]
     counts, confidence = np.zeros(3, np.int64), [0.0]
 
@@ -370,5 +343,5 @@ def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> Summary:
             confidence[0] += float(values["confidence"][labelled].sum(dtype=np.float64))
             yield result
 
-    write_ply(path, np.dtype(kept), cloud.num_points, chunks())
-    return Summary(*counts.tolist(), confidence[0])
+    write_records(path, chunks(), np.dtype(kept), cloud.num_points, ["sc3d"])
+    return PropagateSummary(*counts.tolist(), confidence[0])

@@ -16,7 +16,7 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
 from sc3d.io.chunked_clouds import CHUNK, CloudFile, positions
-from sc3d.labelling.fusion import MIDDLE_STEPS, Extent, count_steps, histogram_median
+from sc3d.labelling.cloud import STEPS, CloudExtent, histogram_median, position_histogram
 
 RASTER = 512  # cells per side in which points are counted, to choose the tiles
 MAX_TILES = 4096
@@ -54,7 +54,7 @@ class TileGrid:
         """(N,) bool: points less than `margin` outside a tile, or in it."""
         low, high = self.box(tile)
         flat = points[:, self.axes]
-        return ((flat >= low - margin) & (flat < high + margin)).all(axis=1)
+        return np.all((flat >= low - margin) & (flat < high + margin), axis=1)
 
     def neighbors(self, tile: int, margin: float) -> list[int]:
         """The tiles that the margin around a tile reaches into, itself first."""
@@ -79,7 +79,7 @@ class CloudStatistics:
     plane (RASTER, RASTER) int64.
     """
 
-    extent: Extent
+    extent: CloudExtent
     axes: tuple[int, int]
     counts: np.ndarray
 
@@ -90,14 +90,14 @@ class CloudStatistics:
             points = positions(records)
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
         axes = tuple(sorted(np.argsort(high - low, kind="stable")[1:].tolist()))
-        steps, counts = np.zeros((3, MIDDLE_STEPS), np.int64), np.zeros(RASTER * RASTER, np.int64)
+        steps, counts = np.zeros((3, STEPS), np.int64), np.zeros(RASTER * RASTER, np.int64)
         fine = TileGrid(low[list(axes)], float((high - low).max()) / RASTER or 1.0, (RASTER, RASTER), axes)
         for _, records in cloud.chunks():
             points = positions(records)
-            steps += count_steps(points, low, high)
+            steps += position_histogram(points, low, high)
             counts += np.bincount(fine.tile_of(points), minlength=RASTER * RASTER)
         return cls(
-            Extent(low, high, histogram_median(steps, low, high)), axes, counts.reshape(RASTER, RASTER)
+            CloudExtent(low, high, histogram_median(steps, low, high)), axes, counts.reshape(RASTER, RASTER)
         )
 
     @property
@@ -140,16 +140,12 @@ class CloudStatistics:
         return _square_grid(self.extent, self.axes, parts)
 
 
-def _square_grid(extent: Extent, axes: tuple[int, int], parts: int) -> TileGrid:
+def _square_grid(extent: CloudExtent, axes: tuple[int, int], parts: int) -> TileGrid:
     """So many tiles along the longer side; along the shorter, as many as are needed."""
     sides = (extent.high - extent.low)[list(axes)]
     size = float(sides.max()) / parts or 1.0
-    return TileGrid(
-        extent.low[list(axes)],
-        size,
-        tuple(int(count) for count in np.clip(np.ceil(sides / size - 1e-9), 1, parts)),
-        axes,
-    )
+    first, second = np.clip(np.ceil(sides / size - 1e-9), 1, parts).astype(int).tolist()
+    return TileGrid(extent.low[list(axes)], size, (first, second), axes)
 
 
 @dataclass(frozen=True)
@@ -221,7 +217,7 @@ class TileStore:
     def rows(self, tile: int) -> np.ndarray:
         return np.memmap(self.folder / f"{tile}.row", np.int64, "r")
 
-    def window(self, tile: int, margin: float) -> TileWithHalo:
+    def with_halo(self, tile: int, margin: float) -> TileWithHalo:
         """The points of a tile, and those less than `margin` (world units) around it; which these are is
         remembered in a file.
         """
@@ -234,7 +230,7 @@ class TileStore:
                         self.grid.within(positions(self.records(other)), tile, margin)
                     ).astype(np.int32)
             with atomic_path(file) as temporary:
-                np.savez(temporary, **around)
+                np.savez(temporary, **around)  # type: ignore[arg-type]  # as in `LabelGrid.save`
         with np.load(file, allow_pickle=False) as around:
             parts = [
                 (tile, slice(None)),
@@ -249,7 +245,7 @@ class TileStore:
 
 def _append(path: Path, values: np.ndarray) -> None:
     with path.open("ab") as file:
-        file.write(np.ascontiguousarray(values))
+        file.write(np.ascontiguousarray(values).data)
 
 
 @dataclass(frozen=True)
@@ -271,15 +267,15 @@ class Results:
     def read(self, tile: int, name: str, mapped: bool = False) -> np.ndarray:
         return np.load(self._path(tile, name), mmap_mode="r" if mapped else None, allow_pickle=False)
 
-    def around(self, window: TileWithHalo, name: str) -> np.ndarray:
+    def around(self, halo: TileWithHalo, name: str) -> np.ndarray:
         """Values of the window's points."""
-        return window.gather(lambda tile: self.read(tile, name, mapped=True))
+        return halo.gather(lambda tile: self.read(tile, name, mapped=True))
 
     def in_order(self, names: list[str]) -> Iterator[dict[str, np.ndarray]]:
         """The values of all points in the order of the cloud, CHUNK at a time."""
         total = sum(self.store.counts.values())
         for start in range(0, total, CHUNK):
-            stop, chunk = min(start + CHUNK, total), {}
+            stop, chunk = min(start + CHUNK, total), dict[str, np.ndarray]()
             for tile in self.store.tiles:
                 rows = self.store.rows(tile)
                 first, last = np.searchsorted(rows, (start, stop))

@@ -4,27 +4,31 @@ colors.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.io.clouds import read_cloud
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import VOTES, spacing_of
+from sc3d.scene.scene import Scene
 from sc3d.view.colors import COLORINGS, Coloring, can_color, color_points, shaded
-from sc3d.view.progressive_order import even_order
 
 if TYPE_CHECKING:
     import open3d as o3d
 
 _CHUNKS = 16  # steps in which points come and go; each is a node per class
 _SMALLEST_CHUNK = 20_000
+_BITS = 21  # of the Morton code per axis; three of them fit into 63 bits
 _SAMPLE = 50_000  # points from which the spacing is found
 
 
 @dataclass(frozen=True)
-class ShownCloud:
+class DisplayCloud:
     """N points in the order in which they are shown.
 
     points: (N, 3) float32, world minus `origin` (3,) float64, so that UTM coordinates keep their millimeters
@@ -42,12 +46,12 @@ class ShownCloud:
     _colors: dict[tuple[str, bool], np.ndarray] = field(default_factory=dict)
 
     @classmethod
-    def of(
+    def from_cloud(
         cls, cloud: o3d.t.geometry.PointCloud, origin: np.ndarray, class_table: ClassTable | None
-    ) -> ShownCloud:
+    ) -> DisplayCloud:
         """origin: (3,) world, near the cloud"""
         world = cloud.point.positions.cpu().numpy()
-        rows = even_order(world)
+        rows = progressive_order(world)
         points = (world[rows].astype(np.float64) - origin).astype(np.float32)
         label = (
             cloud.point["label"].cpu().numpy().ravel().astype(np.uint8)[rows]
@@ -149,6 +153,26 @@ def only_classes(cloud: o3d.t.geometry.PointCloud, ids: set[int] | None) -> o3d.
     return cloud.select_by_mask(o3d.core.Tensor(chosen))
 
 
+def load_cloud(
+    scene: Scene, file: Path | None = None, votes: bool | None = False
+) -> o3d.t.geometry.PointCloud:
+    """The cloud of a file, else the best of the scene; InputError if there is none.
+
+    votes: add those of seeds.ply to a cloud of the scene that has none; None = where that is possible
+    """
+    path = file or scene.best_cloud
+    if path is None:
+        raise InputError(f"{scene.path} has no cloud to show: run `sc3d extract SCENE`, or pass --file FILE")
+    cloud = read_cloud(path)
+    if votes is False or can_color(cloud, "disagreement") or file is not None or not scene.seeds.exists():
+        return cloud
+    if votes:
+        return with_votes(cloud, read_cloud(scene.seeds))
+    with suppress(InputError):
+        return with_votes(cloud, read_cloud(scene.seeds))
+    return cloud
+
+
 def with_votes(
     cloud: o3d.t.geometry.PointCloud, seeds: o3d.t.geometry.PointCloud
 ) -> o3d.t.geometry.PointCloud:
@@ -164,3 +188,53 @@ def with_votes(
     for name in [name for name in seeds.point if name.startswith(VOTES)]:
         result.point[name] = seeds.point[name]
     return result
+
+
+def progressive_order(points: np.ndarray) -> np.ndarray:
+    """Rows of the points so that the first K of them, for any K, thin the cloud evenly and keep its relative
+    densities.
+
+    The points are sorted along a Z-order curve, which neighbors share, and then taken in the order of the
+    van der Corput sequence,
+    whose every beginning is spread evenly over the curve. Nothing is random, and copies of a cloud in another
+    order give the same points.
+
+    points: (N, 3) finite; returns: (N,) int64, a permutation
+    """
+    along_curve = np.argsort(morton_codes(points), kind="stable")
+    return along_curve[_van_der_corput(len(points))]
+
+
+def morton_codes(points: np.ndarray) -> np.ndarray:
+    """(N,) uint64 position of (N, 3) points on the Z-order curve of the cube around them."""
+    points = np.asarray(points, np.float64)
+    if not len(points):
+        return np.empty(0, np.uint64)
+    low = points.min(axis=0)
+    side = float((points.max(axis=0) - low).max()) or 1.0
+    cells = np.minimum((points - low) / side * (1 << _BITS), (1 << _BITS) - 1).astype(np.uint64)
+    x, y, z = (_spread(cells[:, axis]) for axis in range(3))
+    return x << np.uint64(2) | y << np.uint64(1) | z
+
+
+def _spread(values: np.ndarray) -> np.ndarray:
+    """Two zero bits between any two of the 21 bits of (N,) uint64."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        values = (values | values << np.uint64(shift)) & np.uint64(mask)
+    return values
+
+
+def _van_der_corput(count: int) -> np.ndarray:
+    """(count,) int64: 0 to count - 1 by their bits read backwards."""
+    bits = max(count - 1, 0).bit_length()
+    numbers = np.arange(1 << bits, dtype=np.int64)
+    backwards = np.zeros_like(numbers)
+    for bit in range(bits):
+        backwards |= (numbers >> bit & 1) << (bits - 1 - bit)
+    return backwards[backwards < count]

@@ -9,13 +9,18 @@ import cv2
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
+from tqdm import tqdm
 
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View, pinhole_view
 from sc3d.io.atomic import atomic_path
+from sc3d.splatting.evaluation import picture
+from sc3d.view.colors import Coloring
+from sc3d.view.display_splats import DisplaySplats
 from sc3d.view.viewpoints import fitted
 
 FRAMES_PER_SECOND = 25
+WHITE = (255, 255, 255)  # where there are no splats
 
 
 def flight_path(
@@ -40,6 +45,22 @@ def flight_path(
     poses = np.tile(np.eye(4), (len(moments), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = turned, -np.einsum("nij,nj->ni", turned, moved)
     return [pinhole_view("flight", frame, calibration, pose) for pose in poses]
+
+
+def write_flight(
+    path: Path, splats: DisplaySplats, by: Coloring, views: Sequence[View], size: tuple[int, int]
+) -> None:
+    """Write a video (MP4) of Gaussians along the cameras of a flight, on white.
+
+    by: the photos' colors where the splats have no labels; views: world; size: (width, height) px that the
+        frames fit into
+    """
+    gaussians = splats.gaussians if splats.label is None else splats.painted(by)
+    ride = flight_path([view.shifted(splats.origin) for view in views], size)
+    frames = (
+        picture(gaussians, view, WHITE) for view in tqdm(ride, desc="flight", unit="frame", disable=None)
+    )
+    write_video(path, frames, (ride[0].width, ride[0].height))
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], size: tuple[int, int]) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,11 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import open3d as o3d
 
+from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, local_origin, project, rays
 from sc3d.geometry.neighbors import estimate_normals, orient_normals
 from sc3d.geometry.raycast import FirstSurface, see_points
+from sc3d.io.json_files import read_json
+from sc3d.runner import sidecar
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import NORMAL_NEIGHBORS, read_surface, read_votes, spacing_of
+from sc3d.scene.scene import Scene
 from sc3d.view.colors import STATES
 
 if TYPE_CHECKING:
@@ -83,6 +88,14 @@ class Inspector:
         self.cloud, self.views, self.class_table, self._mesh = cloud, list(views), class_table, mesh
         self._points = cloud.point.positions.cpu().numpy().astype(np.float64)
         self._given_voxel_size = voxel_size
+
+    @classmethod
+    def from_scene(cls, scene: Scene, cloud: o3d.t.geometry.PointCloud, views: Sequence[View]) -> Inspector:
+        """Looks points up as `label` saw them: with the voxel size that it wrote down."""
+        table, voxel_size = scene.class_table() if scene.classes.exists() else None, None
+        with suppress(InputError, KeyError, TypeError, ValueError):
+            voxel_size = float(read_json(sidecar(scene.seeds))["summary"]["voxel_size"])
+        return cls(cloud, views, table, scene.mesh, voxel_size)
 
     def nearest(self, position: np.ndarray) -> int:
         """Row of the point nearest to a (3,) world position."""

@@ -11,6 +11,7 @@ Known failures, and what is done about them (Open3D 0.20):
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import logging
 import os
@@ -20,11 +21,15 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View, pinhole_view
+
+if TYPE_CHECKING:
+    import open3d as o3d
 
 logger = logging.getLogger(__name__)
 
@@ -33,7 +38,7 @@ _PROBE = "import open3d as o3d; o3d.visualization.rendering.OffscreenRenderer(16
 
 
 @dataclass(frozen=True)
-class Drawing:
+class Renderable:
     """What is drawn, in a frame near the origin, so that float32 suffices.
 
     points: (N, 3) float32; colors: (N, 3) uint8 RGB; point_size: px
@@ -50,18 +55,18 @@ class Drawing:
 
 
 def render(
-    drawing: Drawing, view: View, background: tuple[int, int, int], renderer: str = "auto"
+    renderable: Renderable, view: View, background: tuple[int, int, int], renderer: str = "auto"
 ) -> np.ndarray:
     """Draw through a pinhole view.
 
-    view: without distortion, in the frame of `drawing`; renderer: "auto", "vulkan" or "egl"
+    view: without distortion, in the frame of `renderable`; renderer: "auto", "vulkan" or "egl"
     returns: (H, W, 3) uint8 RGB, colors exactly as given: no light, no antialiasing
     Raises Sc3dError that names the packages to install.
     """
     if renderer == "auto":
         renderer = "vulkan" if vulkan_works() else "egl"
     with _quiet():
-        return (_render_vulkan if renderer == "vulkan" else _render_egl)(drawing, view, background)
+        return (_render_vulkan if renderer == "vulkan" else _render_egl)(renderable, view, background)
 
 
 @functools.cache
@@ -78,7 +83,7 @@ def vulkan_works() -> bool:
     return probe.returncode == 0
 
 
-def _render_vulkan(drawing: Drawing, view: View, background: tuple[int, int, int]) -> np.ndarray:
+def _render_vulkan(renderable: Renderable, view: View, background: tuple[int, int, int]) -> np.ndarray:
     import open3d as o3d
 
     rendering = o3d.visualization.rendering
@@ -91,52 +96,53 @@ def _render_vulkan(drawing: Drawing, view: View, background: tuple[int, int, int
     scene.view.set_post_processing(False)  # tone mapping would change class colors
     scene.view.set_antialiasing(False)
     scene.view.set_sample_count(1)
-    for name, geometry in _tensor_geometries(drawing).items():
+    for name, geometry in _tensor_geometries(renderable).items():
         material = rendering.MaterialRecord()
         material.shader = "unlitLine" if name == "lines" else "defaultUnlit"
-        material.point_size = drawing.point_size
+        material.point_size = renderable.point_size
         material.line_width = 3.0
         scene.add_geometry(name, geometry, material)
     renderer.setup_camera(view.matrix, view.cam_from_world, view.width, view.height)
     return np.array(renderer.render_to_image())
 
 
-def _tensor_geometries(drawing: Drawing) -> dict:
+def _tensor_geometries(renderable: Renderable) -> dict:
     import open3d as o3d
 
     tensor = o3d.core.Tensor.from_numpy
-    colors = tensor(np.ascontiguousarray(drawing.colors, dtype=np.float32) / np.float32(255))
-    points = tensor(np.ascontiguousarray(drawing.points, dtype=np.float32))
+    colors = tensor(np.ascontiguousarray(renderable.colors, dtype=np.float32) / np.float32(255))
+    points = tensor(np.ascontiguousarray(renderable.points, dtype=np.float32))
     geometries = {}
-    if drawing.triangles is not None and len(drawing.triangles):
+    if renderable.triangles is not None and len(renderable.triangles):
         mesh = o3d.t.geometry.TriangleMesh(
-            points, tensor(np.ascontiguousarray(drawing.triangles, dtype=np.int32))
+            points, tensor(np.ascontiguousarray(renderable.triangles, dtype=np.int32))
         )
         mesh.vertex.colors = colors
         # unused, but asked for
-        mesh.vertex.normals = tensor(np.tile(np.float32([0, 0, 1]), (len(drawing.points), 1)))
+        mesh.vertex.normals = tensor(np.tile(np.float32([0, 0, 1]), (len(renderable.points), 1)))
         geometries["mesh"] = mesh
-    elif drawing.triangles is None and len(drawing.points):
+    elif renderable.triangles is None and len(renderable.points):
         cloud = o3d.t.geometry.PointCloud(points)
         cloud.point.colors = colors
         geometries["cloud"] = cloud
-    if drawing.lines is not None and len(drawing.lines):
-        geometries["lines"] = _line_set(drawing)
+    if renderable.lines is not None and len(renderable.lines):
+        geometries["lines"] = line_set(renderable.lines, renderable.line_color)
     return geometries
 
 
-def _line_set(drawing: Drawing) -> object:
+def line_set(lines: np.ndarray, color: tuple[int, int, int]) -> o3d.geometry.LineSet:
+    """lines: (L, 2, 3) ends; color: RGB uint8."""
     import open3d as o3d
 
-    ends = np.asarray(drawing.lines, np.float64).reshape(-1, 3)
-    lines = o3d.geometry.LineSet(
+    ends = np.asarray(lines, np.float64).reshape(-1, 3)
+    found = o3d.geometry.LineSet(
         o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(np.arange(len(ends)).reshape(-1, 2))
     )
-    lines.paint_uniform_color(np.array(drawing.line_color) / 255.0)
-    return lines
+    found.paint_uniform_color(np.array(color) / 255.0)
+    return found
 
 
-def _render_egl(drawing: Drawing, view: View, background: tuple[int, int, int]) -> np.ndarray:
+def _render_egl(renderable: Renderable, view: View, background: tuple[int, int, int]) -> np.ndarray:
     import open3d as o3d
 
     canvas, rows, columns = _centered_canvas(view)
@@ -145,18 +151,18 @@ def _render_egl(drawing: Drawing, view: View, background: tuple[int, int, int]) 
         raise Sc3dError(_NO_RENDERER)
     try:
         options = visualizer.get_render_option()
-        options.point_size = drawing.point_size
+        options.point_size = renderable.point_size
         options.background_color = np.array(background) / 255.0
         options.light_on = False
         options.mesh_show_back_face = True
-        for geometry in _legacy_geometries(drawing):
+        for geometry in _legacy_geometries(renderable):
             visualizer.add_geometry(geometry)
         control = visualizer.get_view_control()
         camera = o3d.camera.PinholeCameraParameters()
         camera.intrinsic = o3d.camera.PinholeCameraIntrinsic(canvas.width, canvas.height, canvas.matrix)
         camera.extrinsic = canvas.cam_from_world
         control.convert_from_pinhole_camera_parameters(camera, allow_arbitrary=True)
-        near, far = _depth_range(drawing, view)
+        near, far = _depth_range(renderable, view)
         control.set_constant_z_near(near)
         control.set_constant_z_far(far)
         visualizer.poll_events()
@@ -182,8 +188,12 @@ def _centered_canvas(view: View) -> tuple[View, np.ndarray, np.ndarray]:
     return canvas, np.clip(rows, 0, size[1] - 1), np.clip(columns, 0, size[0] - 1)
 
 
-def _depth_range(drawing: Drawing, view: View) -> tuple[float, float]:
-    ends = [drawing.points] if drawing.lines is None else [drawing.points, np.reshape(drawing.lines, (-1, 3))]
+def _depth_range(renderable: Renderable, view: View) -> tuple[float, float]:
+    ends = (
+        [renderable.points]
+        if renderable.lines is None
+        else [renderable.points, np.reshape(renderable.lines, (-1, 3))]
+    )
     depth = np.concatenate(ends) @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
     depth = depth[depth > 0]
     if not len(depth):
@@ -192,22 +202,26 @@ def _depth_range(drawing: Drawing, view: View) -> tuple[float, float]:
     return max(float(depth.min()) * 0.99, far * 1e-4), far
 
 
-def _legacy_geometries(drawing: Drawing) -> list:
+def _legacy_geometries(renderable: Renderable) -> list:
     import open3d as o3d
 
     points, colors = (
-        o3d.utility.Vector3dVector(drawing.points.astype(np.float64)),
-        o3d.utility.Vector3dVector(drawing.colors / 255.0),
+        o3d.utility.Vector3dVector(renderable.points.astype(np.float64)),
+        o3d.utility.Vector3dVector(renderable.colors / 255.0),
     )
-    if drawing.triangles is not None:
+    if renderable.triangles is not None:
         geometry = o3d.geometry.TriangleMesh(
-            points, o3d.utility.Vector3iVector(drawing.triangles.astype(np.int32))
+            points, o3d.utility.Vector3iVector(renderable.triangles.astype(np.int32))
         )
         geometry.vertex_colors = colors
     else:
         geometry = o3d.geometry.PointCloud(points)
         geometry.colors = colors
-    return [geometry] + ([_line_set(drawing)] if drawing.lines is not None and len(drawing.lines) else [])
+    return [geometry] + (
+        [line_set(renderable.lines, renderable.line_color)]
+        if renderable.lines is not None and len(renderable.lines)
+        else []
+    )
 
 
 @contextmanager
@@ -227,3 +241,28 @@ def _quiet() -> Iterator[None]:
                 os.close(descriptor)
             chatter.seek(0)
             logger.debug("renderer: %s", chatter.read().decode(errors="replace").strip())
+
+
+def check_display() -> None:
+    """Raise Sc3dError that says what to do where no window can be opened."""
+    if not has_display():
+        raise Sc3dError(
+            "no display to open a window on: `sc3d view SCENE --screenshot FILE` renders a picture without one, --web shows it in a browser"
+        )
+
+
+def has_display() -> bool:
+    """Whether a window can be opened; on Linux an X server (or XWayland) must answer."""
+    if not sys.platform.startswith("linux"):
+        return True
+    if not os.environ.get("DISPLAY"):
+        return False
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError:
+        return False
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    display = x11.XOpenDisplay(None)
+    if display:
+        x11.XCloseDisplay(ctypes.c_void_p(display))
+    return bool(display)

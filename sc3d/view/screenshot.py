@@ -10,16 +10,19 @@ import cv2
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import View, local_origin, undistorted
+from sc3d.geometry.cameras import View, local_origin, resample, undistorted
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.scene.class_table import ClassTable
 from sc3d.view.captions import add_legend
 from sc3d.view.colors import Coloring, as_uint8, color_points
-from sc3d.view.renderers import Drawing, render
-from sc3d.view.viewpoints import aerial_view, frusta, frustum_depth, without_outliers
+from sc3d.view.contact_sheet import half_of, side_by_side
+from sc3d.view.renderers import Renderable, render
+from sc3d.view.viewpoints import fitted, frusta, frustum_depth, overview, without_outliers
 
 if TYPE_CHECKING:
     import open3d as o3d
+
+    from sc3d.view.display_splats import DisplaySplats
 
 LINE_COLOR = (240, 150, 20)
 _LARGEST_CANVAS = 8192  # px; what software renderers take
@@ -101,6 +104,44 @@ def screenshot(
     )
 
 
+def screenshot_splats(
+    splats: DisplaySplats,
+    view: View | None = None,
+    photo: np.ndarray | None = None,
+    size: tuple[int, int] = (1600, 1000),
+    style: Style = Style(),
+) -> np.ndarray:
+    """A picture of Gaussians, with a legend where they are colored by their labels.
+
+    view, photo: camera (world) and picture (H, W, 3) uint8 RGB that they are drawn beside; None = an overview
+    style: what it says of coloring, direction and background
+    returns: (H, W, 3) uint8 RGB
+    """
+    from sc3d.splatting.evaluation import compare, picture
+
+    labelled = splats.label is not None and style.by != "photo"
+    gaussians = splats.painted(style.by) if labelled else splats.gaussians
+    if view is None:
+        seen = gaussians.means[gaussians.opacities > 0.5].numpy()
+        points = without_outliers(seen if len(seen) else gaussians.means.numpy())
+        image = picture(gaussians, overview(points, size, style.from_above), style.background)
+    else:
+        source = view.shifted(splats.origin)
+        target = fitted(source, half_of(size))
+        pixels = resample(photo, source, target)
+        if labelled:
+            drawn, caption = picture(gaussians, target, style.background), f"splats by {style.by}"
+        else:
+            found = compare(gaussians, target, pixels)
+            pixels, drawn, caption = found.photo, found.rendered, f"splats, PSNR {found.psnr:.2f} dB"
+        image = side_by_side((pixels, drawn), (view.name, caption))
+    return (
+        add_legend(image, style.by, splats.table, set(np.unique(splats.label).tolist()))
+        if labelled
+        else image
+    )
+
+
 def draw_points(points: np.ndarray, view: View | None, size: tuple[int, int], style: Style) -> PointImage:
     """Draw (N, 3) world points; arguments as for `screenshot`."""
     points = np.asarray(points, np.float64)
@@ -113,14 +154,14 @@ def draw_points(points: np.ndarray, view: View | None, size: tuple[int, int], st
     # every point is drawn in a color of its own: its number, 24 bits; the last stands for lines
     codes = np.arange(len(chosen) + 1)
     colors = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=1).astype(np.uint8)
-    drawing = Drawing(
+    renderable = Renderable(
         (points[chosen] - origin).astype(np.float32),
         colors[:-1],
         _point_size(points[chosen], canvas),
         lines=(lines - origin).astype(np.float32),
         line_color=tuple(colors[-1].tolist()),
     )
-    image = render(drawing, canvas.shifted(origin), (255, 255, 255), style.renderer).astype(np.int32)
+    image = render(renderable, canvas.shifted(origin), (255, 255, 255), style.renderer).astype(np.int32)
     codes = image[..., 0] << 16 | image[..., 1] << 8 | image[..., 2]
     depth = points[chosen] @ canvas.cam_from_world[2, :3] + canvas.cam_from_world[2, 3]
     code = np.minimum(codes, len(chosen) + 1)
@@ -146,10 +187,10 @@ def _mesh_picture(
     canvas, lines, factor = _canvas(points, view, size, style)
     origin = local_origin([canvas])
     triangles, lines = mesh.triangle.indices.cpu().numpy(), (lines - origin).astype(np.float32)
-    drawing = Drawing(
+    renderable = Renderable(
         (points - origin).astype(np.float32), colors, triangles=triangles, lines=lines, line_color=LINE_COLOR
     )
-    return _shrunk(render(drawing, canvas.shifted(origin), style.background, style.renderer), factor)
+    return _shrunk(render(renderable, canvas.shifted(origin), style.background, style.renderer), factor)
 
 
 def _canvas(
@@ -164,7 +205,7 @@ def _canvas(
         else np.empty((0, 2, 3))
     )
     if view is None:
-        view = aerial_view(
+        view = overview(
             np.concatenate([without_outliers(points), lines.reshape(-1, 3)]), size, style.from_above
         )
     else:

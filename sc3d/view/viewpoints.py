@@ -9,7 +9,7 @@ import numpy as np
 from sc3d.geometry.cameras import View, look_at, pinhole_view, rays, undistorted
 
 
-def aerial_view(points: np.ndarray, size: tuple[int, int], from_above: bool = False) -> View:
+def overview(points: np.ndarray, size: tuple[int, int], from_above: bool = False) -> View:
     """A view from the air that holds all points.
 
     points: (N, 3) world, up = +z

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sc3d.cli import main
-from sc3d.exporters.splats import distance_to_class, read_splats
+from sc3d.exporters.splats import distance_to_class
 from sc3d.geometry.cameras import local_origin
 from sc3d.io.images import read_image
 from sc3d.io.splats import origin_comment, read_splat_ply, write_splat_ply
@@ -18,6 +18,7 @@ from sc3d.runner import sidecar
 from sc3d.scene.scene import Scene
 from sc3d.splatting.dataset import load_gaussians
 from sc3d.splatting.gaussians import Gaussians
+from sc3d.view.display_splats import read_splats
 from tests.builders import ORIGIN, views, write_bare_scene
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -10,11 +10,11 @@ import pytest
 from sc3d.geometry.cameras import look_at, pinhole_view, rays
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import Surface, first_surface, nearest_points, see_points
-from sc3d.geometry.voxel_lookup import voxel_lookup
 from sc3d.geometry.voxel_patches import Patches
 from sc3d.geometry.voxel_traversal import VoxelSurface
 from sc3d.geometry.voxels import voxel_keys
-from sc3d.labelling.fusion import Cloud, fuse
+from sc3d.labelling.cloud import Cloud
+from sc3d.labelling.fusion import fuse
 from sc3d.scene.labelled_cloud import SURFACE_VOXEL, read_surface, spacing_of
 from sc3d.scene.labels import UNSEEN
 from sc3d.settings.labels import Label
@@ -42,7 +42,7 @@ def occupancy(rng: np.random.Generator, extent: int, share: float) -> np.ndarray
 
 def patches_of(voxels: np.ndarray, shapes: np.ndarray, voxel_size: float) -> Patches:
     keys = voxel_keys(voxels + 0.5, np.zeros(3), 1.0)
-    return Patches(keys, voxel_lookup(keys), shapes.astype(np.float32), np.zeros(3), voxel_size)
+    return Patches.from_shapes(keys, shapes.astype(np.float32), voxel_size, np.zeros(3))
 
 
 def rays_from(rng: np.random.Generator, extent: int) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -12,8 +12,13 @@ def points():
     return np.random.default_rng(0).uniform(-3, 3, (5000, 3)) + [5e5, 5e6, 100]
 
 
+def grid_over(points: np.ndarray, voxel_size: float, num_channels: int) -> LabelGrid:
+    """An empty field over (N, 3) points."""
+    return LabelGrid.from_voxels(sort_by_voxel(points, voxel_size), num_channels)
+
+
 def test_find_groups_points_exactly_by_voxel(points):
-    field = LabelGrid.around(points, 0.2, 4)
+    field = grid_over(points, 0.2, 4)
     cells = field.find(points)
     keys = np.floor((points - field.origin) / 0.2).astype(int)
     by_key, by_cell = {}, {}
@@ -25,34 +30,34 @@ def test_find_groups_points_exactly_by_voxel(points):
 
 
 def test_cells_are_the_voxels_that_open3d_calls_by_the_same_index(points):
-    field = LabelGrid.around(points, 0.2, 4)
+    field = grid_over(points, 0.2, 4)
     coordinates, indices = field.grid.voxel_coordinates_and_flattened_indices()
     centers = field.origin + coordinates.numpy().astype(np.float64) + 0.1
     np.testing.assert_array_equal(field.find(centers), indices.numpy() * SIDES)
 
 
 def test_merge_adds_and_save_round_trips(points, tmp_path):
-    one, other = LabelGrid.around(points, 0.2, 4), LabelGrid.around(points, 0.2, 4)
+    one, other = grid_over(points, 0.2, 4), grid_over(points, 0.2, 4)
     rng = np.random.default_rng(1)
     for field, chosen in ((one, points[:3000]), (other, points[2000:])):
-        np.add.at(field.votes, (field.find(chosen), rng.integers(0, 4, len(chosen))), 1)
+        field.add(field.find(chosen), np.eye(4, dtype=np.int32)[rng.integers(0, 4, len(chosen))])
     expected = one.votes[one.find(points)] + other.votes[other.find(points)]
     one.merge(other)
     np.testing.assert_array_equal(one.votes[one.find(points)], expected)
     assert one.votes.sum() == 3000 + 3000
     one.save(tmp_path / "votes.npz")
     loaded = o3d.t.geometry.VoxelBlockGrid.load(str(tmp_path / "votes.npz"))
-    again = LabelGrid(loaded, 0.2, one.origin, 4)
+    again = LabelGrid(loaded, 0.2, one.origin)
     np.testing.assert_array_equal(again.votes[again.find(points)], expected)
     with pytest.raises(ValueError):
-        one.merge(LabelGrid.around(points, 0.3, 4))
+        one.merge(grid_over(points, 0.3, 4))
 
 
 def test_merge_brings_blocks_that_were_not_there():
     near, far = np.zeros((1, 3)), np.full((1, 3), 50.0)
-    both = LabelGrid.around(np.concatenate([near, far]), 0.5, 2)
-    one = LabelGrid(LabelGrid.around(near, 0.5, 2).grid, 0.5, both.origin, 2)
-    other = LabelGrid.around(np.concatenate([near, far]), 0.5, 2)
+    both = grid_over(np.concatenate([near, far]), 0.5, 2)
+    one = LabelGrid(grid_over(near, 0.5, 2).grid, 0.5, both.origin)
+    other = grid_over(np.concatenate([near, far]), 0.5, 2)
     other.votes[other.find(far), 1] = 7
     assert one.find(far)[0] == -1
     one.merge(other)

@@ -21,7 +21,7 @@ from sc3d.geometry.cameras import View, look_at, project
 from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.georeferencing.georeference import Georeference, from_origin, read_georeference, write_georeference
 from sc3d.importers.model import guess_observations
-from sc3d.importers.opensfm import _lens as opensfm_lens
+from sc3d.importers.opensfm import _distortion_model as opensfm_model
 from sc3d.importers.project import read_project
 from sc3d.scene.scene import Scene, read_sparse_model
 from sc3d.settings.reconstruction import Import
@@ -470,7 +470,7 @@ class TestFilesOfTheToolsThemselves:
         (0, 0).
         """
         case = json.loads((FILES / "opensfm_projections.json").read_text())["cameras"][number]
-        camera = to_camera(opensfm_lens(case["camera"], "test"), 0.01, "test")
+        camera = to_camera(opensfm_model(case["camera"], "test"), 0.01, "test")
         np.testing.assert_allclose(
             camera.img_from_cam(np.array(case["points"])), np.array(case["pixels"]) + 0.5, atol=1e-3
         )

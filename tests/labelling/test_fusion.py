@@ -7,19 +7,20 @@ import pytest
 
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.geometry.raycast import Surface
-from sc3d.labelling.fusion import Cloud, edge_distance, fuse, observe
+from sc3d.labelling.cloud import Cloud
+from sc3d.labelling.fusion import fuse
+from sc3d.labelling.observation import edge_distance, observe
 from sc3d.scene.labels import LOCKED, SEED, UNLOCKED, UNSEEN
-from sc3d.settings.labels import Label
+from sc3d.settings.labels import Label, PaperMechanisms
 
 PLAIN = Label(
     voxel_size=0.2,
     edge_width=0,
-    depth_excess=False,
-    incidence=False,
-    range=False,
     use_confidence=False,
     verify="no",
+    mechanisms=PaperMechanisms(depth_excess=False, incidence=False, range=False),
 )
+SECOND_VOTE = replace(PLAIN.mechanisms, reproject=True)
 
 
 def plane(height: float = 0.0, half: float = 3.0, step: float = 0.1) -> np.ndarray:
@@ -74,7 +75,7 @@ def test_agreement_is_a_seed_everywhere():
 def test_consensus_threshold_decides_between_seed_and_lock(votes, consensus, state):
     cloud, views = cloud_of(plane()), cameras_above(len(votes))
     read = constant({view.name: vote for view, vote in zip(views, votes, strict=True)})
-    labels = fuse(cloud, views, read, None, 5, replace(PLAIN, consensus=consensus, reproject=False)).labels
+    labels = fuse(cloud, views, read, None, 5, replace(PLAIN, consensus=consensus)).labels
     assert (labels.state == state).all()
     assert (labels.label == (0 if state == LOCKED else votes[0])).all()
 
@@ -82,10 +83,7 @@ def test_consensus_threshold_decides_between_seed_and_lock(votes, consensus, sta
 def test_paper_locks_on_any_disagreement():
     cloud, views = cloud_of(plane()), cameras_above(10)
     read = constant({view.name: 2 if row == 9 else 1 for row, view in enumerate(views)})
-    assert (
-        fuse(cloud, views, read, None, 5, replace(PLAIN, method="paper", reproject=False)).labels.state
-        == LOCKED
-    ).all()
+    assert (fuse(cloud, views, read, None, 5, replace(PLAIN, method="paper")).labels.state == LOCKED).all()
 
 
 def test_label_zero_never_votes():
@@ -170,9 +168,7 @@ def test_votes_do_not_depend_on_the_order_of_views_or_points():
         5,
         settings,
     )
-    np.testing.assert_array_equal(
-        first.field.votes[first.cells][point_order], second.field.votes[second.cells]
-    )
+    np.testing.assert_array_equal(first.grid.votes[first.rows][point_order], second.grid.votes[second.rows])
     for name in ("label", "confidence", "state", "num_views"):
         np.testing.assert_array_equal(getattr(first.labels, name)[point_order], getattr(second.labels, name))
 
@@ -193,10 +189,10 @@ def test_reprojection_unlocks_what_only_mask_edges_disputed():
         for row in range(12)
     ]
     rng = np.random.default_rng(0)
-    locked = fuse(cloud, straight, read, None, 5, replace(PLAIN, consensus=0.95, reproject=False)).labels
+    locked = fuse(cloud, straight, read, None, 5, replace(PLAIN, consensus=0.95)).labels
     rng = np.random.default_rng(0)
     again = fuse(
-        cloud, straight, read, None, 5, replace(PLAIN, consensus=0.95, edge_width=0.9, reproject=True)
+        cloud, straight, read, None, 5, replace(PLAIN, consensus=0.95, edge_width=0.9, mechanisms=SECOND_VOTE)
     ).labels
     assert (locked.state == LOCKED).sum() > 0
     assert (again.state == UNLOCKED).sum() > 0
@@ -209,11 +205,11 @@ def test_pixel_weights_follow_the_distance_to_mask_edges():
     ranges = np.full((40, 60), 50.0, np.float32)
     confidence = np.full((40, 60), 204, np.uint8)
     edge = edge_distance(mask)
-    picture = observe(mask, confidence, edge, ranges, Label(edge_width=1.5))
+    picture = observe(mask, confidence, ranges, 1.5)
     assert edge[5, 29] == edge[5, 30] == 0.5 and edge[5, 20] == pytest.approx(9.5, abs=0.2)
     np.testing.assert_allclose(picture.weights, 0.8 * (1 - np.exp(-edge / 1.5)), atol=0.01)
     assert (picture.strict == (edge >= 1.5)).all()
-    assert (observe(mask, None, edge, ranges, Label(edge_width=0)).weights == 1).all()
+    assert (observe(mask, None, ranges, 0).weights == 1).all()
 
 
 def test_a_second_vote_of_a_single_view_unlocks_nothing():
@@ -221,7 +217,12 @@ def test_a_second_vote_of_a_single_view_unlocks_nothing():
     tilted = np.full((120, 120), 1, np.uint8)
     masks = {view.name: (tilted * (2 - (row == 0)), None) for row, view in enumerate(views)}
     labels = fuse(
-        cloud, views, lambda view: masks[view.name], None, 5, replace(PLAIN, consensus=1.0, reproject=True)
+        cloud,
+        views,
+        lambda view: masks[view.name],
+        None,
+        5,
+        replace(PLAIN, consensus=1.0, mechanisms=SECOND_VOTE),
     ).labels
     assert (labels.state == LOCKED).all()
 

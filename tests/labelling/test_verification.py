@@ -2,16 +2,8 @@
 
 import numpy as np
 
-from sc3d.geometry.voxels import BLOCK, VOXELS, sort_by_voxel
-from sc3d.labelling.verification import (
-    MIN_RELIABILITY,
-    PRIOR_SHARE,
-    PRIOR_VIEWS,
-    Places,
-    VoteLog,
-    neighbor_blocks,
-    verify,
-)
+from sc3d.geometry.voxels import BLOCK, LabelGrid, sort_by_voxel
+from sc3d.labelling.verification import MIN_RELIABILITY, PRIOR_SHARE, PRIOR_VIEWS, VoteLog, verify
 
 FULL = 4096
 
@@ -23,8 +15,20 @@ def log_of(*views: tuple) -> VoteLog:
     return log
 
 
-def one_block(count: int) -> Places:
-    return Places(np.zeros(count, np.int64), neighbor_blocks(np.array([12345], np.int64)))
+def cells_in_blocks(*counts: int, at: tuple[int, ...] = (0,)) -> tuple[LabelGrid, np.ndarray]:
+    """A grid with so many cells in each of the blocks at `at` along x, one voxel each, and their rows."""
+    inside = np.stack(np.unravel_index(np.arange(BLOCK**3), (BLOCK,) * 3), axis=1) + 0.5
+    points = np.concatenate([inside[:count] + [BLOCK * x, 0, 0] for count, x in zip(counts, at, strict=True)])
+    grid = LabelGrid.from_voxels(sort_by_voxel(points, 1.0, np.zeros(3)), 4)
+    return grid, grid.find(points)
+
+
+def verified(
+    log: VoteLog, winner: np.ndarray, grid: LabelGrid, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which cells pass, and their votes, which are weighed anew."""
+    passed = verify(log, winner, grid, rows, FULL, reweigh=True)
+    return passed, grid.votes[rows]
 
 
 def test_the_log_gives_back_what_was_written_as_often_as_asked():
@@ -40,9 +44,9 @@ def test_the_log_gives_back_what_was_written_as_often_as_asked():
 def test_votes_are_weighed_by_the_square_of_the_share_that_agrees():
     winner = np.full(100, 1, np.uint8)
     labels = np.where(np.arange(100) < 25, 1, 2)  # agrees at a quarter of the cells
-    votes = np.zeros((100, 3), np.int32)
-    votes[:, 0] = 7
-    passed = verify(log_of((labels, np.full(100, FULL))), winner, one_block(100), FULL, votes)
+    grid, rows = cells_in_blocks(100)
+    grid.votes[rows, 0] = 7
+    passed, votes = verified(log_of((labels, np.full(100, FULL))), winner, grid, rows)
     reliability = (25 + PRIOR_VIEWS * PRIOR_SHARE) / (100 + PRIOR_VIEWS)
     assert reliability > MIN_RELIABILITY
     np.testing.assert_array_equal(votes[np.arange(100), labels], round(FULL * reliability**2))
@@ -59,40 +63,21 @@ def test_a_view_that_errs_all_around_a_place_is_overruled_there_by_one_that_does
     good, bad = np.full(count, 1), np.full(count, 2)
     others = np.where(np.arange(count) < 150, 1, 0)
     winner = np.where(np.arange(count) < 150, 1, 2).astype(np.uint8)  # a tie at first: the wrong one won
-    votes = np.zeros((count, 3), np.int32)
-    weights = np.full(count, FULL)
-    verify(
-        log_of((bad, weights), (good, weights), (others, weights), (others, weights)),
-        winner,
-        one_block(count),
-        FULL,
-        votes,
-    )
+    weights, cells = np.full(count, FULL), cells_in_blocks(count)
+    log = log_of((bad, weights), (good, weights), (others, weights), (others, weights))
+    votes = verified(log, winner, *cells)[1]
     assert (votes[150:, 1] > 5 * votes[150:, 2]).all()
 
 
 def test_reliability_is_a_matter_of_place():
     """A view that errs in one block keeps its say in a block far away, and less of it next door."""
-    points = np.array([[0.5, 0.5, 0.5], [BLOCK + 0.5, 0.5, 0.5], [5 * BLOCK + 0.5, 0.5, 0.5]]).repeat(
-        50, axis=0
-    )
-    sorting = sort_by_voxel(points, 1.0, np.zeros(3))
-    keys = np.unique(sorting.keys // VOXELS)
-    neighbors = neighbor_blocks(keys)
-    assert (
-        (neighbors[:, 13] == [0, 1, 2]).all()
-        and sorted(neighbors[0][neighbors[0] >= 0]) == [0, 1]
-        and (neighbors[2] >= 0).sum() == 1
-    )
+    grid, rows = cells_in_blocks(50, 50, 50, at=(0, 1, 5))
+    slots = grid.slots(np.int32([[0, 0, 0], [1, 0, 0], [5, 0, 0]]))
+    neighbors = grid.neighbors()[slots]
+    np.testing.assert_array_equal(neighbors[:, 13], slots)
+    assert set(neighbors[0]) == {-1, slots[0], slots[1]} and set(neighbors[2]) == {-1, slots[2]}
     labels = np.r_[np.full(50, 2), np.full(100, 1)]
-    votes = np.zeros((150, 3), np.int32)
-    verify(
-        log_of((labels, np.full(150, FULL))),
-        np.full(150, 1, np.uint8),
-        Places(np.arange(3).repeat(50), neighbors),
-        FULL,
-        votes,
-    )
+    votes = verified(log_of((labels, np.full(150, FULL))), np.full(150, 1, np.uint8), grid, rows)[1]
     here, next_door, far = votes[0, 2], votes[50, 1], votes[100, 1]
     assert here < 0.3 * FULL and 0.3 * FULL < next_door < 0.6 * FULL and far > 0.95 * FULL
 
@@ -102,7 +87,16 @@ def test_the_order_of_views_does_not_matter():
     views = [(rng.integers(0, 4, 300), rng.integers(1, FULL, 300)) for _ in range(5)]
     winner, results = rng.integers(0, 4, 300).astype(np.uint8), []
     for order in (views, views[::-1]):
-        votes = np.zeros((300, 4), np.int32)
-        results.append((verify(log_of(*order), winner, one_block(300), FULL, votes), votes))
+        results.append(verified(log_of(*order), winner, *cells_in_blocks(300)))
     np.testing.assert_array_equal(results[0][0], results[1][0])
     np.testing.assert_array_equal(results[0][1], results[1][1])
+
+
+def test_without_reweighing_the_votes_stay_and_the_same_cells_pass():
+    rng = np.random.default_rng(0)
+    views = [(rng.integers(0, 4, 300), rng.integers(1, FULL, 300)) for _ in range(5)]
+    winner, (grid, rows) = rng.integers(0, 4, 300).astype(np.uint8), cells_in_blocks(300)
+    grid.votes[rows] = 5
+    passed = verify(log_of(*views), winner, grid, rows, FULL, reweigh=False)
+    assert (grid.votes[rows] == 5).all()
+    np.testing.assert_array_equal(passed, verified(log_of(*views), winner, grid, rows)[0])

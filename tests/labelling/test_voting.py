@@ -10,13 +10,23 @@ import pytest
 
 from sc3d.geometry.cameras import View, look_at, project
 from sc3d.geometry.raycast import Surface, first_surface, see_points
-from sc3d.geometry.voxels import sort_by_voxel, voxel_origin
+from sc3d.geometry.voxels import sort_by_voxel
+from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.density import FULL, GaussianField, gaussian_density, kernel_density, voxel_shares
-from sc3d.labelling.fusion import Cloud, edge_distance, fuse, observe
-from sc3d.labelling.voting import camera_parameters, open_accumulator
-from sc3d.labelling.voting_kernels import GRAZING, MIN_WEIGHT, SCALE, VoteWeighting, to_camera, to_pixel
+from sc3d.labelling.fusion import fuse
+from sc3d.labelling.observation import observe
+from sc3d.labelling.voting import (
+    GRAZING,
+    MIN_WEIGHT,
+    SCALE,
+    CameraParameters,
+    VoteAccumulator,
+    VoteWeighting,
+    to_camera,
+    to_pixel,
+)
 from sc3d.scene.labels import LOCKED
-from sc3d.settings.labels import Label
+from sc3d.settings.labels import Label, PaperMechanisms
 
 MODELS = {
     "SIMPLE_PINHOLE": [110, 80, 60],
@@ -26,7 +36,7 @@ MODELS = {
     "OPENCV": [110, 112, 80, 60, 0.05, -0.02, 1e-3, -2e-3],
     "OPENCV_FISHEYE": [90, 92, 80, 60, 0.02, -0.01, 0, 0],
 }
-SETTINGS = Label(voxel_size=0.25, incidence=True, verify="no")
+SETTINGS = Label(voxel_size=0.25, verify="no", mechanisms=PaperMechanisms(incidence=True))
 
 
 def world(seed: int = 0) -> tuple[Cloud, Surface]:
@@ -79,17 +89,15 @@ def noise_masks(views: list[View], seed: int = 1) -> dict:
 
 def slow_votes(cloud: Cloud, views: list[View], masks: dict, surface: Surface, settings: Label) -> np.ndarray:
     """(N, 5) votes of each point's cell, from `see_points` and numpy."""
-    ballot, _ = open_accumulator(
-        cloud, voxel_origin(cloud.points.min(axis=0), settings.voxel_size), settings.voxel_size, 5
-    )
-    cells = ballot.to_points(np.arange(len(ballot.votes)))
-    facing = ballot.to_points(ballot.cloud.facing)
-    votes = np.zeros((len(ballot.votes), 5), np.int64)
+    accumulator = VoteAccumulator.for_cloud(cloud, settings.voxel_size, 5)
+    cells = accumulator.to_points(np.arange(len(accumulator.votes)))
+    facing = accumulator.to_points(accumulator.cloud.facing)
+    votes = np.zeros((len(accumulator.votes), 5), np.int64)
     reference = np.median([np.linalg.norm(view.center - np.median(cloud.points, axis=0)) for view in views])
     for view in views:
         mask, confidence = masks[view.name]
         first = first_surface(surface, view)
-        weights = observe(mask, confidence, edge_distance(mask), first.range, settings).weights
+        weights = observe(mask, confidence, first.range, settings.edge_width).weights
         sums, counts = np.zeros((len(votes), 5), np.int64), np.zeros(len(votes), np.int64)
         for turn in (1, -1):  # see_points drops what faces away; scattered voxels take it as well
             seen = see_points(view, cloud.points, turn * cloud.normals, first, settings.voxel_size)
@@ -115,7 +123,7 @@ def test_votes_are_those_of_the_slow_twin(model):
     masks = noise_masks(views)
     fused = fuse(cloud, views, lambda view: masks[view.name], surface, 5, SETTINGS)
     expected = slow_votes(cloud, views, masks, surface, SETTINGS)
-    found = fused.field.votes[fused.cells]
+    found = fused.grid.votes[fused.rows]
     assert (found[:, 0] > 0).mean() > 0.8
     np.testing.assert_array_equal(found[:, 0], expected[:, 0])
     assert np.abs(found - expected).max() <= len(views)  # float32 against float64: one unit of 4096 per view
@@ -131,7 +139,7 @@ def test_kernel_projects_like_pycolmap(model):
     )
     view = View("a", camera, look_at(np.array([4.0, -3, 6]), np.zeros(3)))
     points = np.random.default_rng(0).normal(0, 3, (2000, 3))
-    camera = camera_parameters(view, points)
+    camera = CameraParameters.from_view(view, points)
     assert not camera.pixels.size
     expected, _ = project(view, points)
     known = np.isfinite(expected[:, 0])
@@ -181,7 +189,7 @@ def test_one_or_two_threads_views_and_points_in_any_order_give_the_same_bits():
     (cloud, surface), views = world(), views_of("RADIAL")
     masks, settings, rng = (
         noise_masks(views),
-        replace(Label(), voxel_size=0.25, reproject=True),
+        Label(voxel_size=0.25, mechanisms=PaperMechanisms(reproject=True)),
         np.random.default_rng(5),
     )
     expected = fuse(cloud, views, lambda view: masks[view.name], surface, 5, settings)
@@ -201,15 +209,15 @@ def test_one_or_two_threads_views_and_points_in_any_order_give_the_same_bits():
         numba.set_num_threads(before)
     for name in ("label", "confidence", "state", "num_views"):
         np.testing.assert_array_equal(getattr(found.labels, name), getattr(expected.labels, name)[order])
-    np.testing.assert_array_equal(found.field.votes[found.cells], expected.field.votes[expected.cells][order])
+    np.testing.assert_array_equal(found.grid.votes[found.rows], expected.grid.votes[expected.rows][order])
 
 
 @pytest.mark.parametrize(
     "switch",
     [
-        {"incidence": False},
-        {"range": False},
-        {"depth_excess": False},
+        {"mechanisms": PaperMechanisms()},
+        {"mechanisms": PaperMechanisms(incidence=True, range=False)},
+        {"mechanisms": PaperMechanisms(incidence=True, depth_excess=False)},
         {"use_confidence": False},
         {"edge_width": 0.0},
     ],
@@ -221,30 +229,30 @@ def test_every_weight_is_a_switch(switch):
     on, off = (
         fuse(cloud, views, read, surface, 5, settings) for settings in (SETTINGS, replace(SETTINGS, **switch))
     )
-    assert (on.field.votes[:, 0] == off.field.votes[:, 0]).all()  # the same sightings
-    assert on.field.votes[:, 1:].sum() < off.field.votes[:, 1:].sum()  # each factor only takes weight away
+    assert (on.grid.votes[:, 0] == off.grid.votes[:, 0]).all()  # the same sightings
+    assert on.grid.votes[:, 1:].sum() < off.grid.votes[:, 1:].sum()  # each factor only takes weight away
 
 
 def test_grazing_sightings_take_no_part_in_the_second_vote():
     (cloud, surface), views = world(), views_of("PINHOLE", 1)
-    ballot, _ = open_accumulator(cloud, voxel_origin(cloud.points.min(axis=0), 0.25), 0.25, 5)
+    accumulator = VoteAccumulator.for_cloud(cloud, 0.25, 5, second=True)
     mask = np.ones((120, 160), np.uint8)
     first = first_surface(surface, views[0])
-    ballot.cast(
+    accumulator.add_view(
         views[0],
-        observe(mask, None, edge_distance(mask), first.range, Label()),
+        observe(mask, None, first.range, Label().edge_width),
         VoteWeighting(0.25, 9.0, True, True, True, False, True),
     )
     cosine = np.abs(np.einsum("ij,ij->i", cloud.normals, views[0].center - cloud.points)) / np.linalg.norm(
         views[0].center - cloud.points, axis=1
     )
-    steepest = np.zeros(len(ballot.votes))
-    np.maximum.at(steepest, ballot.to_points(np.arange(len(ballot.votes))), cosine)
-    strict = ballot.strict[:, 0] > 0
+    steepest = np.zeros(len(accumulator.votes))
+    np.maximum.at(steepest, accumulator.to_points(np.arange(len(accumulator.votes))), cosine)
+    strict = accumulator.strict[:, 0] > 0
     assert (
         strict.any()
         and (steepest[strict] >= GRAZING).all()
-        and (ballot.votes[:, 0] > ballot.strict[:, 0]).any()
+        and (accumulator.votes[:, 0] > accumulator.strict[:, 0]).any()
     )
 
 
@@ -290,7 +298,7 @@ def test_density_decides_between_the_points_of_a_voxel():
     mask[:, 80:] = 2
     settings = Label(method="majority", voxel_size=2.0)
     votes = fuse(cloud, [view], lambda _: (mask, None), None, 3, settings)
-    shares = votes.field.votes[votes.cells[0], 1:] / SCALE
+    shares = votes.grid.votes[votes.rows[0], 1:] / SCALE
     np.testing.assert_allclose(sorted(shares), [0.2, 0.8], atol=2e-3)
 
 
@@ -303,7 +311,14 @@ def test_the_paper_preset_locks_whatever_the_other_options_say():
         views,
         masks,
         surface,
-        Label(method="paper", voxel_size=0.25, consensus=0.5, incidence=False, verify="no", edge_width=0),
+        Label(
+            method="paper",
+            voxel_size=0.25,
+            consensus=0.5,
+            verify="no",
+            edge_width=0,
+            mechanisms=PaperMechanisms(range=False),
+        ),
     )
     np.testing.assert_array_equal(one.state, other.state)
     assert (one.state == LOCKED).mean() > (

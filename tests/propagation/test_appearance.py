@@ -3,15 +3,26 @@
 import numpy as np
 import pytest
 
-from sc3d.geometry.graph import build_graph
-from sc3d.propagation import propagate
+from sc3d.geometry.graph import Graph, build_graph
+from sc3d.propagation import propagate as propagation
 from sc3d.propagation.appearance import AppearanceModel
-from sc3d.propagation.propagate import LabelledPoints
+from sc3d.propagation.labelled_points import LabelledPoints
 from sc3d.propagation.terrain import relief_features
 from sc3d.scene.labels import SEED, UNSEEN, Labels
 from sc3d.settings.labels import Propagate
 
 LAWN, ROOF, ROAD = 1, 2, 3
+
+
+def propagate(graph: Graph, points: LabelledPoints, settings: Propagate) -> Labels:
+    return propagation.propagate(points, None, settings, graph)
+
+
+def fitted(
+    model: AppearanceModel, label: np.ndarray, examples: np.ndarray, num_classes: int
+) -> np.ndarray | None:
+    """What the model says of a cloud by the cloud's own examples."""
+    return model.log_likelihood(model.statistics(label, examples, num_classes), label)
 
 
 def village(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -119,7 +130,7 @@ def test_product_of_raters_by_hand_on_two_independent_features():
     colors = np.zeros((len(label), 3), np.uint8)
     colors[:, 0] = 255 * second
     appearance = AppearanceModel.from_features(relief, colors)
-    rating = appearance.fit(label, np.ones(len(label), bool), 2)
+    rating = fitted(appearance, label, np.ones(len(label), bool), 2)
     odds = (0.7 * np.where(first, 0.2, 0.8) * np.where(second, 0.3, 0.7)) / (
         0.3 * np.where(first, 0.6, 0.4) * np.where(second, 0.9, 0.1)
     )
@@ -131,10 +142,10 @@ def test_a_class_with_few_examples_is_left_to_the_votes():
     rng = np.random.default_rng(0)
     label = np.repeat([1, 2, 3], [2000, 2000, 40]).astype(np.uint8)
     relief = rng.normal(size=(len(label), 4)).astype(np.float32) + label[:, None]
-    rating = AppearanceModel.from_features(relief, None).fit(label, np.ones(len(label), bool), 3)
+    rating = fitted(AppearanceModel.from_features(relief, None), label, np.ones(len(label), bool), 3)
     assert np.ptp(rating[:4000, 2]) == 0 and np.exp(rating[0, 2]) == pytest.approx(0.05)
     assert (rating[4000:] == 0).all()
-    assert AppearanceModel.from_features(relief, None).fit(label, label == 1, 3) is None
+    assert fitted(AppearanceModel.from_features(relief, None), label, label == 1, 3) is None
 
 
 @pytest.mark.parametrize("method", ["map", "geometry", "knn"])

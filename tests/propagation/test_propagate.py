@@ -10,12 +10,16 @@ import scipy.sparse
 
 from sc3d.geometry.graph import Graph, build_graph, similarity
 from sc3d.geometry.neighbors import NeighborIndex, curvature
-from sc3d.propagation import propagate
+from sc3d.propagation import propagate as propagation
+from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
 from sc3d.propagation.potts import free_energy, mean_field, mean_field_sequential, potts_energy, softmax
-from sc3d.propagation.propagate import LabelledPoints, tie_breakers
 from sc3d.propagation.region_growing import grow_regions, vote_nearest
 from sc3d.scene.labels import LOCKED, PROPAGATED, SEED, UNSEEN, Labels
 from sc3d.settings.labels import Propagate
+
+
+def propagate(graph: Graph, points: LabelledPoints, settings: Propagate) -> Labels:
+    return propagation.propagate(points, None, settings, graph)
 
 
 def plane(height: float = 0.0, count: int = 40, offset: float = 0.0) -> np.ndarray:

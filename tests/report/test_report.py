@@ -21,13 +21,17 @@ from sc3d.io.clouds import write_geometry
 from sc3d.io.images import write_image
 from sc3d.io.json_files import write_json
 from sc3d.report import write_report
-from sc3d.report.certainty import certainty_section
 from sc3d.report.charts import flight_map, histogram, paired_bars, reliability_curve
-from sc3d.report.data import ReportData, load_report_data
+from sc3d.report.data import ReportData, class_areas, load_report_data
 from sc3d.report.images import comparison, ground_picture
-from sc3d.report.objects import class_areas, found_section
-from sc3d.report.processing import processing_section
-from sc3d.report.sections import headline, quality_section, summary_line
+from sc3d.report.sections import (
+    certainty_section,
+    found_section,
+    headline,
+    processing_section,
+    quality_section,
+    summary_line,
+)
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.scene.scene import Scene
 

@@ -1,4 +1,4 @@
-"""By hand: `python tests/kill_run.py FOLDER --kills 50` kills `sc3d run` on a tiny synthetic site at random
+"""By hand: `python tests/robustness/kill_run.py FOLDER --kills 50` kills `sc3d run` on a tiny synthetic site at random
 moments and runs it again.
 
 Each time the second run must complete, leave no hidden files, and write the bytes of an uninterrupted run. A

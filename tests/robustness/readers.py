@@ -204,7 +204,7 @@ def _read_sidecars(folder: Path) -> object:
 
 
 def _read_weights(folder: Path) -> object:
-    from sc3d.segmentation.weights import find_weights, model_type
+    from sc3d.segmentation.models import find_weights, model_type
 
     return model_type(find_weights("owner/model", folder, download=False))
 
@@ -310,7 +310,7 @@ def _copy_mask_file(name: str):
         _write(
             folder,
             mapping__json=json.dumps(
-                {name: "road" for name in ("vehicle", "sky", "person", "roof", "lawn", "thing", "crown")}
+                dict.fromkeys(("vehicle", "sky", "person", "roof", "lawn", "thing", "crown"), "road")
             ),
         )
 
@@ -343,7 +343,7 @@ def _read_project(folder: Path) -> object:
 
 def _build_project(kind: str):
     def build(folder: Path) -> None:
-        import test_imports as made
+        from tests.importers import test_importers as made
 
         views, points = made.fly(), made.probe(20)
         folder.mkdir(parents=True, exist_ok=True)
@@ -386,7 +386,7 @@ def _read_geometries(folder: Path) -> object:
 
 def _build_las(suffix: str):
     def build(folder: Path) -> None:
-        import test_imports as made
+        from tests.importers import test_importers as made
 
         folder.mkdir(parents=True, exist_ok=True)
         made.write_las(folder / f"cloud.{suffix}", made.surveyed(60))

@@ -23,7 +23,7 @@ from sc3d.io.images import find_photos, image_size, read_image, read_index_image
 from sc3d.io.json_files import read_json
 from sc3d.scene.class_table import read_classes
 from sc3d.scene.scene import match_masks, read_sparse_model
-from sc3d.settings.outputs import View
+from sc3d.settings.outputs import ViewCommand
 from tests.builders import views, write_bare_scene, write_model
 from tests.robustness.hostile_files import patch, picture, refused, tracked_model
 
@@ -365,4 +365,9 @@ def test_servers_listen_on_loopback_unless_told_otherwise():
     from sc3d.annotate.server import ADDRESS
     from sc3d.view.web.page import LOCAL
 
-    assert ADDRESS == LOCAL == {field.name: field.default for field in fields(View)}["host"] == "127.0.0.1"
+    assert (
+        ADDRESS
+        == LOCAL
+        == {field.name: field.default for field in fields(ViewCommand)}["host"]
+        == "127.0.0.1"
+    )

@@ -158,12 +158,10 @@ def test_fifty_kills_of_a_whole_run(tmp_path):
 
 
 def test_ctrl_c_is_one_clear_line(finished, tmp_path, monkeypatch, capsys):
-    import sc3d.stages.label as label
-
     scene = tmp_path / "scene"
     shutil.copytree(finished, scene)
     before = contents(scene)
-    monkeypatch.setattr(label, "fuse", lambda *_: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("sc3d.labelling.label.fuse", lambda *_: signal.raise_signal(signal.SIGINT))
     # a shell starts background jobs deaf to Ctrl-C
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

@@ -198,7 +198,7 @@ def test_masks_err_and_flight_covers_the_city(made):
 
 
 def test_unfinished_files_get_no_name(tmp_path):
-    with pytest.raises(ValueError, match="0 points were appended"), open_cloud(tmp_path / "cloud.ply", 5):
+    with pytest.raises(ValueError, match="0 records instead of 5"), open_cloud(tmp_path / "cloud.ply", 5):
         pass
     with pytest.raises(KeyError), open_mesh(tmp_path / "mesh.ply"):
         raise KeyError

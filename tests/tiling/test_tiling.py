@@ -18,10 +18,11 @@ import open3d as o3d
 import pytest
 
 from sc3d.errors import InputError
-from sc3d.io.chunked_clouds import CloudFile, write_ply
+from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.clouds import read_cloud, write_geometry
+from sc3d.io.ply import write_records
 from sc3d.scene.scene import Scene
-from sc3d.settings.labels import Evaluate, Label, Propagate
+from sc3d.settings.labels import Evaluate, Label, PaperMechanisms, Propagate
 from sc3d.settings.synthesize import Synthesize
 from sc3d.stages import evaluate, label, propagate
 from sc3d.synthetic.generate import synthesize
@@ -29,9 +30,10 @@ from sc3d.tiling import evaluate as tiled_evaluate
 from sc3d.tiling import label as tiled_label
 from sc3d.tiling import memory as plan
 from sc3d.tiling import propagate as tiled_propagate
-from sc3d.tiling.memory import WorkFolder, memory_of
-from sc3d.tiling.ranges import MeshParts, RangeMaps, read_triangles, write_ranges
+from sc3d.tiling.first_surfaces import MeshParts, RangeMaps, read_triangles, write_ranges
+from sc3d.tiling.memory import memory_of
 from sc3d.tiling.store import CloudStatistics, TileStore
+from sc3d.tiling.work_folder import WorkFolder
 
 POINTS = 60_000
 TILES = 25_000  # points of a tile with its margin
@@ -56,7 +58,6 @@ def small_tiles(monkeypatch):
 
     for module in (tiled_label, tiled_propagate, tiled_evaluate):
         monkeypatch.setattr(module, "max_points", room)
-    for module in (label, propagate, evaluate):
         monkeypatch.setattr(module, "fits", lambda _, resources: resources.max_memory != "2G")
 
 
@@ -91,7 +92,8 @@ def blocks(path: Path) -> tuple[np.ndarray, np.ndarray]:
     "options",
     [
         {},
-        {"reproject": True, "incidence": True, "density": True},
+        {"mechanisms": PaperMechanisms(reproject=True, incidence=True, density=True)},
+        {"method": "paper"},
         {"method": "direct"},
         {"depth_filter": False},
     ],
@@ -221,8 +223,8 @@ def test_ranges_over_parts_of_a_mesh_are_those_of_the_whole(site, tmp_path):
 def command(site):
     """Runs `label` in a process of its own with room for few points, on `workers` Dask workers."""
     program = (
-        "import sys\nfrom sc3d.tiling import label\nlabel.max_points = lambda *_: %d\nfrom sc3d.cli import main\nif __name__ == '__main__':\n    main()\n"
-        % TILES
+        f"from sc3d.tiling import label\nlabel.max_points = lambda *_: {TILES}\n"
+        "from sc3d.cli import main\nif __name__ == '__main__':\n    main()\n"
     )
     script = site.parent / "few_points.py"
     script.write_text(program)
@@ -262,7 +264,7 @@ def kill_a_worker(parent: int, site: Path, seconds: float = 120) -> bool:
     """SIGKILL one Dask worker as soon as the first tile has its labels; whether one was killed."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
-        if any(folder.glob("results/label.*.npy") for folder in site.glob(".workers2.ply.*.parts")):
+        if any(site.glob(".workers2.ply.*.parts/results/label.*.npy")):
             for folder in Path("/proc").iterdir():
                 if (
                     folder.name.isdigit()
@@ -312,8 +314,10 @@ class CloudFileTiles:
     @staticmethod
     def of(site: Path) -> list[int]:
         cloud = CloudFile.open(site / "cloud.ply")
-        survey = CloudStatistics.from_cloud(cloud)
-        grid = survey.grid(TILES, tiled_label.BLOCKS * tiled_label.BLOCK * tiled_label.VOXEL * survey.spacing)
+        statistics = CloudStatistics.from_cloud(cloud)
+        grid = statistics.grid(
+            TILES, tiled_label.BLOCKS * tiled_label.BLOCK * tiled_label.VOXEL * statistics.spacing
+        )
         return np.unique(grid.tile_of(read_cloud(site / "cloud.ply").point.positions.numpy())).tolist()
 
 
@@ -360,24 +364,24 @@ def test_a_store_gives_back_every_point_once_and_the_margin(site, tmp_path):
         np.sort(np.concatenate([store.rows(tile) for tile in store.tiles])), np.arange(POINTS)
     )
     for tile in store.tiles:
-        window = store.window(tile, 2.0)
-        np.testing.assert_array_equal(window.rows, np.flatnonzero(store.grid.within(points, tile, 2.0)))
+        halo = store.with_halo(tile, 2.0)
+        np.testing.assert_array_equal(halo.rows, np.flatnonzero(store.grid.within(points, tile, 2.0)))
         np.testing.assert_array_equal(
-            window.rows[window.core], np.flatnonzero(store.grid.tile_of(points) == tile)
+            halo.rows[halo.core], np.flatnonzero(store.grid.tile_of(points) == tile)
         )
-        np.testing.assert_array_equal(window.gather(store.records)["x"], points[window.rows, 0])
+        np.testing.assert_array_equal(halo.gather(store.records)["x"], points[halo.rows, 0])
 
 
 def test_ply_in_chunks_is_what_open3d_reads(tmp_path):
     dtype = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("label", "u1")])
     records = np.zeros(10, dtype)
     records["x"], records["label"] = np.arange(10) + 5e5 + 1e-3, np.arange(10)
-    write_ply(tmp_path / "made.ply", dtype, 10, [records[:4], records[4:]])
+    write_records(tmp_path / "made.ply", [records[:4], records[4:]], dtype, 10)
     read = read_cloud(tmp_path / "made.ply")
     np.testing.assert_array_equal(read.point.positions.numpy()[:, 0], records["x"])
     np.testing.assert_array_equal(read.point.label.numpy().ravel(), records["label"])
     with pytest.raises(ValueError, match="instead of"):
-        write_ply(tmp_path / "made.ply", dtype, 11, [records])
+        write_records(tmp_path / "made.ply", [records], dtype, 11)
 
 
 @pytest.mark.parametrize(

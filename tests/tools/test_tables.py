@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import torch
 
+from sc3d.cli import main as sc3d
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.io.clouds import read_cloud
 from sc3d.io.images import read_index_image
 from sc3d.io.splats import write_splat_ply
-from sc3d.labelling.fusion import Cloud
+from sc3d.labelling.cloud import Cloud
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label, Propagate
 from sc3d.splatting.gaussians import Gaussians
@@ -33,6 +34,10 @@ from tools.make_manual import helps
 
 def fails(capsys, *arguments) -> str:
     return command_fails(capsys, *arguments, command=main)
+
+
+def run_stage(*arguments) -> None:
+    sc3d([str(argument) for argument in arguments])
 
 
 def run(*arguments) -> None:
@@ -86,8 +91,8 @@ def figures(record: dict, name: str, scene: int = 0) -> dict:
 )
 def test_rows_equal_the_stages(folder, record, tmp_path, name, method, how):
     scene = folder / "seed0_noise1"
-    run("label", scene, "--method", method, "--output", tmp_path / "seeds.ply")
-    run(
+    run_stage("label", scene, "--method", method, "--output", tmp_path / "seeds.ply")
+    run_stage(
         "propagate",
         scene,
         "--method",
@@ -97,7 +102,7 @@ def test_rows_equal_the_stages(folder, record, tmp_path, name, method, how):
         "--output",
         tmp_path / "full.ply",
     )
-    run("evaluate", scene, "--labelled", tmp_path / "full.ply", "--output", tmp_path / "metrics.json")
+    run_stage("evaluate", scene, "--labelled", tmp_path / "full.ply", "--output", tmp_path / "metrics.json")
     metrics, found = json.loads((tmp_path / "metrics.json").read_text()), figures(record, name)
     for area, key in (
         ("all", "labels"),
@@ -181,7 +186,7 @@ def test_every_switch_has_a_row_that_turns_it_alone():
         zeros = {name for name, text in helps(type(default)).items() if "0 = off" in text}
         assert flags | zeros | {"method"} <= {name for names in changed for name in names}, stage
     assert len({row.key for row in rows}) == len(rows) and all(row.key != row.base.key for row in rows)
-    assert {getattr(record, "edge_width") for _, record in turned(replace(Label(), edge_width=0.0))} == {
+    assert {record.edge_width for _, record in turned(replace(Label(), edge_width=0.0))} == {
         0.0,
         1.0,
     }

@@ -11,9 +11,8 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, local_origin, look_at, pinhole_view, project
 from sc3d.geometry.raycast import Surface, first_surface, see_points
 from sc3d.scene.class_table import parse_classes
-from sc3d.view.display_cloud import ShownCloud, class_ids, only_classes, with_votes
+from sc3d.view.display_cloud import DisplayCloud, class_ids, only_classes, progressive_order, with_votes
 from sc3d.view.picking import Inspector, photos_that_see, point_on_ray, position_at
-from sc3d.view.progressive_order import even_order
 
 UTM = np.array([512_345.0, 5_187_654.0, 210.0])
 CLASSES = parse_classes(
@@ -182,30 +181,30 @@ def test_every_beginning_of_the_order_is_spread_evenly():
     side = 32
     grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), axis=-1).reshape(-1, 2)
     points = np.random.default_rng(4).permutation(np.c_[grid, np.zeros(len(grid))]) + UTM
-    order = even_order(points)
+    order = progressive_order(points)
     assert np.array_equal(np.sort(order), np.arange(len(points)))
     for blocks in (1, 2, 4, 8, 16):  # as many points as square blocks: one in each
         first = (points[order[: blocks**2], :2] - UTM[:2]).astype(int) // (side // blocks)
         assert len(np.unique(first, axis=0)) == blocks**2
     shuffle = np.random.default_rng(5).permutation(len(points))
-    assert np.array_equal(points[shuffle][even_order(points[shuffle])], points[order])
-    assert len(even_order(points[:0])) == 0 and even_order(points[:1]).tolist() == [0]
+    assert np.array_equal(points[shuffle][progressive_order(points[shuffle])], points[order])
+    assert len(progressive_order(points[:0])) == 0 and progressive_order(points[:1]).tolist() == [0]
 
 
 def test_shown_cloud_keeps_millimeters_and_rows():
     points = UTM + np.random.default_rng(6).uniform(-60, 60, (5000, 3))
     label = np.random.default_rng(7).choice(np.uint8([0, 1, 3]), (5000, 1))
-    shown = ShownCloud.of(
+    display = DisplayCloud.from_cloud(
         make_cloud(points, label=label, confidence=np.ones((5000, 1), np.float32)), np.round(UTM), CLASSES
     )
     assert (
-        shown.points.dtype == np.float32
-        and np.abs(shown.points + shown.origin - points[shown.rows]).max() < 1e-3
+        display.points.dtype == np.float32
+        and np.abs(display.points + display.origin - points[display.rows]).max() < 1e-3
     )
-    assert np.array_equal(shown.colors("label"), CLASSES.palette[label.ravel()[shown.rows]])
-    assert shown.class_counts == {value: int((label == value).sum()) for value in (0, 1, 3)}
-    assert shown.colorings == ("label", "confidence") and np.isclose(
-        shown.spacing_at(1250), 2 * shown.spacing_at(5000)
+    assert np.array_equal(display.colors("label"), CLASSES.palette[label.ravel()[display.rows]])
+    assert display.class_counts == {value: int((label == value).sum()) for value in (0, 1, 3)}
+    assert display.colorings == ("label", "confidence") and np.isclose(
+        display.spacing_at(1250), 2 * display.spacing_at(5000)
     )
 
 

@@ -18,7 +18,6 @@ from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View, in_image, look_at, pinhole_view, project, undistorted
 from sc3d.scene.class_table import parse_classes
 from sc3d.scene.labelled_cloud import LabelledSurface
-from sc3d.view import screenshot
 from sc3d.view.colors import (
     COLORINGS,
     CONTESTED,
@@ -31,8 +30,8 @@ from sc3d.view.colors import (
 )
 from sc3d.view.picking import Inspector
 from sc3d.view.renderers import vulkan_works
-from sc3d.view.screenshot import Style, draw_points
-from sc3d.view.viewpoints import aerial_view, frusta
+from sc3d.view.screenshot import Style, draw_points, screenshot
+from sc3d.view.viewpoints import frusta, overview
 from sc3d.view.window import show
 
 UTM = np.array([500_000.0, 4_500_000.0, 100.0])
@@ -151,7 +150,7 @@ def test_picture_of_a_dense_cloud_is_closed_and_framed():
 @pytest.mark.parametrize("size", [(800, 500), (300, 900)])
 def test_aerial_view_holds_all_points(from_above, size):
     points = UTM + np.random.default_rng(2).uniform([-80, -10, 0], [20, 60, 35], (500, 3))
-    view = aerial_view(points, size, from_above)
+    view = overview(points, size, from_above)
     pixels, depth = project(view, points)
     assert in_image(view, pixels).all() and (depth > 0).all()
     north = project(view, points.mean(axis=0) + [[0, 0, 0], [0, 1, 0], [1, 0, 0]])[0]
@@ -292,7 +291,7 @@ def test_without_display_the_window_names_the_screenshot(monkeypatch, tmp_path):
 
 def test_where_nothing_can_render_the_error_names_the_two_packages():
     script = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from tests.view import test_screenshot as test_view; from sc3d.errors import Sc3dError; from sc3d.view import screenshot\n"
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from tests.view import test_screenshot as test_view; from sc3d.errors import Sc3dError; from sc3d.view.screenshot import screenshot\n"
         "try: screenshot(test_view.full_cloud(), None, (64, 64), class_table=test_view.CLASSES)\n"
         "except Sc3dError as error: sys.exit(str(error))"
     )

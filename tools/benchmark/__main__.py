@@ -7,7 +7,7 @@ import sys
 
 import tyro
 
-from sc3d.cli import reporting_errors
+from sc3d.cli import reporting_errors, start_logging
 from tools.benchmark import settings
 
 RUNS: dict[type, tuple[str, str]] = {
@@ -26,6 +26,7 @@ def main(arguments: list[str] | None = None) -> None:
         settings.Benchmark, args=arguments, prog="python -m tools.benchmark", description=description
     )
     module, function = RUNS[type(command)]
+    start_logging()
     with reporting_errors():
         getattr(importlib.import_module(f"tools.benchmark.{module}"), function)(command)
 

@@ -12,7 +12,8 @@ import open3d as o3d
 from sc3d.geometry.cameras import View, in_image, project, rays
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import Surface
-from sc3d.labelling.fusion import Cloud, Mask
+from sc3d.labelling.cloud import Cloud
+from sc3d.labelling.observation import Mask
 
 NUM_NEIGHBORS = 16
 DEPTH_TOLERANCE = 0.01  # of the depth

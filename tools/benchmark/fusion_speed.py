@@ -19,9 +19,12 @@ from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.raycast import Surface
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.provenance import peak_memory_mb, reset_peak_memory, versions
-from sc3d.labelling.fusion import Cloud, Fusion, Mask, fuse
+from sc3d.labelling.cloud import Cloud
+from sc3d.labelling.fusion import Fusion, fuse
 from sc3d.labelling.inputs import Masks
-from sc3d.propagation.propagate import LabelledPoints, complete
+from sc3d.labelling.observation import Mask
+from sc3d.propagation.labelled_points import LabelledPoints
+from sc3d.propagation.propagate import propagate
 from sc3d.scene.labelled_cloud import point_arrays, read_surface, spacing_of
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
@@ -44,7 +47,7 @@ FUSE, MAP, RAYS, Z_BUFFER, NEIGHBORS, SKLEARN = (
 
 
 @dataclass(frozen=True)
-class Workload:
+class FusionWorkload:
     """A cloud and the views that label it; masks are those of the scene. read: mask by view, kept in memory
     so that no file is timed.
     """
@@ -93,7 +96,7 @@ def run_fusion_speed(command: BenchmarkFusionSpeed) -> None:
     publish(record, markdown(record), command.output)
 
 
-def _workload(scene: Scene, masks: Masks, num_points: int) -> Workload:
+def _workload(scene: Scene, masks: Masks, num_points: int) -> FusionWorkload:
     """Random points of the cloud (seed 0), all views with a mask. More points than the cloud has: copies,
     moved at random along the surface.
     """
@@ -110,7 +113,7 @@ def _workload(scene: Scene, masks: Masks, num_points: int) -> Workload:
     moves = rng.normal(0, spacing, (num_points, 3)) * (np.arange(num_points) >= len(points))[:, None]
     moves -= np.einsum("ni,ni->n", moves, normals[rows])[:, None] * normals[rows]
     pictures = {view.name: masks.read(view) for view in masks.views}
-    return Workload(
+    return FusionWorkload(
         Cloud(points[rows] + moves, normals[rows]),
         colors[rows],
         masks.views,
@@ -120,7 +123,7 @@ def _workload(scene: Scene, masks: Masks, num_points: int) -> Workload:
     )
 
 
-def _cut(workload: Workload, num_points: int | None, num_views: int) -> Workload:
+def _cut(workload: FusionWorkload, num_points: int | None, num_views: int) -> FusionWorkload:
     """The first points and views; with more views than there are, they are repeated under other names."""
     views = [
         replace(view, name=f"{view.name}#{row // len(workload.views)}")
@@ -136,21 +139,21 @@ def _cut(workload: Workload, num_points: int | None, num_views: int) -> Workload
     return replace(workload, cloud=cloud, colors=workload.colors[:num_points], views=views)
 
 
-def _label(workload: Workload) -> Fusion:
+def _label(workload: FusionWorkload) -> Fusion:
     settings = Label(voxel_size=workload.voxel_size)
     return fuse(workload.cloud, workload.views, workload.read, workload.surface, workload.num_ids, settings)
 
 
-def _propagate(workload: Workload, fusion: Fusion) -> Labels:
+def _propagate(workload: FusionWorkload, fusion: Fusion) -> Labels:
     evidence = LabelledPoints(workload.cloud.points, fusion.labels, fusion.votes, workload.colors)
-    return complete(evidence, workload.cloud.normals, Propagate(method="map"))
+    return propagate(evidence, workload.cloud.normals, Propagate(method="map"))
 
 
-def _label_and_propagate(workload: Workload) -> Labels:
+def _label_and_propagate(workload: FusionWorkload) -> Labels:
     return _propagate(workload, _label(workload))
 
 
-def _compare(workload: Workload, repeats: int) -> dict[str, dict[str, float]]:
+def _compare(workload: FusionWorkload, repeats: int) -> dict[str, dict[str, float]]:
     """Median CPU and wall seconds of each contender; they take turns."""
     sized = [view.resized(*workload.read(view)[0].shape[::-1]) for view in workload.views]
     bundles, fusion = rivals.ray_bundles(workload.surface, sized), _label(workload)
@@ -177,17 +180,17 @@ def _compare(workload: Workload, repeats: int) -> dict[str, dict[str, float]]:
     }
 
 
-def _grown(workload: Workload, num_views: int) -> dict[str, float]:
+def _grown(workload: FusionWorkload, num_views: int) -> dict[str, float]:
     """Seconds and peak memory of label and of propagate at one size."""
     workload = _cut(workload, None, num_views)
     # the first cast builds the tree
     rivals.cast_only(workload.surface, rivals.ray_bundles(workload.surface, workload.views[:1]))
-    workload.voxel_size
+    _ = workload.voxel_size  # measured once
     cpu, wall, peak, fusion = _timed(lambda: _label(workload))
     record = {
         "points": len(workload.cloud.points),
         "views": num_views,
-        "voxels": len(np.unique(fusion.cells // 2)),
+        "voxels": len(np.unique(fusion.rows // 2)),
         "label_cpu_seconds": cpu,
         "label_wall_seconds": wall,
         "label_peak_memory_mb": peak,

@@ -17,7 +17,7 @@ from tools.benchmark.publish import check_output, publish
 from tools.benchmark.settings import BenchmarkSpeed
 from tools.benchmark.speed_table import markdown
 from tools.benchmark.training import measure_steps, measure_training
-from tools.benchmark.workload import Ground, build_workload, ground_of, synthetic_ground
+from tools.benchmark.workload import TrainingGround, build_workload, ground_of, synthetic_ground
 
 logger = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ def run_speed(command: BenchmarkSpeed) -> None:
 
 
 def _configuration(
-    ground: Ground, size: tuple[int, int], command: BenchmarkSpeed, binary: Path | None
+    ground: TrainingGround, size: tuple[int, int], command: BenchmarkSpeed, binary: Path | None
 ) -> dict:
     """size: number of Gaussians, longest side of the view, px"""
     workload = build_workload(ground, *size)

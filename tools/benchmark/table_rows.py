@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Literal, get_args, get_origin, get_type_hints
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from typing import Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from sc3d.settings.common import Resources
-from sc3d.settings.labels import Label, Propagate
+from sc3d.settings.labels import Label, PaperMechanisms, Propagate
 from tools.make_manual import helps
 
 OURS, DEFAULT = "conflict-lock + geometry", "sc3d as it is by default"
@@ -18,10 +18,9 @@ NO_FILTER = Label(depth_filter=False)
 GEOMETRY = Propagate(method="geometry")
 BASELINES = ("direct", "majority")
 RESOURCES = {field.name for field in fields(Resources)}
-ON_VALUES: dict[tuple[str, str], float] = {}
-"""What "on" means for numeric options that are off (0) by default, by stage and option; others are tried at
-1.
-"""
+
+
+Settings = TypeVar("Settings", Label, Propagate, PaperMechanisms)
 
 
 @dataclass(frozen=True)
@@ -114,17 +113,20 @@ def ablation() -> list[Row]:
     return rows
 
 
-def turned(record: Label | Propagate) -> list[tuple[str, Label | Propagate]]:
+def turned(record: Settings) -> list[tuple[str, Settings]]:
     """Description and record for every switch that can be turned: flags, choices, and numbers for which the
     help says that 0 is off.
     """
-    kind, stage = type(record), type(record).__name__.lower()
-    hints, found = get_type_hints(kind), []
+    kind, found = type(record), []
+    hints = get_type_hints(kind)
     for field in fields(kind):
         value, option = getattr(record, field.name), field.name.replace("_", "-")
-        if not _is_mechanism(kind, field.name):
+        if is_dataclass(value):
+            inside = turned(value)
+            found += [(text, replace(record, **{field.name: inner})) for text, inner in inside]
+        elif not _is_mechanism(kind, field.name):
             continue
-        if hints[field.name] is bool:
+        elif hints[field.name] is bool:
             found.append((f"--{'no-' if value else ''}{option}", replace(record, **{field.name: not value})))
         elif get_origin(hints[field.name]) is Literal:
             others = [
@@ -134,7 +136,7 @@ def turned(record: Label | Propagate) -> list[tuple[str, Label | Propagate]]:
             ]
             found += [(f"--{option} {choice}", replace(record, **{field.name: choice})) for choice in others]
         elif "0 = off" in helps(kind)[field.name]:
-            other = 0.0 if value else ON_VALUES.get((stage, field.name), 1.0)
+            other = 0.0 if value else 1.0
             found.append((f"--{option} {other:g}", replace(record, **{field.name: type(value)(other)})))
     return found
 

@@ -19,7 +19,7 @@ from sc3d.geometry.raycast import Surface, first_surface, nearest_points
 from sc3d.io.atomic import atomic_path
 from sc3d.io.clouds import read_cloud
 from sc3d.io.images import read_index_image, write_image
-from sc3d.labelling.fusion import Cloud
+from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.inputs import Masks, point_density
 from sc3d.metrics import Confusion, EvaluationPixels, depth_edge_band
 from sc3d.scene.labelled_cloud import REACH, point_arrays, read_surface, spacing_of

@@ -4,6 +4,7 @@ are kept, so that a run can go on.
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
 import logging
@@ -20,10 +21,12 @@ from sc3d.errors import InputError
 from sc3d.io.atomic import require_writable
 from sc3d.io.json_files import write_json
 from sc3d.io.provenance import digest, peak_memory_mb, reset_peak_memory, versions
-from sc3d.labelling.fusion import Cloud, Fusion, fuse
+from sc3d.labelling.cloud import Cloud
+from sc3d.labelling.fusion import Fusion, fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size
 from sc3d.metrics import Confusion
-from sc3d.propagation.propagate import LabelledPoints, complete
+from sc3d.propagation.labelled_points import LabelledPoints
+from sc3d.propagation.propagate import propagate
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label, Propagate
@@ -44,17 +47,6 @@ from tools.benchmark.table_scenes import (
 logger = logging.getLogger(__name__)
 
 # the rows
-DECIDE = (
-    "geometry",
-    "propagation",
-    "density.py",
-    "fusion.py",
-    "labelled.py",
-    "labelling.py",
-    "verification.py",
-    "voting.py",
-    "voting_kernels.py",
-)
 
 
 @dataclass(frozen=True)
@@ -138,10 +130,24 @@ def unique_rows() -> list[Row]:
 
 @cache
 def code_digest() -> str:
-    """Hash of the sources that decide a row: rows of other code are not mixed in."""
-    root = Path(sc3d.__file__).parent
-    files = sorted(file for file in root.rglob("*.py") if file.relative_to(root).parts[0] in DECIDE)
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+    """Hash of the sources that decide a row, which are those that fuse, propagate and judge, with all that they import:
+    rows of other code are not mixed in.
+    """
+    root, wanted, seen = Path(sc3d.__file__).parent.parent, [fuse, propagate, Confusion], set()
+    names = [function.__module__ for function in wanted]
+    while names:
+        name = names.pop()
+        file = root.joinpath(*name.split(".")).with_suffix(".py")
+        if file in seen or not file.is_file():
+            continue
+        seen.add(file)
+        nodes = [
+            node for node in ast.walk(ast.parse(file.read_text("utf-8"))) if isinstance(node, ast.ImportFrom)
+        ]
+        names += [
+            part for node in nodes for part in (node.module, *(f"{node.module}.{a.name}" for a in node.names))
+        ]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in sorted(seen))).hexdigest()[:12]
 
 
 def _check(command: BenchmarkTables) -> None:
@@ -258,10 +264,10 @@ def _seeds(place: Place, masks: Masks, label: Label) -> tuple[LabelledPoints, di
 
 
 def _fused(place: Place, masks: Masks, label: Label) -> Fusion:
-    cloud = with_density(place, label.voxel_size) if label.density else place.cloud
-    return fuse(
-        cloud, masks.views, masks.read, place.surface if label.depth_filter else None, place.num_ids, label
-    )
+    label = label.resolved
+    cloud = with_density(place, label.voxel_size) if label.mechanisms.density else place.cloud
+    surface = place.surface if label.depth_filter else None
+    return fuse(cloud, masks.views, masks.read, surface, place.num_ids, label)
 
 
 def _propagated(
@@ -269,7 +275,7 @@ def _propagated(
 ) -> tuple[Labels, dict[str, float]]:
     """As `sc3d propagate` does it."""
     with _measured() as cost:
-        labels = complete(evidence, place.cloud.normals, settings)
+        labels = propagate(evidence, place.cloud.normals, settings)
     return labels, cost
 
 

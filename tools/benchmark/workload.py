@@ -23,7 +23,7 @@ _FULL_SIZE = (1986, 1116)  # of the synthetic photos, px
 
 
 @dataclass(frozen=True)
-class Ground:
+class TrainingGround:
     """Surface points (P, 3) in a local world frame, their colors (P, 3) uint8, and two views that overlap,
     at full size.
     """
@@ -48,7 +48,7 @@ class Workload:
         return f"{len(self.gaussians) / 1000:g} k @ {self.views[0].width}x{self.views[0].height}"
 
 
-def synthetic_ground(num_points: int = 20_000, seed: int = 0) -> Ground:
+def synthetic_ground(num_points: int = 20_000, seed: int = 0) -> TrainingGround:
     """Rolling ground seen almost straight down, so wide that one view shows a fifth of it."""
     rng = np.random.default_rng(seed)
     height, focal = 50.0, 0.8 * _FULL_SIZE[0]
@@ -71,10 +71,10 @@ def synthetic_ground(num_points: int = 20_000, seed: int = 0) -> Ground:
         )
         for index, side in enumerate((-5.0, 5.0))
     ]
-    return Ground(points, colors.clip(0, 255).astype(np.uint8), tuple(views))
+    return TrainingGround(points, colors.clip(0, 255).astype(np.uint8), tuple(views))
 
 
-def ground_of(model: SparseModel) -> Ground:
+def ground_of(model: SparseModel) -> TrainingGround:
     """Sparse points of a COLMAP model; the view that sees nearest to a fifth of them, and its best neighbor.
     InputError for too small models.
     """
@@ -88,10 +88,10 @@ def ground_of(model: SparseModel) -> Ground:
     first = int(np.argmin(np.abs(np.array(shares) - VISIBLE_SHARE)))
     second = int(neighbor_views(model.tracks, points, np.stack([view.center for view in views]))[first][0])
     named = [replace(views[index], name=f"view_{row}.png") for row, index in enumerate((first, second))]
-    return Ground(points, model.colors, tuple(named))
+    return TrainingGround(points, model.colors, tuple(named))
 
 
-def build_workload(ground: Ground, num_gaussians: int, max_size: int, seed: int = 0) -> Workload:
+def build_workload(ground: TrainingGround, num_gaussians: int, max_size: int, seed: int = 0) -> Workload:
     """Spread Gaussians over a ground and scale them until a view has `FRAGMENTS` contributing fragments per
     pixel.
 
@@ -109,7 +109,7 @@ def build_workload(ground: Ground, num_gaussians: int, max_size: int, seed: int 
     return Workload(gaussians, views, tuple(_photo(gaussians, view, rng) for view in views))
 
 
-def _spread(ground: Ground, count: int, rng: np.random.Generator) -> Gaussians:
+def _spread(ground: TrainingGround, count: int, rng: np.random.Generator) -> Gaussians:
     """Means between points and their neighbors, evenly over the surface; scales from the distances among
     them, first axis across the surface.
     """

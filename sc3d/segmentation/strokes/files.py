@@ -1,12 +1,10 @@
 """What a user drew on photos: strokes, polygons and colors, read, checked and painted at any size.
 
 LabelMe JSON: shapes of type linestrip, line, point (with `"width": <px>`, which LabelMe keeps although it
-does not know it), polygon,
-rectangle and circle; coordinates in px from the upper left corner of the photo as it is stored; later shapes
-cover earlier ones.
-The label is the name of a class, or `_background_` for what belongs to no class. PNG: the colors of the
-class table; black and
-transparent pixels say nothing. A photo may have both, the PNG below.
+does not know it), polygon, rectangle and circle; coordinates in px from the upper left corner of the photo as
+it is stored; later shapes cover earlier ones. The label is the name of a class, or `_background_` for what
+belongs to no class. PNG: the colors of the class table; black and transparent pixels say nothing. A photo may
+have both, the PNG below.
 """
 
 from __future__ import annotations
@@ -14,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,14 +27,14 @@ BACKGROUND = "_background_"  # LabelMe's own name for it
 NOTHING = -1  # a pixel without a stroke; 0 is background
 MIN_POINTS = {"point": 1, "line": 2, "linestrip": 1, "polygon": 3, "rectangle": 2, "circle": 2}
 DEFAULT_WIDTH = 0.005  # of a stroke that states none, share of the photo's longest side
-_FAR = 1e5  # px; more cannot be meant, and would overflow the fixed-point coordinates of OpenCV
+_MAX_COORDINATE = 1e5  # px; more cannot be meant, and would overflow the fixed-point coordinates of OpenCV
 _SHIFT = 4  # fractional bits of those coordinates
-_THICKEST = 32767  # px, to OpenCV
-_LEAST_SHARE = 0.25  # of a reduced pixel that a PNG must cover
+_MAX_THICKNESS = 32767  # px, to OpenCV
+_MIN_SHARE = 0.25  # of a reduced pixel that a PNG must cover
 
 
 @dataclass(frozen=True)
-class Shape:
+class StrokeShape:
     """One stroke or area. label: class id, 0 = background; points: (N, 2) float64 px of the stored photo;
     width: of strokes, px, 0 = default.
     """
@@ -57,7 +56,7 @@ class PhotoStrokes:
 
     photo: Path
     size: tuple[int, int]
-    shapes: tuple[Shape, ...] = ()
+    shapes: tuple[StrokeShape, ...] = ()
     picture: np.ndarray | None = None
 
     def paint(self, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
@@ -118,20 +117,20 @@ def read_strokes(folder: Path, photos_folder: Path, class_table: ClassTable) -> 
 
 def parse_shapes(
     content: object, origin: Path | str, size: tuple[int, int], class_table: ClassTable
-) -> tuple[Shape, ...]:
+) -> tuple[StrokeShape, ...]:
     """The shapes of a decoded LabelMe file, scaled to the photo; InputError if something is wrong.
 
     origin: names the file in messages; size: (width, height) px of the photo
     """
     shapes = content.get("shapes") if isinstance(content, dict) else None
-    if not isinstance(shapes, list):
+    if not isinstance(content, dict) or not isinstance(shapes, list):
         raise InputError(f"{origin} is not a LabelMe file: it has no list of shapes")
-    stated = (content.get("imageWidth"), content.get("imageHeight"))
+    stated: tuple[Any, Any] = (content.get("imageWidth"), content.get("imageHeight"))
     scale = 1.0
     if stated != (None, None):
-        if not all(isinstance(side, int) and 0 < side < _FAR for side in stated):
+        if not all(isinstance(side, int) and 0 < side < _MAX_COORDINATE for side in stated):
             raise InputError(f"{origin}: imageWidth and imageHeight must be whole numbers of px")
-        check_mask_aspect(Path(str(origin)), stated, size)
+        check_mask_aspect(origin, stated, size)
         scale = max(size) / max(stated)
     ids = {entry.name: entry.id for entry in class_table} | {BACKGROUND: 0}
     return tuple(
@@ -139,7 +138,7 @@ def parse_shapes(
     )
 
 
-def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) -> Shape:
+def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) -> StrokeShape:
     if not isinstance(shape, dict):
         raise InputError(f"{origin} is not an object")
     label, kind = shape.get("label"), shape.get("shape_type") or "polygon"
@@ -158,7 +157,9 @@ def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) 
         raise InputError(f"{origin}: a {kind} needs at least {MIN_POINTS[kind]} points")
     if not _is_number(width) or width < 0:
         raise InputError(f"{origin}: width must be a number of px")
-    return Shape(ids[label], kind, np.array(points, np.float64).reshape(-1, 2) * scale, float(width) * scale)
+    return StrokeShape(
+        ids[label], kind, np.array(points, np.float64).reshape(-1, 2) * scale, float(width) * scale
+    )
 
 
 def _is_number(value: object) -> bool:
@@ -166,7 +167,7 @@ def _is_number(value: object) -> bool:
         isinstance(value, int | float)
         and not isinstance(value, bool)
         and math.isfinite(value)
-        and abs(value) < _FAR
+        and abs(value) < _MAX_COORDINATE
     )
 
 
@@ -219,7 +220,7 @@ def _reduce(picture: np.ndarray, width: int, height: int) -> np.ndarray:
             for label in ids
         ]
     )
-    return np.where(shares.max(axis=0) >= _LEAST_SHARE, ids[shares.argmax(axis=0)], NOTHING).astype(np.int16)
+    return np.where(shares.max(axis=0) >= _MIN_SHARE, ids[shares.argmax(axis=0)], NOTHING).astype(np.int16)
 
 
 def _components(labels: np.ndarray) -> tuple[np.ndarray, int]:
@@ -232,7 +233,7 @@ def _components(labels: np.ndarray) -> tuple[np.ndarray, int]:
     return groups, count
 
 
-def _draw(shape: Shape, scale: np.ndarray, default_width: float, size: tuple[int, int]) -> np.ndarray:
+def _draw(shape: StrokeShape, scale: np.ndarray, default_width: float, size: tuple[int, int]) -> np.ndarray:
     """(H, W) bool pixels that a shape covers, at least one unless it lies outside; scale: (2,) of x and y;
     size: (H, W).
     """
@@ -250,7 +251,7 @@ def _draw(shape: Shape, scale: np.ndarray, default_width: float, size: tuple[int
     if shape.kind in ("polygon", "rectangle", "circle"):
         cv2.fillPoly(canvas, fixed, 1, shift=_SHIFT)
     else:
-        thickness = min(max(1, round((shape.width or default_width) * float(scale.mean()))), _THICKEST)
+        thickness = min(max(1, round((shape.width or default_width) * float(scale.mean()))), _MAX_THICKNESS)
         # a single point is no line to OpenCV
         cv2.polylines(canvas, [np.concatenate([fixed[0], fixed[0][-1:]])], False, 1, thickness, shift=_SHIFT)
     return canvas > 0

@@ -47,6 +47,31 @@ class ImageGradients(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _add_channel(pixels, place, w, value, total, product):
+    """Of 8 pixels of one channel with gradient g: total + w g, the fragment's sum, and product + g f, f = value."""
+    g = load(pixels, place)
+    return fma(w, g, total), fma(g, value, product)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _alpha_gradient(pixels, place, gain, alpha, exponent):
+    """d loss / d ln(alpha) of 8 pixels, with gain = w g.f; takes it out of what is still to come."""
+    rest = load(pixels, place + PLANE) - gain
+    store(pixels, place + PLANE, rest)
+    gradient = gain - alpha * rest / (splat(_ONE) - alpha)
+    # no gradient where alpha was cut to 0.99
+    return where_at_least(splat(_ZERO) - exponent, splat(-_LOG2_MAX_ALPHA), gradient)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _values(records, base):
+    """What a fragment shows, for 8 pixels each: color 3, normal 3, plane distance."""
+    red, green, blue = splat(records[base + 8]), splat(records[base + 9]), splat(records[base + 10])
+    nx, ny, nz = splat(records[base + 11]), splat(records[base + 12]), splat(records[base + 13])
+    return red, green, blue, nx, ny, nz, splat(records[base + 14])
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _backward_tile(tiles, tile, frame, geometry, pixels, gradients):
     """Runs a tile front to back again; writes the pixel sums of each instance (`projection_backward.SUMS`).
 
@@ -55,31 +80,27 @@ def _backward_tile(tiles, tile, frame, geometry, pixels, gradients):
     With t = transmittance in front of the fragment:  d loss / d ln(alpha) = w g.f - alpha / (1 - alpha)
     rest_behind,  w = alpha t.
     """
-    records, lane, zero, one = tiles.records, ramp(), splat(_ZERO), splat(_ONE)
-    minus_clamp = splat(-_LOG2_MAX_ALPHA)
+    records, lane, zero, first = tiles.records, ramp(), splat(_ZERO), tiles.starts[tile]
     lines, ends = np.empty(3 * TILE, np.float32), np.empty(2 * TILE, np.int32)
-    first = tiles.starts[tile]
     for entry in range(first, tiles.starts[tile + 1]):
         if (entry - first) % CHECK == CHECK - 1 and finished(pixels):
             return
         base = np.int64(tiles.ranks[entry]) * RECORD
         first_row, last_row = measure_rows(records, base, frame, lines, ends)
         minus_decay = splat(-records[base + 3])
-        red, green, blue = splat(records[base + 8]), splat(records[base + 9]), splat(records[base + 10])
-        nx, ny, nz = splat(records[base + 11]), splat(records[base + 12]), splat(records[base + 13])
-        distance = splat(records[base + 14])
-        s_sum, su_sum, suu_sum, sy_sum, suy_sum, syy_sum, x_sum, y_sum = (
-            zero, zero, zero, zero, zero, zero, zero, zero
-        )  # fmt: skip
-        red_sum, green_sum, blue_sum, nx_sum, ny_sum, nz_sum, d_sum = zero, zero, zero, zero, zero, zero, zero
-        # m, a and h
-        slope, to_x, to_y = records[base + 2], records[base + 3] / _SCALE, records[base + 4] / _SCALE
+        red, green, blue, nx, ny, nz, distance = _values(records, base)
+        s_sum = su_sum = suu_sum = sy_sum = suy_sum = syy_sum = x_sum = y_sum = zero
+        red_sum = green_sum = blue_sum = nx_sum = ny_sum = nz_sum = d_sum = zero
+        slope, to_x, to_y = (
+            records[base + 2],
+            records[base + 3] / _SCALE,
+            records[base + 4] / _SCALE,
+        )  # m, a, h
+        tilt = splat(-to_x * slope)
         for row in range(first_row, last_row + 1):
-            center, peak = lines[TILE + row], splat(lines[2 * TILE + row])
+            center, peak, s_row, su_row = lines[TILE + row], splat(lines[2 * TILE + row]), zero, zero
             column, end = np.int64(ends[row]), np.int64(ends[TILE + row])
-            s_row, su_row = zero, zero
-            dy = lines[row]
-            tilt, lift = splat(-to_x * slope), splat(to_y * dy)
+            height, lift = splat(lines[row]), splat(to_y * lines[row])
             while column < end:
                 place = row * STRIDE + column
                 u = lane + splat(np.float32(column) - center)
@@ -89,51 +110,28 @@ def _backward_tile(tiles, tile, frame, geometry, pixels, gradients):
                     continue
                 exponent = log2_alpha(minus_decay, u, peak)
                 alpha = alpha_of(exponent, transmittance)
-                w = alpha * transmittance
+                w, product = alpha * transmittance, load(pixels, place + 2 * PLANE)
                 store(pixels, place, transmittance - w)
-                g = load(pixels, place + 3 * PLANE)
-                red_sum = fma(w, g, red_sum)
-                product = fma(g, red, load(pixels, place + 2 * PLANE))
-                g = load(pixels, place + 4 * PLANE)
-                green_sum = fma(w, g, green_sum)
-                product = fma(g, green, product)
-                g = load(pixels, place + 5 * PLANE)
-                blue_sum = fma(w, g, blue_sum)
-                product = fma(g, blue, product)
+                red_sum, product = _add_channel(pixels, place + 3 * PLANE, w, red, red_sum, product)
+                green_sum, product = _add_channel(pixels, place + 4 * PLANE, w, green, green_sum, product)
+                blue_sum, product = _add_channel(pixels, place + 5 * PLANE, w, blue, blue_sum, product)
                 if geometry:
-                    g = load(pixels, place + 6 * PLANE)
-                    nx_sum = fma(w, g, nx_sum)
-                    product = fma(g, nx, product)
-                    g = load(pixels, place + 7 * PLANE)
-                    ny_sum = fma(w, g, ny_sum)
-                    product = fma(g, ny, product)
-                    g = load(pixels, place + 8 * PLANE)
-                    nz_sum = fma(w, g, nz_sum)
-                    product = fma(g, nz, product)
-                    g = load(pixels, place + 9 * PLANE)
-                    d_sum = fma(w, g, d_sum)
-                    product = fma(g, distance, product)
-                gain = w * product
-                rest = load(pixels, place + PLANE) - gain
-                store(pixels, place + PLANE, rest)
-                s = gain - alpha * rest / (one - alpha)
-                # no gradient where alpha was cut to 0.99
-                s = where_at_least(zero - exponent, minus_clamp, s)
+                    nx_sum, product = _add_channel(pixels, place + 6 * PLANE, w, nx, nx_sum, product)
+                    ny_sum, product = _add_channel(pixels, place + 7 * PLANE, w, ny, ny_sum, product)
+                    nz_sum, product = _add_channel(pixels, place + 8 * PLANE, w, nz, nz_sum, product)
+                    d_sum, product = _add_channel(pixels, place + 9 * PLANE, w, distance, d_sum, product)
+                s = _alpha_gradient(pixels, place, w * product, alpha, exponent)
                 su = s * u
-                s_row = s_row + s
-                su_row = su_row + su
-                suu_sum = fma(su, u, suu_sum)
+                s_row, su_row, suu_sum = s_row + s, su_row + su, fma(su, u, suu_sum)
                 x_sum = x_sum + absolute(su)
                 y_sum = y_sum + absolute(fma(tilt, su, lift * s))
-            height = splat(dy)
-            s_sum, su_sum = s_sum + s_row, su_sum + su_row
+            s_sum, su_sum, syy_sum = s_sum + s_row, su_sum + su_row, fma(height * height, s_row, syy_sum)
             sy_sum, suy_sum = fma(height, s_row, sy_sum), fma(height, su_row, suy_sum)
-            syy_sum = fma(height * height, s_row, syy_sum)
-        place = np.int64(tiles.instances[entry]) * RECORD
-        x_sum = x_sum * splat(to_x)
-        store(gradients, place, sums(s_sum, su_sum, suu_sum, sy_sum, suy_sum, syy_sum, x_sum, y_sum))
-        place += LANES
-        store(gradients, place, sums(red_sum, green_sum, blue_sum, nx_sum, ny_sum, nz_sum, d_sum, zero))
+        place, x_sum = np.int64(tiles.instances[entry]) * RECORD, x_sum * splat(to_x)
+        moments = sums(s_sum, su_sum, suu_sum, sy_sum, suy_sum, syy_sum, x_sum, y_sum)
+        store(gradients, place, moments)
+        shown = sums(red_sum, green_sum, blue_sum, nx_sum, ny_sum, nz_sum, d_sum, zero)
+        store(gradients, place + LANES, shown)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -14,8 +14,8 @@ import numpy as np
 from sc3d.geometry.cameras import View, undistorted
 from sc3d.scene.class_table import ClassTable
 from sc3d.view.colors import Coloring
-from sc3d.view.display_cloud import ShownCloud
-from sc3d.view.display_splats import SPLAT_COLORINGS, ShownSplats
+from sc3d.view.display_cloud import DisplayCloud
+from sc3d.view.display_splats import SPLAT_COLORINGS, DisplaySplats
 from sc3d.view.screenshot import LINE_COLOR
 from sc3d.view.web.orbit_camera import field_of_view, orientation
 
@@ -38,18 +38,20 @@ class CloudLayer:
     def __init__(
         self,
         server: viser.ViserServer,
-        shown: ShownCloud,
+        display: DisplayCloud,
         root: str,
         by: Coloring,
         hidden: set[int] = frozenset(),
     ) -> None:
-        self._scene, self._shown, self._by, self._relief, self._scale = server.scene, shown, by, True, 1.0
+        self._scene, self._display, self._by, self._relief, self._scale = server.scene, display, by, True, 1.0
         self._root = server.scene.add_frame(f"/{root}", show_axes=False)
         self._classes = {
             label: server.scene.add_frame(
-                f"/{root}/{node_name(shown.class_table, label)}", show_axes=False, visible=label not in hidden
+                f"/{root}/{node_name(display.class_table, label)}",
+                show_axes=False,
+                visible=label not in hidden,
             )
-            for label in shown.class_counts
+            for label in display.class_counts
         }
         self._chunks: list[list[tuple[np.ndarray, viser.PointCloudHandle]]] = []
         self._lock = threading.RLock()  # sliders call from several threads
@@ -57,12 +59,12 @@ class CloudLayer:
     @property
     def count(self) -> int:
         """Number of points that are there, hidden ones included."""
-        return min(len(self._chunks) * self._shown.chunk, len(self._shown.points))
+        return min(len(self._chunks) * self._display.chunk, len(self._display.points))
 
     def show_points(self, count: int) -> None:
         """Show about the first `count` points: whole chunks, at least one."""
         wanted = max(
-            1, min(round(count / self._shown.chunk), -(-len(self._shown.points) // self._shown.chunk))
+            1, min(round(count / self._display.chunk), -(-len(self._display.points) // self._display.chunk))
         )
         with self._lock:
             for handles in self._chunks[wanted:]:
@@ -76,7 +78,7 @@ class CloudLayer:
     def color_by(self, by: Coloring, relief: bool = True) -> None:
         """Show another attribute. relief: shaded, where the cloud has normals"""
         with self._lock:
-            self._by, self._relief, colors = by, relief, self._shown.colors(by, relief)
+            self._by, self._relief, colors = by, relief, self._display.colors(by, relief)
             for rows, handle in self._handles():
                 handle.colors = colors[rows]
 
@@ -100,18 +102,18 @@ class CloudLayer:
         return [entry for handles in self._chunks for entry in handles]
 
     def _point_size(self) -> float:
-        return self._scale * _COVER * self._shown.spacing_at(self.count)
+        return self._scale * _COVER * self._display.spacing_at(self.count)
 
     def _add_chunk(self, number: int) -> list[tuple[np.ndarray, viser.PointCloudHandle]]:
-        start, colors = number * self._shown.chunk, self._shown.colors(self._by, self._relief)
-        labels = self._shown.label[start : start + self._shown.chunk]
+        start, colors = number * self._display.chunk, self._display.colors(self._by, self._relief)
+        labels = self._display.label[start : start + self._display.chunk]
         handles = []
         for label, node in self._classes.items():
             rows = start + np.flatnonzero(labels == label)
             if len(rows):
                 handle = self._scene.add_point_cloud(
                     f"{node.name}/{number:02d}",
-                    self._shown.points[rows],
+                    self._display.points[rows],
                     colors[rows],
                     point_size=self._point_size(),
                     precision="float32",
@@ -127,15 +129,21 @@ class SplatLayer:
     def __init__(
         self,
         server: viser.ViserServer,
-        load: Callable[[], ShownSplats],
-        shown: ShownCloud,
+        load: Callable[[], DisplaySplats],
+        display: DisplayCloud,
         by: Coloring,
         hidden: set[int] = frozenset(),
     ) -> None:
-        """load: reads them; shown: has the frame of the viewer and the class table"""
-        self._server, self._load, self._shown, self._by, self._hidden = server, load, shown, by, set(hidden)
+        """load: reads them; display: has the frame of the viewer and the class table"""
+        self._server, self._load, self._display, self._by, self._hidden = (
+            server,
+            load,
+            display,
+            by,
+            set(hidden),
+        )
         self._root: viser.FrameHandle | None = None
-        self._splats: ShownSplats | None = None
+        self._splats: DisplaySplats | None = None
         self._nodes: dict[int, tuple[np.ndarray, viser.GaussianSplatHandle]] = {}
         self._lock = threading.RLock()
 
@@ -168,14 +176,14 @@ class SplatLayer:
         scene, gaussians, colors = self._server.scene, splats.gaussians, self._colors()
         self._root = scene.add_frame("/splats", show_axes=False)
         means, opacities = (
-            gaussians.means.numpy() + (splats.origin - self._shown.origin),
+            gaussians.means.numpy() + (splats.origin - self._display.origin),
             gaussians.opacities.numpy()[:, None],
         )
         covariances, unit = half_precision(gaussians.covariances.numpy())
         label = np.zeros(len(means), np.uint8) if splats.label is None else splats.label
         for present in np.unique(label).tolist():
             rows = np.flatnonzero(label == present)
-            name = "all" if splats.label is None else node_name(self._shown.class_table, present)
+            name = "all" if splats.label is None else node_name(self._display.class_table, present)
             handle = scene.add_gaussian_splats(
                 f"/splats/{name}",
                 (means[rows] / unit).astype(np.float32),
@@ -189,7 +197,7 @@ class SplatLayer:
 
     def _colors(self) -> np.ndarray:
         labelled = self._splats.label is not None and self._by in SPLAT_COLORINGS
-        return self._splats.colors(self._by if labelled else "photo", self._shown.class_table)
+        return self._splats.colors(self._by if labelled else "photo")
 
 
 class CameraLayer:

@@ -17,7 +17,7 @@ _NEAR, _FAR = 1 / 500, 50.0  # of the distance to what is looked at
 
 
 @dataclass(frozen=True)
-class OrbitPose:
+class OrbitCamera:
     """position, look_at: (3,), the latter in the middle of the picture and the point to turn around; up: (3,)
     unit; fov: vertical, radians.
     """
@@ -28,7 +28,7 @@ class OrbitPose:
     fov: float
 
     @classmethod
-    def from_view(cls, view: View, middle: np.ndarray, upright: bool) -> OrbitPose:
+    def from_view(cls, view: View, middle: np.ndarray, upright: bool) -> OrbitCamera:
         """middle: (3,) of what is looked at, whose depth the point to turn around has; upright: turn around
         +z unless the view is straight down
         """

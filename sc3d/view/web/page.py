@@ -22,12 +22,12 @@ from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import Coloring
-from sc3d.view.display_cloud import ShownCloud
-from sc3d.view.display_splats import ShownSplats
+from sc3d.view.display_cloud import DisplayCloud
+from sc3d.view.display_splats import DisplaySplats
 from sc3d.view.picking import Inspector
-from sc3d.view.viewpoints import aerial_view, frustum_depth, without_outliers
+from sc3d.view.viewpoints import frustum_depth, overview, without_outliers
 from sc3d.view.web.layers import CameraLayer, CloudLayer, SplatLayer
-from sc3d.view.web.orbit_camera import OrbitPose
+from sc3d.view.web.orbit_camera import OrbitCamera
 from sc3d.view.web.panel import Page, PhotoPanel, PointPanel, ShowPanel, legend_html
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 LOCAL = "127.0.0.1"
 PAGE_POINTS, FILE_POINTS, FILE_SPLATS = 1_000_000, 300_000, 200_000  # shown at the start; at most in a file
 _TITLE = "sc3d"
-_WINDOW = (1600, 1000)  # px; the start holds the whole scene in a window of this shape
+_START_SIZE = (1600, 1000)  # px; the start holds the whole scene in a window of this shape
 
 # Chromium starts no worker of viser's from a blob: address in a page from disk; without that address viser
 # uses a data: address, which works.
@@ -62,7 +62,7 @@ class WebView:
 
     scene: Scene
     inspector: Inspector
-    load_splats: Callable[[], ShownSplats] | None = None
+    load_splats: Callable[[], DisplaySplats] | None = None
     splats_first: bool = False
     by: Coloring = "label"
     classes: set[int] | None = None
@@ -83,18 +83,20 @@ def serving(view: WebView, host: str = LOCAL, port: int = 0) -> Iterator[str]:
 
     Raises MissingPackageError without viser.
     """
-    shown = _shown(view)
+    display = _display_cloud(view)
     with _server(host, port) as server:
-        hidden = _hidden(view, shown)
-        cloud = CloudLayer(server, shown, "cloud", view.by, hidden)
+        hidden = _hidden(view, display)
+        cloud = CloudLayer(server, display, "cloud", view.by, hidden)
         cloud.show_points(view.num_points or PAGE_POINTS)
         splats = (
-            None if view.load_splats is None else SplatLayer(server, view.load_splats, shown, view.by, hidden)
+            None
+            if view.load_splats is None
+            else SplatLayer(server, view.load_splats, display, view.by, hidden)
         )
-        views = [one.shifted(shown.origin) for one in view.drawn_views]
-        cameras = CameraLayer(server, views, frustum_depth(views, shown.points) if views else 1.0)
-        page = Page(server, view.scene, shown, views, view.inspector, cloud, splats, cameras)
-        home = _start(server, view, shown, views)
+        views = [one.shifted(display.origin) for one in view.drawn_views]
+        cameras = CameraLayer(server, views, frustum_depth(views, display.points) if views else 1.0)
+        page = Page(server, view.scene, display, views, view.inspector, cloud, splats, cameras)
+        home = _start(server, view, display, views)
         PointPanel(page, ShowPanel(page, view.by, hidden, view.splats_first))
         if views:
             photos = PhotoPanel(page, home)
@@ -124,23 +126,23 @@ def write_page(path: Path, view: WebView) -> None:
     """Write a page that opens from disk, without a server: every coloring of the cloud as a node of its own
     that can be switched on and off.
     """
-    shown = _shown(view)
+    display = _display_cloud(view)
     with _server(LOCAL, 0) as server:
-        hidden = _hidden(view, shown)
-        for by in (view.by, *(other for other in shown.colorings if other != view.by)):
-            layer = CloudLayer(server, shown, f"cloud by {by}", by, hidden)
-            layer.show_points(min(len(shown.points), view.num_points or FILE_POINTS))
+        hidden = _hidden(view, display)
+        for by in (view.by, *(other for other in display.colorings if other != view.by)):
+            layer = CloudLayer(server, display, f"cloud by {by}", by, hidden)
+            layer.show_points(min(len(display.points), view.num_points or FILE_POINTS))
             layer.show(by == view.by and not view.splats_first)
         if view.splats_first:
             SplatLayer(
-                server, lambda: view.load_splats().most_visible(FILE_SPLATS), shown, view.by, hidden
+                server, lambda: view.load_splats().most_visible(FILE_SPLATS), display, view.by, hidden
             ).show(True)
-        views = [one.shifted(shown.origin) for one in view.drawn_views]
-        CameraLayer(server, views, frustum_depth(views, shown.points) if views else 1.0)
-        _start(server, view, shown, views)
+        views = [one.shifted(display.origin) for one in view.drawn_views]
+        CameraLayer(server, views, frustum_depth(views, display.points) if views else 1.0)
+        _start(server, view, display, views)
         page = server.scene.as_html()
     with atomic_path(path) as temporary:
-        temporary.write_text(_for_disk(page, legend_html(view.by, shown)), encoding="utf-8")
+        temporary.write_text(_for_disk(page, legend_html(view.by, display)), encoding="utf-8")
 
 
 def _for_disk(page: str, legend: str) -> str:
@@ -179,7 +181,7 @@ def _server(host: str, port: int) -> Iterator[viser.ViserServer]:
             server.stop()
 
 
-def _shown(view: WebView) -> ShownCloud:
+def _display_cloud(view: WebView) -> DisplayCloud:
     points = view.inspector.cloud.point.positions
     views = view.inspector.views
     middle = (
@@ -187,24 +189,24 @@ def _shown(view: WebView) -> ShownCloud:
         if views
         else points[: max(1, len(points) // 2)].cpu().numpy().mean(axis=0)
     )
-    return ShownCloud.of(view.inspector.cloud, np.round(middle), view.inspector.class_table)
+    return DisplayCloud.from_cloud(view.inspector.cloud, np.round(middle), view.inspector.class_table)
 
 
-def _hidden(view: WebView, shown: ShownCloud) -> set[int]:
-    return set() if view.classes is None else ({0} | set(shown.class_counts)) - view.classes
+def _hidden(view: WebView, display: DisplayCloud) -> set[int]:
+    return set() if view.classes is None else ({0} | set(display.class_counts)) - view.classes
 
 
-def _start(server: viser.ViserServer, view: WebView, shown: ShownCloud, views: list[View]) -> OrbitPose:
+def _start(server: viser.ViserServer, view: WebView, display: DisplayCloud, views: list[View]) -> OrbitCamera:
     """Set the camera that a browser starts with; returns the pose that shows the whole scene, in the frame of
-    `shown`.
+    `display`.
     """
-    points = without_outliers(shown.points.astype(np.float64))
-    above = aerial_view(
-        np.concatenate([points, *(one.center[None] for one in views)]), _WINDOW, view.from_above
+    points = without_outliers(display.points.astype(np.float64))
+    above = overview(
+        np.concatenate([points, *(one.center[None] for one in views)]), _START_SIZE, view.from_above
     )
-    home = OrbitPose.from_view(above, shown.middle, upright=True)
+    home = OrbitCamera.from_view(above, display.middle, upright=True)
     photo = next((one for one in views if one.name == view.photo), None)
-    (home if photo is None else OrbitPose.from_view(photo, shown.middle, upright=False)).start(
+    (home if photo is None else OrbitCamera.from_view(photo, display.middle, upright=False)).start(
         server.initial_camera
     )
     return home

@@ -12,13 +12,14 @@ import numpy as np
 
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View
+from sc3d.io.images import data_uri
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import Coloring, color_scale, legend_entries
-from sc3d.view.display_cloud import ShownCloud
+from sc3d.view.display_cloud import DisplayCloud
 from sc3d.view.picking import Inspector, PickedPoint, point_on_ray
 from sc3d.view.web.layers import CameraLayer, CloudLayer, SplatLayer
-from sc3d.view.web.orbit_camera import OrbitPose
-from sc3d.view.web.photos import PhotoPictures, jpeg_uri, photo_pictures, thumbnail
+from sc3d.view.web.orbit_camera import OrbitCamera
+from sc3d.view.web.photos import PhotoPictures, photo_pictures, thumbnail
 
 if TYPE_CHECKING:
     import viser
@@ -33,11 +34,11 @@ _PICKED_COLOR = (255, 0, 200)
 
 @dataclass(frozen=True)
 class Page:
-    """All that the panel works on. views: in the frame of `shown`; splats: None where there are none"""
+    """All that the panel works on. views: in the frame of `display`; splats: None where there are none"""
 
     server: viser.ViserServer
     scene: Scene
-    shown: ShownCloud
+    display: DisplayCloud
     views: list[View]
     inspector: Inspector
     cloud: CloudLayer
@@ -57,9 +58,9 @@ class ShowPanel:
                 )
                 layers.on_update(lambda _: self._choose_layers(layers.value))
                 self._choose_layers(layers.value)
-            self._by = gui.add_dropdown("Color by", page.shown.colorings, initial_value=by)
-            self._legend = gui.add_html(legend_html(by, page.shown))
-            has_relief = page.shown.has_relief
+            self._by = gui.add_dropdown("Color by", page.display.colorings, initial_value=by)
+            self._legend = gui.add_html(legend_html(by, page.display))
+            has_relief = page.display.has_relief
             self._relief = gui.add_checkbox(
                 "relief",
                 has_relief,
@@ -75,7 +76,7 @@ class ShowPanel:
                 cameras.on_update(lambda _: page.cameras.show(cameras.value))
 
     def _add_sliders(self, gui: viser.GuiApi) -> None:
-        layer, total, chunk = self._page.cloud, len(self._page.shown.points), self._page.shown.chunk
+        layer, total, chunk = self._page.cloud, len(self._page.display.points), self._page.display.chunk
         if total > chunk:
             points = gui.add_slider(
                 "Thousand points",
@@ -89,10 +90,10 @@ class ShowPanel:
         size.on_update(lambda _: layer.resize(size.value))
 
     def _add_classes(self, gui: viser.GuiApi) -> None:
-        table = self._page.shown.class_table
+        table = self._page.display.class_table
         if table is None:
             return
-        counts = self._page.shown.class_counts
+        counts = self._page.display.class_counts
         for label in [
             *(label for label in counts if label),
             *([0] if 0 in counts or self._page.splats is not None else []),
@@ -121,13 +122,13 @@ class ShowPanel:
             self._page.cloud.color_by(by, self._relief.value)
             if self._page.splats is not None:
                 self._page.splats.color_by(by)
-        self._legend.content = legend_html(by, self._page.shown)
+        self._legend.content = legend_html(by, self._page.display)
 
 
 class PhotoPanel:
     """A photo and its mask, chosen by a click on its camera or by name, and a look through that camera."""
 
-    def __init__(self, page: Page, home: OrbitPose) -> None:
+    def __init__(self, page: Page, home: OrbitCamera) -> None:
         """home: where "Overview" returns to"""
         self._page, self._home, self._views = page, home, {view.name: view for view in page.views}
         gui = page.server.gui
@@ -149,7 +150,7 @@ class PhotoPanel:
         found = None
         if name != _NO_PHOTO:
             found = photo_pictures(
-                self._page.scene, self._views[name], self._page.shown.class_table, _PHOTO_SIZE
+                self._page.scene, self._views[name], self._page.display.class_table, _PHOTO_SIZE
             )
         self._pictures.content = "" if found is None else pictures_html(found)
         thumbnails = (
@@ -166,7 +167,7 @@ class PhotoPanel:
             self._home.move(client)
         elif client is not None and name != _NO_PHOTO:
             self._page.cameras.hide(name)
-            OrbitPose.from_view(self._views[name], self._page.shown.middle, upright=False).move(client)
+            OrbitCamera.from_view(self._views[name], self._page.display.middle, upright=False).move(client)
 
 
 class PointPanel:
@@ -181,15 +182,15 @@ class PointPanel:
         )
 
     def _pick(self, origin: np.ndarray, direction: np.ndarray) -> None:
-        shown, layer = self._page.shown, self._page.cloud
-        rows = np.flatnonzero(~np.isin(shown.label[: layer.count], sorted(self._panel.hidden)))
-        found = point_on_ray(shown.points[rows], origin, direction, shown.spacing_at(layer.count))
+        display, layer = self._page.display, self._page.cloud
+        rows = np.flatnonzero(~np.isin(display.label[: layer.count], sorted(self._panel.hidden)))
+        found = point_on_ray(display.points[rows], origin, direction, display.spacing_at(layer.count))
         if found is None:
             return
         with self._busy:  # the surface is made once
-            picked = self._page.inspector.look_up(int(shown.rows[rows[found]]))
+            picked = self._page.inspector.look_up(int(display.rows[rows[found]]))
         self._page.cameras.mark(picked.photos)
-        radius = max(2 * shown.spacing_at(layer.count), 0.004 * shown.extent)
+        radius = max(2 * display.spacing_at(layer.count), 0.004 * display.extent)
         # without light and shadow, which take seconds where there is no GPU
         self._page.server.scene.add_icosphere(
             "/picked",
@@ -198,12 +199,12 @@ class PointPanel:
             material="toon3",
             cast_shadow=False,
             receive_shadow=False,
-            position=picked.position - shown.origin,
+            position=picked.position - display.origin,
         )
         self._text.content = point_html(picked)
 
 
-def legend_html(by: Coloring, shown: ShownCloud) -> str:
+def legend_html(by: Coloring, display: DisplayCloud) -> str:
     """What the colors mean, as HTML: swatches of classes and states, or a color scale; empty for photo
     colors.
     """
@@ -212,13 +213,13 @@ def legend_html(by: Coloring, shown: ShownCloud) -> str:
         stops = ", ".join(_css(color) for color in scale.colors[::15])
         bar = f"<span style='display:block;height:.8em;background:linear-gradient(90deg, {stops})'></span>"
         return f"<div style='padding:0 .75em;font-size:.8em'>{bar}<span>{escape(scale.low)}</span><span style='float:right'>{escape(scale.high)}</span></div>"
-    present = set(shown.class_counts) if by == "label" else None
+    present = set(display.class_counts) if by == "label" else None
     swatch = (
         "<span style='display:inline-block;width:.8em;height:.8em;margin-right:.4em;background:{}'></span>{}"
     )
     entries = [
         swatch.format(_css(color), escape(name))
-        for name, color in legend_entries(by, shown.class_table, present)
+        for name, color in legend_entries(by, display.class_table, present)
     ]
     entries = [f"<span style='margin-right:1em'>{entry}</span>" for entry in entries]
     return f"<div style='padding:0 .75em;font-size:.8em'>{' '.join(entries)}</div>" if entries else ""
@@ -229,7 +230,7 @@ def pictures_html(found: PhotoPictures) -> str:
     withdraws while they load.
     """
     pictures = [
-        f"{_note(label)}<img alt='{label}' style='display:block;width:100%' src='{jpeg_uri(picture)}'>"
+        f"{_note(label)}<img alt='{label}' style='display:block;width:100%' src='{data_uri(picture)}'>"
         for label, picture in (("photo", found.photo), ("mask", found.mask))
         if picture is not None
     ]

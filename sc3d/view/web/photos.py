@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,12 +62,6 @@ def thumbnail(photo: np.ndarray, view: View, max_size: int) -> np.ndarray:
     most `max_size` px.
     """
     return resample(photo, view, fitted(view, (max_size, max_size)))
-
-
-def jpeg_uri(image: np.ndarray) -> str:
-    """data: address of (H, W, 3) uint8 RGB as JPEG."""
-    encoded = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
 def _size(view: View, max_size: int) -> tuple[int, int]:

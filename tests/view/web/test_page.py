@@ -23,11 +23,11 @@ from sc3d.geometry.cameras import View, look_at, pinhole_view, project, rays, un
 from sc3d.scene.scene import Scene
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.view.colors import STATES
-from sc3d.view.display_cloud import ShownCloud
-from sc3d.view.display_splats import ShownSplats
+from sc3d.view.display_cloud import DisplayCloud
+from sc3d.view.display_splats import DisplaySplats
 from sc3d.view.picking import Inspector
-from sc3d.view.viewpoints import aerial_view, frustum_depth, without_outliers
-from sc3d.view.web.orbit_camera import OrbitPose, field_of_view
+from sc3d.view.viewpoints import frustum_depth, overview, without_outliers
+from sc3d.view.web.orbit_camera import OrbitCamera, field_of_view
 from sc3d.view.web.photos import photo_pictures
 from tests.builders import CLASSES, ORIGIN, ground, inspector_of, labelled_scene, views
 
@@ -152,7 +152,7 @@ def opened(served: Visit) -> Iterator[Visit]:
     assert served.errors == []
 
 
-def in_canvas(page: object, pose: OrbitPose, fov: float | None = None) -> tuple[View, np.ndarray]:
+def in_canvas(page: object, pose: OrbitCamera, fov: float | None = None) -> tuple[View, np.ndarray]:
     """What the page shows when it looks from a pose of the viewer's frame: a view of the canvas' size, and
     (2,) its corner in the page, px.
     """
@@ -165,23 +165,23 @@ def in_canvas(page: object, pose: OrbitPose, fov: float | None = None) -> tuple[
     ), np.array([box["x"], box["y"]])
 
 
-def home_of(scene: Scene) -> tuple[OrbitPose, ShownCloud]:
+def home_of(scene: Scene) -> tuple[OrbitCamera, DisplayCloud]:
     """The pose that the page starts with, and the cloud in its frame."""
     centers = np.array([view.center for view in views()])
-    shown = ShownCloud.of(
+    display = DisplayCloud.from_cloud(
         inspector_of(scene).cloud, np.round(np.median(centers, axis=0)), scene.class_table()
     )
-    points = np.concatenate([without_outliers(shown.points.astype(np.float64)), centers - shown.origin])
-    return OrbitPose.from_view(aerial_view(points, (1600, 1000)), shown.middle, upright=True), shown
+    points = np.concatenate([without_outliers(display.points.astype(np.float64)), centers - display.origin])
+    return OrbitCamera.from_view(overview(points, (1600, 1000)), display.middle, upright=True), display
 
 
 def click_camera(page: object, scene: Scene, name: str) -> None:
     """Click into the pyramid of a photo's camera, seen from the pose that the page starts with."""
-    home, shown = home_of(scene)
-    local = [view.shifted(shown.origin) for view in scene.model.views]
+    home, display = home_of(scene)
+    local = [view.shifted(display.origin) for view in scene.model.views]
     window, corner = in_canvas(page, home)
     view = next(one for one in local if one.name == name)
-    target = view.center + 0.6 * frustum_depth(local, shown.points) * view.cam_from_world[2, :3]
+    target = view.center + 0.6 * frustum_depth(local, display.points) * view.cam_from_world[2, :3]
     page.mouse.click(*(corner + project(window, target[None])[0][0]))
 
 
@@ -209,10 +209,10 @@ def test_clicked_camera_shows_its_photo_and_mask_and_is_looked_through(scene, op
     for label, picture in (("photo", expected.photo), ("mask", expected.mask)):
         image = page.locator(f"img[alt={label}]")
         image.wait_for()
-        shown = decoded(base64.b64decode(image.get_attribute("src").split(",")[1])).astype(int)
+        drawn = decoded(base64.b64decode(image.get_attribute("src").split(",")[1])).astype(int)
         assert (
             image.evaluate("one => one.complete && one.naturalWidth") == view.width
-            and np.abs(shown - picture).mean() < 2
+            and np.abs(drawn - picture).mean() < 2
         )
     page.get_by_role("button", name="Through it").click()
     opened.wait_for(lambda: agreement(opened.picture, page, view) > 0.97, "what the photo's camera sees")
@@ -225,7 +225,7 @@ def agreement(picture: np.ndarray, page: object, view: View) -> float:
     the middle; 0 if there are few.
     """
     forward = view.cam_from_world[2, :3]
-    pose = OrbitPose(
+    pose = OrbitCamera(
         view.center, view.center + forward, -view.cam_from_world[1, :3], field_of_view(undistorted(view))[0]
     )
     window, corner = in_canvas(page, pose)
@@ -257,12 +257,12 @@ def test_drag_turns_around_the_scene(opened):
 
 def test_what_is_known_of_a_picked_point(scene, opened):
     page = opened.page
-    home, shown = home_of(scene)
+    home, display = home_of(scene)
     window, corner = in_canvas(page, home)
     cloud, points = inspector_of(scene).cloud, ground()
     for target in ([-2.03, -2.02, 0], [2.51, -1.02, 0]):
         page.keyboard.down("Control")
-        page.mouse.click(*(corner + project(window, ORIGIN + [target] - shown.origin)[0][0]))
+        page.mouse.click(*(corner + project(window, ORIGIN + [target] - display.origin)[0][0]))
         page.keyboard.up("Control")
         rows = page.locator("tr", has_text="position")
         opened.wait_for(
@@ -293,7 +293,7 @@ def position_in(rows: object) -> np.ndarray:
     return np.array([float(number) for number in re.findall(r"\d+\.\d+", rows.inner_text())])
 
 
-def two_layers() -> ShownSplats:
+def two_layers(table) -> DisplaySplats:
     """Splats of class 1 above splats of class 3, given front to back: drawn in that order, the ones below
     would cover the ones above.
     """
@@ -309,15 +309,19 @@ def two_layers() -> ShownSplats:
         torch.full((count,), 6.0),
         torch.zeros(count, 3),
     )
-    return ShownSplats(
-        gaussians, np.round(ORIGIN), np.repeat(np.uint8([1, 3]), x.size), np.ones(count, np.float32)
+    return DisplaySplats(
+        gaussians,
+        np.round(ORIGIN),
+        np.repeat(np.uint8([1, 3]), x.size),
+        np.ones(count, np.float32),
+        table,
     )
 
 
 def test_file_opens_from_disk_and_sorts_splats_by_depth(scene, browser, tmp_path):
     from sc3d.view.web.page import WebView, write_page
 
-    splats = two_layers()
+    splats = two_layers(scene.class_table())
     view = WebView(
         scene,
         Inspector(splats.centers(), scene.model.views, scene.class_table(), scene.mesh),

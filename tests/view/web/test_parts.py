@@ -27,10 +27,10 @@ from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.scene.class_table import parse_classes
 from sc3d.scene.scene import Scene
-from sc3d.view.display_cloud import ShownCloud
+from sc3d.view.display_cloud import DisplayCloud
 from sc3d.view.picking import PickedPoint
 from sc3d.view.web.layers import CameraLayer, CloudLayer, half_precision, node_name
-from sc3d.view.web.orbit_camera import OrbitPose, orientation
+from sc3d.view.web.orbit_camera import OrbitCamera, orientation
 from sc3d.view.web.panel import legend_html, point_html
 from sc3d.view.web.photos import overlay, photo_pictures, thumbnail
 from tests.builders import CLASSES, ORIGIN, inspector_of, labelled_scene, truth_mask, views
@@ -56,16 +56,16 @@ def layer_server() -> Iterator[object]:
 def test_pose_is_that_of_the_view():
     middle = np.array([2.0, 1.0, 0.0])
     view = pinhole_view("a", (400, 300), (500, 500, 200, 150), look_at(np.array([5.0, -30, 20]), middle))
-    pose = OrbitPose.from_view(view, middle, upright=True)
+    pose = OrbitCamera.from_view(view, middle, upright=True)
     assert (
         np.allclose(pose.position, [5, -30, 20])
         and np.allclose(pose.look_at, middle)
         and np.allclose(pose.up, [0, 0, 1])
     )
     assert np.isclose(np.tan(pose.fov / 2), 150 / 500)
-    assert OrbitPose.from_view(view, middle, upright=False).up @ [0, 0, 1] > 0.5  # the top of the photo
+    assert OrbitCamera.from_view(view, middle, upright=False).up @ [0, 0, 1] > 0.5  # the top of the photo
     down = pinhole_view("b", (400, 300), (500, 500, 200, 150), look_at(np.array([0.0, 0, 20]), np.zeros(3)))
-    assert np.allclose(OrbitPose.from_view(down, np.zeros(3), upright=True).up, [0, 1, 0])
+    assert np.allclose(OrbitCamera.from_view(down, np.zeros(3), upright=True).up, [0, 1, 0])
     turned = orientation(view)  # wxyz
     w, x, y, z = turned
     assert np.allclose(
@@ -108,14 +108,14 @@ def test_texts_are_escaped_and_paths_have_no_slash():
     assert "/" not in node_name(odd, 1) and node_name(None, 0) == "points"
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.zeros((2, 3))))
     cloud.point["label"] = o3d.core.Tensor(np.uint8([[1], [1]]))
-    legend = legend_html("label", ShownCloud.of(cloud, np.zeros(3), odd))
+    legend = legend_html("label", DisplayCloud.from_cloud(cloud, np.zeros(3), odd))
     assert "&lt;lawn&gt;" in legend and "<lawn>" not in legend and "rgb(1,2,3)" in legend
 
 
 def test_layers_send_each_point_once_in_its_class(scene):
-    shown = ShownCloud.of(inspector_of(scene).cloud, np.round(ORIGIN), scene.class_table())
+    display = DisplayCloud.from_cloud(inspector_of(scene).cloud, np.round(ORIGIN), scene.class_table())
     with layer_server() as server:
-        layer = CloudLayer(server, shown, "cloud", "label", hidden={3})
+        layer = CloudLayer(server, display, "cloud", "label", hidden={3})
         layer.show_points(10**9)
         sent = {
             name: handle
@@ -123,8 +123,8 @@ def test_layers_send_each_point_once_in_its_class(scene):
             if name.count("/") == 3
         }
         points = np.concatenate([handle.points for handle in sent.values()])
-        assert layer.count == len(points) == len(shown.points) and np.array_equal(
-            np.unique(points, axis=0), np.unique(shown.points, axis=0)
+        assert layer.count == len(points) == len(display.points) and np.array_equal(
+            np.unique(points, axis=0), np.unique(display.points, axis=0)
         )
         assert all((handle.colors == ROAD).all() == ("/road/" in name) for name, handle in sent.items())
         assert points.dtype == np.float32 and np.abs(points).max() < 20  # local, not UTM
@@ -142,10 +142,16 @@ def test_layers_send_each_point_once_in_its_class(scene):
 
 def test_fewer_points_are_a_thinner_cloud(scene, monkeypatch):
     monkeypatch.setattr("sc3d.view.display_cloud._SMALLEST_CHUNK", 500)
-    shown = ShownCloud.of(inspector_of(scene).cloud, np.round(ORIGIN), scene.class_table())
+    display = DisplayCloud.from_cloud(inspector_of(scene).cloud, np.round(ORIGIN), scene.class_table())
     with layer_server() as server:
-        layer = CloudLayer(server, shown, "cloud", "label")
-        for wanted, chunks in ((2000, 4), (500, 1), (0, 1), (1010, 2), (10**9, -(-len(shown.points) // 500))):
+        layer = CloudLayer(server, display, "cloud", "label")
+        for wanted, chunks in (
+            (2000, 4),
+            (500, 1),
+            (0, 1),
+            (1010, 2),
+            (10**9, -(-len(display.points) // 500)),
+        ):
             layer.show_points(wanted)
             nodes = [
                 handle for name, handle in server.scene._handle_from_node_name.items() if name.count("/") == 3
@@ -153,10 +159,10 @@ def test_fewer_points_are_a_thinner_cloud(scene, monkeypatch):
             assert (
                 sum(len(handle.points) for handle in nodes)
                 == layer.count
-                == min(500 * chunks, len(shown.points))
+                == min(500 * chunks, len(display.points))
             )
             assert len({handle.point_size for handle in nodes}) == 1 and np.isclose(
-                nodes[0].point_size, 0.9 * shown.spacing_at(layer.count)
+                nodes[0].point_size, 0.9 * display.spacing_at(layer.count)
             )
 
 

@@ -9,8 +9,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
-from sc3d.geometry.voxels import BLOCK
+from sc3d.geometry.voxels import file_header
 from sc3d.io.atomic import atomic_path
 from sc3d.tiling.store import Results
 
@@ -38,12 +39,7 @@ def write_field(results: Results, tiles: list[int], voxel_size: float, path: Pat
             _sorted(results, tiles, owner[order], row[order], shape),
         )
         _array(archive, "key", joined.shape, np.int32, [joined[order]])
-        for name, value in (
-            ("attr_name_votes", np.zeros(1, np.int32)),
-            ("CPU:0", np.uint8(0)),
-            ("block_resolution", np.array([BLOCK], np.int64)),
-            ("voxel_size", np.array([voxel_size], np.float32)),
-        ):
+        for name, value in file_header(voxel_size).items():
             _array(archive, name, value.shape, value.dtype, [value])
 
 
@@ -63,7 +59,11 @@ def _sorted(
 
 
 def _array(
-    archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: type, parts: Iterable[np.ndarray]
+    archive: zipfile.ZipFile,
+    name: str,
+    shape: tuple[int, ...],
+    dtype: npt.DTypeLike,
+    parts: Iterable[np.ndarray],
 ) -> None:
     # without a date, so that equal fields are equal files
     with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as file:

@@ -11,7 +11,7 @@ import numpy as np
 
 from sc3d.geometry.graph import Graph, build_graph
 from sc3d.io.chunked_clouds import columns, positions
-from sc3d.labelling.fusion import Extent
+from sc3d.labelling.cloud import CloudExtent
 from sc3d.propagation.appearance import (
     COLOR_BINS,
     COLOR_BLUR,
@@ -20,7 +20,7 @@ from sc3d.propagation.appearance import (
     AppearanceModel,
     Histogram,
 )
-from sc3d.propagation.propagate import LabelledPoints, tie_breakers
+from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
 from sc3d.propagation.terrain import NUM_FEATURES
 from sc3d.scene.labelled_cloud import VOTES
 from sc3d.scene.labels import Labels
@@ -39,7 +39,7 @@ class PropagateJob:
     """
 
     settings: Propagate
-    extent: Extent
+    extent: CloudExtent
     store: TileStore
     results: Results
     margin: float
@@ -56,7 +56,7 @@ class TileGraph:
     """A tile with its margin, in the canonical order of its graph. core: (N,) bool points of the tile itself"""
 
     tile: int
-    window: TileWithHalo
+    halo: TileWithHalo
     graph: Graph
     known: LabelledPoints
     core: np.ndarray
@@ -64,37 +64,37 @@ class TileGraph:
     @classmethod
     def load(cls, job: PropagateJob, tile: int) -> TileGraph:
         """The graph is built at the first time and kept in files, of which a pass reads what it looks at."""
-        window = job.store.window(tile, job.margin)
+        halo = job.store.with_halo(tile, job.margin)
         if not job.results.has(tile, f"part_{KNOWN[-1]}"):
-            _build(job, tile, window)
+            _build(job, tile, halo)
         graph, known = Graph(*_mapped(job, tile, GRAPH)), _mapped(job, tile, KNOWN)
         evidence = LabelledPoints(
             known[0], Labels(*known[2:-1]), known[1], known[-1] if job.colored else None
         )
-        return cls(tile, window, graph, evidence, window.core[graph.order])
+        return cls(tile, halo, graph, evidence, halo.core[graph.order])
 
     def own(self, values: np.ndarray) -> np.ndarray:
         """Values of the tile's own points, as `Results` keeps them, from values (N, ...) of the part."""
         result = np.empty_like(values)
         result[self.graph.order] = values
-        return result[self.window.core]
+        return result[self.halo.core]
 
     def around(self, job: PropagateJob, name: str) -> np.ndarray:
         """Values of all points of the part, from what their tiles keep."""
-        return job.results.around(self.window, name)[self.graph.order]
+        return job.results.around(self.halo, name)[self.graph.order]
 
     def own_in_order(self, values: np.ndarray) -> np.ndarray:
         """The opposite of `own`; 0 at the points of the margin."""
         result = np.zeros((len(self.core), *values.shape[1:]), values.dtype)
-        result[self.window.core] = values
+        result[self.halo.core] = values
         return result[self.graph.order]
 
     def appearance(self, job: PropagateJob) -> AppearanceModel:
         """Histogram cells of all points of the part."""
-        return raters_of(self.around(job, "cells"))
+        return appearance_of(self.around(job, "cells"))
 
 
-def raters_of(cells: np.ndarray) -> AppearanceModel:
+def appearance_of(cells: np.ndarray) -> AppearanceModel:
     """Raters from the cells (N, G) int32 that `cells_of` gives."""
     relief = Histogram(cells[:, -1], (RELIEF_BINS,) * NUM_FEATURES, RELIEF_BLUR)
     return AppearanceModel(
@@ -107,8 +107,8 @@ def cells_of(appearance: AppearanceModel) -> np.ndarray:
     return np.stack([group.cell for group in appearance.groups], axis=1)
 
 
-def _build(job: PropagateJob, tile: int, window: TileWithHalo) -> None:
-    evidence, normals = _evidence(job, window)
+def _build(job: PropagateJob, tile: int, halo: TileWithHalo) -> None:
+    evidence, normals = _evidence(job, halo)
     colors, box = evidence.colors if job.settings.color else None, (job.extent.low, job.extent.high)
     graph = build_graph(
         evidence.points, normals, job.settings.num_neighbors, colors, tie_breakers(evidence, normals), box
@@ -128,9 +128,9 @@ def _mapped(job: PropagateJob, tile: int, names: tuple[str, ...]) -> list[np.nda
     return [np.asarray(job.results.read(tile, f"part_{name}", mapped=True)) for name in names]
 
 
-def _evidence(job: PropagateJob, window: TileWithHalo) -> tuple[LabelledPoints, np.ndarray]:
+def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np.ndarray]:
     """What is known of the window's points, by row, and their normals."""
-    records = window.gather(job.store.records)
+    records = halo.gather(job.store.records)
     labels = Labels(
         *(
             records[name].astype(kind)

@@ -1,0 +1,42 @@
+"""Commands and options of the version before, accepted for one version with a warning."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import fields
+
+from sc3d.settings.labels import PaperMechanisms
+
+logger = logging.getLogger(__name__)
+
+MOVED = {  # commands that are tools of a checkout now
+    "benchmark": "python -m tools.benchmark",
+    "manual": "python tools/make_manual.py",
+}
+MECHANISMS = [field.name.replace("_", "-") for field in fields(PaperMechanisms)]
+OPTIONS = {
+    "--num-neighbours": "--num-neighbors",
+    "--train.num-neighbours": "--train.num-neighbors",
+    **{f"--label.{name}": f"--label.mechanisms.{name}" for name in MECHANISMS},
+    **{f"--label.no-{name}": f"--label.mechanisms.no-{name}" for name in MECHANISMS},
+}
+VALUES = {("--from", "centres"): "centers", ("--extract.from", "centres"): "centers"}
+
+
+def current(arguments: list[str]) -> list[str]:
+    """The arguments of a command as they are spelled now; underscores in options are hyphens, as everywhere."""
+    result: list[str] = []
+    for argument in arguments:
+        option, equals, value = argument.partition("=")
+        option = option.replace("_", "-") if option.startswith("--") else option
+        previous = result[-1].replace("_", "-") if result else ""
+        if equals:
+            new = f"{OPTIONS.get(option, option)}={VALUES.get((option, value), value)}"
+            changed = option in OPTIONS or (option, value) in VALUES
+        else:
+            new = OPTIONS.get(option, VALUES.get((previous, argument), argument))
+            changed = option in OPTIONS or (previous, argument) in VALUES
+        if changed:
+            logger.warning("%s is spelled %s now: the old spelling goes with the next version", argument, new)
+        result.append(new if changed else argument)
+    return result

@@ -1,0 +1,106 @@
+"""What is known of the points before labels spread: seeds, votes, colors; which of them can teach the classes' look."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sc3d.scene.labels import SEED, UNLOCKED, Labels
+
+# seeds to learn from: seen by so many views, this share of their votes
+AGREED_VIEWS, AGREED_SHARE = 3, 0.9
+MIN_EXAMPLES = 500  # agreed points of a class; with fewer, its look is not known
+
+
+@dataclass(frozen=True)
+class LabelledPoints:
+    """What is known of N points, canonical order.
+
+    points: (N, 3) world; seeds: labels of fusion; votes: (N, num_ids) float32 or None, column 0 is ignored;
+        colors: (N, 3) uint8 or None
+    """
+
+    points: np.ndarray
+    seeds: Labels
+    votes: np.ndarray | None
+    colors: np.ndarray | None
+
+    def ordered(self, order: np.ndarray) -> LabelledPoints:
+        return LabelledPoints(
+            self.points[order],
+            self.seeds[order],
+            *(None if part is None else part[order] for part in (self.votes, self.colors)),
+        )
+
+    @property
+    def known_votes(self) -> np.ndarray:
+        """(N, num_ids) float32 votes, where the method needs them; ValueError if there are none."""
+        if self.votes is None:
+            raise ValueError("these points have no votes, which the map method needs")
+        return self.votes
+
+    @property
+    def seed_labels(self) -> np.ndarray:
+        """(N,) uint8 labels of the seeds, 0 elsewhere."""
+        return np.where(np.isin(self.seeds.state, (SEED, UNLOCKED)), self.seeds.label, 0).astype(np.uint8)
+
+    @property
+    def sure(self) -> np.ndarray:
+        """(N,) bool seeds with hardly a vote against them."""
+        return (self.seeds.state == SEED) & (self.seed_labels > 0) & (self.seeds.confidence >= AGREED_SHARE)
+
+    def agreement(self, core: np.ndarray | None = None) -> np.ndarray:
+        """(AGREED_VIEWS, 256) int64: sure seeds of each class that at least 1, 2, ... views saw; core: (N,)
+        bool points to count, None = all.
+        """
+        sure, start = self.sure if core is None else self.sure & core, self.seed_labels
+        return np.stack(
+            [
+                np.bincount(start[sure & (self.seeds.num_views >= least)], minlength=256)
+                for least in range(1, AGREED_VIEWS + 1)
+            ]
+        )
+
+    def agreed_by(self, least: int) -> np.ndarray:
+        """(N,) bool sure seeds that at least so many views saw."""
+        return self.sure & (self.seeds.num_views >= least)
+
+    @property
+    def agreed(self) -> np.ndarray:
+        """(N,) bool seeds that many views agree on."""
+        return self.agreed_by(views_to_agree(self.agreement()))
+
+    @property
+    def num_classes(self) -> int:
+        return (int(self.seeds.label.max(initial=1)) + 1 if self.votes is None else self.votes.shape[1]) - 1
+
+
+def views_to_agree(agreement: np.ndarray) -> int:
+    """How many views must have seen an example: AGREED_VIEWS, or fewer, where some class would have too few
+    examples: to the appearance model it would not exist.
+
+    agreement: (AGREED_VIEWS, 256) of the whole cloud
+    """
+    wanted = agreement[0] >= MIN_EXAMPLES
+    return next(
+        (
+            least
+            for least in range(AGREED_VIEWS, 1, -1)
+            if (agreement[least - 1][wanted] >= MIN_EXAMPLES).all()
+        ),
+        1,
+    )
+
+
+def tie_breakers(evidence: LabelledPoints, normals: np.ndarray | None) -> tuple[np.ndarray, ...]:
+    """Arrays (N,) that tell points of equal position apart, for `build_graph`."""
+    seeds = evidence.seeds
+    tables = (part for part in (evidence.votes, evidence.colors, normals) if part is not None)
+    return (
+        seeds.label,
+        seeds.state,
+        seeds.num_views,
+        seeds.confidence,
+        *(column for table in tables for column in table.T),
+    )
