@@ -1,7 +1,7 @@
 """Gaussians in the PLY that 3DGS viewers read, as plain arrays.
 
-Columns: x y z, nx ny nz, f_dc (3), f_rest (0, 9, 24 or 45, color channel by color channel), opacity (a logit),
-scale (3 logarithms), rot (wxyz).
+Columns: x y z, nx ny nz, f_dc (3), f_rest (0, 9, 24 or 45, color channel by color channel), opacity (a
+logit), scale (3 logarithms), rot (wxyz).
 """
 
 from __future__ import annotations
