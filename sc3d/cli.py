@@ -41,7 +41,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 def start_logging() -> None:
     """Log to stderr, of other packages warnings only; `sc3d ... | head` ends quietly."""
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    if hasattr(signal, "SIGPIPE"):  # not on Windows
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     logging.basicConfig(format="%(message)s", stream=sys.stderr)
     for package in ("sc3d", "tools"):
         logging.getLogger(package).setLevel(logging.INFO)

@@ -20,7 +20,8 @@ ALPHA, BETA, GAMMA = 0.6, 0.4, 1.0  # eq. 7
 RADIUS = 3.0  # edges reach this many local point spacings
 SPACING_NEIGHBOR = 4  # the local spacing is the distance to this neighbor
 COLOR_WIDTH = 0.1  # standard deviation of colors on one surface, of 1
-MORTON_BITS = 10
+ORDER_BITS = 10  # per axis, of the curve that orders the points
+MORTON_BITS = 21  # per axis; three of them fit into 63 bits
 CHUNK = 200_000  # points whose neighbors are held twice at a time
 
 
@@ -120,7 +121,7 @@ def canonical_order(points: np.ndarray, ties: tuple[np.ndarray, ...] = ()) -> np
     """(N,) int64 rows along a Morton curve; within a cell by x, y, z, then by `ties`. points: (N, 3) float32
     in the unit cube.
     """
-    code = _morton((points * np.float32((1 << MORTON_BITS) - 1)).astype(np.int64))
+    code = morton_codes((points * np.float32((1 << ORDER_BITS) - 1)).astype(np.int64))
     keys = (points[:, 2], points[:, 1], points[:, 0], code)
     order = np.lexsort(keys)
     moved = points[order]
@@ -142,13 +143,25 @@ def similarity(
     )
 
 
-def _morton(cells: np.ndarray) -> np.ndarray:
-    """(N,) interleaved bits of (N, 3) integers of at most 21 bits."""
-    code = np.zeros(len(cells), np.int64)
-    for bit in range(MORTON_BITS):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return code
+def morton_codes(cells: np.ndarray) -> np.ndarray:
+    """(N,) uint64 interleaved bits of (N, 3) whole numbers of at most MORTON_BITS bits, the first of each three from the
+    first column: positions on a Z-order curve.
+    """
+    x, y, z = (_spread_bits(column) for column in cells.T.astype(np.uint64))
+    return x | y << np.uint64(1) | z << np.uint64(2)
+
+
+def _spread_bits(values: np.ndarray) -> np.ndarray:
+    """Two zero bits between any two of the 21 bits of (N,) uint64."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        values = (values | values << np.uint64(shift)) & np.uint64(mask)
+    return values
 
 
 def _others(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

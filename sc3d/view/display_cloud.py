@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.geometry.graph import MORTON_BITS, morton_codes
 from sc3d.io.clouds import read_cloud
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import VOTES, spacing_of
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
 _CHUNKS = 16  # steps in which points come and go; each is a node per class
 _SMALLEST_CHUNK = 20_000
-_BITS = 21  # of the Morton code per axis; three of them fit into 63 bits
 _SAMPLE = 50_000  # points from which the spacing is found
 
 
@@ -200,33 +200,19 @@ def progressive_order(points: np.ndarray) -> np.ndarray:
 
     points: (N, 3) finite; returns: (N,) int64, a permutation
     """
-    along_curve = np.argsort(morton_codes(points), kind="stable")
+    along_curve = np.argsort(curve_positions(points), kind="stable")
     return along_curve[_van_der_corput(len(points))]
 
 
-def morton_codes(points: np.ndarray) -> np.ndarray:
+def curve_positions(points: np.ndarray) -> np.ndarray:
     """(N,) uint64 position of (N, 3) points on the Z-order curve of the cube around them."""
     points = np.asarray(points, np.float64)
     if not len(points):
         return np.empty(0, np.uint64)
     low = points.min(axis=0)
     side = float((points.max(axis=0) - low).max()) or 1.0
-    cells = np.minimum((points - low) / side * (1 << _BITS), (1 << _BITS) - 1).astype(np.uint64)
-    x, y, z = (_spread(cells[:, axis]) for axis in range(3))
-    return x << np.uint64(2) | y << np.uint64(1) | z
-
-
-def _spread(values: np.ndarray) -> np.ndarray:
-    """Two zero bits between any two of the 21 bits of (N,) uint64."""
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        values = (values | values << np.uint64(shift)) & np.uint64(mask)
-    return values
+    steps = 1 << MORTON_BITS
+    return morton_codes(np.minimum((points - low) / side * steps, steps - 1).astype(np.uint64)[:, ::-1])
 
 
 def _van_der_corput(count: int) -> np.ndarray:
