@@ -80,14 +80,15 @@ def read_splat_ply(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
     Raises InputError for another file, and for values that cannot be rendered.
     """
     table, comments = _read_vertices(Path(path))
+    found = table.dtype.names or ()
 
     def columns(names: list[str]) -> np.ndarray:
-        missing = [name for name in names if name not in table.dtype.names]
+        missing = [name for name in names if name not in found]
         if missing:
             raise InputError(f"{path} is not a Gaussian splat PLY: property {missing[0]} is missing")
         return np.stack([table[name].astype(np.float32) for name in names], 1)
 
-    num_rest = sum(name.startswith("f_rest_") for name in table.dtype.names)
+    num_rest = sum(name.startswith("f_rest_") for name in found)
     if num_rest not in (0, 9, 24, 45):
         raise InputError(f"{path} has {num_rest} f_rest properties; 0, 9, 24 or 45 belong to degrees 0 to 3")
     arrays = {

@@ -79,7 +79,7 @@ def camera_array(view: View) -> np.ndarray:
 @lru_cache(maxsize=64)
 def interleaved(count: int) -> np.ndarray:
     """(count,) int64 permutation: 0, 16, 32, ..., 1, 17, ..."""
-    return np.concatenate([np.arange(first, count, _STREAMS, np.int64) for first in range(_STREAMS)])
+    return np.concatenate([np.arange(first, count, _STREAMS, dtype=np.int64) for first in range(_STREAMS)])
 
 
 def project_view(
