@@ -30,7 +30,7 @@ class Block:
         lies in the core of one block.
         """
         flat, width = np.asarray(points, np.float64)[:, self.axes], np.array(self.border) * border
-        return ((flat >= self.low - width) & (flat < self.high + width)).all(axis=1)
+        return np.all((flat >= self.low - width) & (flat < self.high + width), axis=1)
 
 
 def split_blocks(points: np.ndarray, count: int) -> list[Block]:
@@ -62,7 +62,7 @@ def _cut(flat: np.ndarray, count: int, block: Block) -> list[Block]:
     # many points at one place
     if min(left.sum() // first, (~left).sum() // (count - first)) < MIN_POINTS // 2:
         raise InputError("the sparse points cannot be cut into so many blocks: lower --blocks")
-    low, high = list(block.low), list(block.high)
-    low[axis] = high[axis] = place
-    lower, upper = replace(block, high=tuple(high)), replace(block, low=tuple(low))
+    other = block.low[1 - axis], block.high[1 - axis]
+    low, high = ((place, bound) if axis == 0 else (bound, place) for bound in other)
+    lower, upper = replace(block, high=high), replace(block, low=low)
     return _cut(flat[left], first, lower) + _cut(flat[~left], count - first, upper)

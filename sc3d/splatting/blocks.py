@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 import cv2
 import numba
@@ -42,7 +43,7 @@ from sc3d.tiling.executor import Executor
 SHARE = 0.05
 NEAREST = 5  # sparse points that say what a pixel shows
 CELL = 4  # px, side of the cells of which that is asked
-GPU = {"GPU": 1}  # what a worker must offer to get a block, with --device cuda
+GPU = {"GPU": 1.0}  # what a worker must offer to get a block, with --device cuda
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ def train_blocks(job: BlockJob, data: TrainingData, tasks: Executor) -> tuple[Tr
     job.folder.mkdir(exist_ok=True)
     tasks.run("blocks", partial(train_block, job), indices, GPU if job.settings.device == "cuda" else None)
     parts = [Gaussians.from_arrays(read_splat_ply(job.file(index, "ply"))[0]) for index in indices]
-    records = [read_json(job.file(index, "json")) for index in indices]
+    records = [cast(dict[str, Any], read_json(job.file(index, "json"))) for index in indices]
     gaussians = merge(parts, list(job.blocks))
     exposures, counts = np.zeros((len(data.views), 2)), np.zeros((len(data.views), 1))
     for record in records:

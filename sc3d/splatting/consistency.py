@@ -43,7 +43,8 @@ def relative_pose(view: View, other: View, device: torch.device | str = "cpu") -
     """(3, 3) and (3,) float32 of other_from_view between the camera frames; composed in float64."""
     rotation = other.cam_from_world[:3, :3] @ view.cam_from_world[:3, :3].T
     translation = other.cam_from_world[:3, 3] - rotation @ view.cam_from_world[:3, 3]
-    return tuple(torch.from_numpy(part.astype(np.float32)).to(device) for part in (rotation, translation))
+    parts = [torch.from_numpy(part.astype(np.float32)).to(device) for part in (rotation, translation)]
+    return parts[0], parts[1]
 
 
 def sample(image: Tensor, pixels: Tensor) -> Tensor:

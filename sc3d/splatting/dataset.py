@@ -42,11 +42,12 @@ class TrainingData:
 
     def image(self, index: int) -> np.ndarray:
         """(H, W, 3) uint8 photo of a view. Raises InputError if its size is not the view's."""
-        return self._checked(_item(self.images, index), index, "image")
+        image = self.images(index) if callable(self.images) else self.images[index]
+        return self._checked(image, index, "image")
 
     def mask(self, index: int) -> np.ndarray | None:
         """(H, W) bool mask of a view, if there is one. Raises InputError if its size is not the view's."""
-        mask = _item(self.masks, index)
+        mask = self._raw_mask(index)
         return None if mask is None else self._checked(mask, index, "mask").astype(bool)
 
     def photo(
@@ -61,18 +62,18 @@ class TrainingData:
                 mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
         # plane by plane, as `render` stores images
         planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).float() / 255
-        image = planes.permute(1, 2, 0).to(device)
-        return view, image, None if mask is None else torch.from_numpy(mask).to(device)
+        target = planes.permute(1, 2, 0).to(device)
+        return view, target, None if mask is None else torch.from_numpy(mask).to(device)
 
     def subset(self, indices: list[int]) -> TrainingData:
         """The same points with some of the views, renumbered from 0."""
         return TrainingData(
             [self.views[index] for index in indices],
-            lambda row: _item(self.images, indices[row]),
+            lambda row: self.image(indices[row]),
             self.points,
             self.colors,
             None if self.tracks is None else [self.tracks[index] for index in indices],
-            lambda row: _item(self.masks, indices[row]),
+            lambda row: self._raw_mask(indices[row]),
         )
 
     def seen(self, index: int) -> np.ndarray:
@@ -82,6 +83,11 @@ class TrainingData:
         pixels, depths = project(self.views[index], np.asarray(self.points, np.float64))
         return np.nonzero(in_image(self.views[index], pixels) & (depths > 0))[0]
 
+    def _raw_mask(self, index: int) -> np.ndarray | None:
+        if self.masks is None:
+            return None
+        return self.masks(index) if callable(self.masks) else self.masks[index]
+
     def _checked(self, array: np.ndarray, index: int, what: str) -> np.ndarray:
         view, (height, width) = self.views[index], array.shape[:2]
         if (height, width) != (view.height, view.width):
@@ -89,12 +95,6 @@ class TrainingData:
                 f"{what} of {view.name} is {width}x{height}, its view {view.width}x{view.height}"
             )
         return array
-
-
-def _item(source: Sequence | Callable | None, index: int) -> np.ndarray | None:
-    if source is None:
-        return None
-    return source(index) if callable(source) else source[index]
 
 
 def scene_data(scene: Scene, settings: TrainSettings) -> tuple[TrainingData, np.ndarray]:

@@ -63,8 +63,10 @@ def compare(
     target = torch.from_numpy(np.ascontiguousarray(photo)).float() / 255
     used = torch.ones(photo.shape[:2], dtype=torch.bool) if mask is None else torch.from_numpy(mask)
     if exposure is None:
-        exposure = losses.fit_exposure(image[used], target[used])
-    image = losses.apply_exposure(image, torch.as_tensor(exposure, dtype=torch.float32))
+        fitted = losses.fit_exposure(image[used], target[used])
+    else:
+        fitted = torch.as_tensor(exposure, dtype=torch.float32)
+    image = losses.apply_exposure(image, fitted)
     depth, _, normals_cam = depth_map(gaussians, view)
     normals = normals_cam @ view.cam_from_world[:3, :3].astype(np.float32)
     return Comparison(view.name, photo, _as_uint8(image), depth, normals, psnr(image[used], target[used]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ class Gaussians:
     quats: (N, 4) wxyz rotations world_from_gaussian, not necessarily normalized
     opacity_logits: (N,)
     sh_dc: (N, 3) spherical harmonic Y_0 of each color channel
-    sh_rest: (N, K - 1, 3) the others, K = 1, 4, 9, 16; None = none
+    sh_rest: (N, K - 1, 3) the others, K = 1, 4, 9, 16; none unless given
     color = 0.5 + Y_0 sh_dc + sum_k Y_k(direction) sh_rest_k, direction from the camera to the mean
     """
 
@@ -33,10 +33,10 @@ class Gaussians:
     quats: torch.Tensor
     opacity_logits: torch.Tensor
     sh_dc: torch.Tensor
-    sh_rest: torch.Tensor = None
+    sh_rest: torch.Tensor = field(default_factory=lambda: torch.zeros(0, 0, 3))
 
     def __post_init__(self) -> None:
-        if self.sh_rest is None:
+        if len(self.sh_rest) < len(self.sh_dc):
             self.sh_rest = self.sh_dc.new_zeros(len(self.sh_dc), 0, 3)
 
     def __len__(self) -> int:
@@ -153,8 +153,8 @@ class Gaussians:
         values = torch.from_numpy(np.ascontiguousarray(colors, np.float32)).to(self.means)
         return Gaussians(self.means, self.log_scales, self.quats, self.opacity_logits, (values - 0.5) / SH_C0)
 
-    def __getitem__(self, chosen: torch.Tensor | np.ndarray) -> Gaussians:
-        """The Gaussians of an index or bool tensor."""
+    def __getitem__(self, chosen: torch.Tensor | np.ndarray | slice) -> Gaussians:
+        """The Gaussians of an index or bool tensor, or a slice."""
         return Gaussians(**{name: tensor[chosen] for name, tensor in self.parameters().items()})
 
 
@@ -168,7 +168,6 @@ def _first_axis_along(directions: np.ndarray) -> torch.Tensor:
     """(N, 4) wxyz quaternions that turn (1, 0, 0) into the (N, 3) unit directions or their opposites, by at
     most 90 degrees.
     """
-    directions = torch.from_numpy(np.where(directions[:, :1] < 0, -directions, directions)).float()
-    x, y, z = directions.unbind(1)
+    x, y, z = torch.from_numpy(np.where(directions[:, :1] < 0, -directions, directions)).float().unbind(1)
     # Half-way rotation: w = 1 + cos(angle), vector = (1, 0, 0) x direction.
     return torch.nn.functional.normalize(torch.stack([1 + x, torch.zeros_like(x), -z, y], 1), dim=1)

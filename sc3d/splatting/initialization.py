@@ -134,8 +134,8 @@ def _sweep(
         for other in others:
             cost, inside = losses.patch_dissimilarity((normals, distances), pixels, own, other)
             costs.append(torch.where(inside, cost, 2.0))
-        cost = torch.stack(costs).sort(0).values[:2].mean(0).numpy()
-        cost = cost[around].mean(axis=1)  # leaves in the wind: one patch says little
-        better = cost < best_cost
-        best_cost[better], best_depth[better] = cost[better], plane_depth(plane, rays)[better]
+        best_two = torch.stack(costs).sort(0).values[:2].mean(0).numpy()
+        averaged = best_two[around].mean(axis=1)  # leaves in the wind: one patch says little
+        better = averaged < best_cost
+        best_cost[better], best_depth[better] = averaged[better], plane_depth(plane, rays)[better]
     return best_depth, best_cost

@@ -69,8 +69,8 @@ def evidence_by_gradient(
         dc = gray.sh_dc.clone().requires_grad_()
         image = render(replace(gray, sh_dc=dc), view, 0, geometry=False).color
         shown = torch.stack([(target == label) * weight for label in range(first, first + 3)], dim=2)
-        (image * shown.to(image)).sum().backward()
-        part = dc.grad.cpu().numpy().astype(np.float64) / SH_C0
+        (gradient,) = torch.autograd.grad((image * shown.to(image)).sum(), dc)
+        part = gradient.cpu().numpy().astype(np.float64) / SH_C0
         evidence[:, first : first + 3] = part[:, : num_ids - first]
     return evidence
 

@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 from torch import Tensor
 
 
-@dataclass
-class ViewStatistics:
-    """What one view tells about each Gaussian, for densification and pruning; no gradients.
+class ViewStatistics(Protocol):
+    """What one view tells about each Gaussian, (N,) float32, for densification and pruning; no gradients."""
 
-    weight: (N,) float32 sum over pixels of w_i; after forward
-    max_transmittance: (N,) float32 largest transmittance in front of any of its fragments, 0 = never hit;
-        after forward
-    gradient: (N,) float32 |d loss / d mean2d| in normalized device units: pixel gradient times (W / 2, H /
-        2); zero until backward
-    absolute_gradient: (N,) float32 the same from sums of absolute per-pixel gradients (AbsGS); zero until
-        backward
-    """
+    @property
+    def weight(self) -> Tensor:
+        """Sum over pixels of w_i."""
 
-    weight: Tensor
-    max_transmittance: Tensor
-    gradient: Tensor
-    absolute_gradient: Tensor
+    @property
+    def max_transmittance(self) -> Tensor:
+        """Largest transmittance in front of any of its fragments, 0 = never hit."""
+
+    @property
+    def gradient(self) -> Tensor:
+        """|d loss / d mean2d| in normalized device units: pixel gradient times (W / 2, H / 2); zero until
+        backward.
+        """
+
+    @property
+    def absolute_gradient(self) -> Tensor:
+        """The same from sums of absolute per-pixel gradients (AbsGS)."""
 
 
 @dataclass

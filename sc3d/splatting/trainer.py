@@ -68,7 +68,6 @@ def train(
     trainer = Trainer(data, settings)
     if checkpoint is not None and checkpoint.is_file():
         trainer.resume(checkpoint)
-    saves = settings.checkpoint_every if checkpoint is not None else 0
     hidden = None if progress else True
     with tqdm(
         total=settings.iterations, initial=trainer.iteration, disable=hidden, unit="it", desc="train"
@@ -79,7 +78,8 @@ def train(
             if row is not None:
                 loss, quality = f"{row['loss']:.4f}", f"{row['psnr']:.2f}"
                 bar.set_postfix(loss=loss, psnr=quality, gaussians=row["num_gaussians"])
-            if saves and trainer.iteration % saves == 0:
+            saves = settings.checkpoint_every
+            if checkpoint is not None and saves and trainer.iteration % saves == 0:
                 trainer.save(checkpoint)
     gaussians = trainer.gaussians.detached().to("cpu")
     scores = held_out_scores(trainer.gaussians, data, settings)
@@ -113,7 +113,9 @@ class Trainer:
         self.exposure_optimizer = torch.optim.SparseAdam([self.exposures], EXPOSURE_RATE, eps=1e-15)
         self.num_initial = len(gaussians)
         self.statistics = Statistics.zeros(self.num_initial, self.device)
-        self.iteration, self.queue, self.depths = 0, [], {}
+        self.iteration = 0
+        self.queue: list[int] = []
+        self.depths: dict[int, torch.Tensor] = {}
         self.log: list[dict[str, float]] = []
         self._recent: list[tuple[float, float]] = []
         self._seconds, self._started = 0.0, time.perf_counter()

@@ -7,7 +7,8 @@ import torch
 from torch.optim import Adam
 
 from sc3d.splatting import strategy
-from sc3d.splatting.rendered_view import Rendering, ViewStatistics
+from sc3d.splatting.cpu.backend import KernelStatistics
+from sc3d.splatting.rendered_view import Rendering
 from sc3d.splatting.strategy import MOMENTS, DensifyLimits, Statistics, current_gaussians
 from tests.splatting.test_gaussians import random_gaussians
 
@@ -127,8 +128,8 @@ def test_trim_drops_what_is_hidden_or_floats():
         ([3, 3, 3, 0, 3], [0.9, 0.2, 0.3, 0, 0.4]),
         ([3, 3, 3, 0, 0], [0] * 5),
     ):
-        view = ViewStatistics(*torch.zeros(4, 5))
-        view.max_transmittance = torch.tensor(transmittance).float()
+        nothing = torch.zeros(5)
+        view = KernelStatistics(nothing, torch.tensor(transmittance).float(), nothing, nothing)
         statistics.add(Rendering(*[None] * 4, torch.tensor(radius).float(), view))
     kept = current_gaussians(optimizer).means[[0, 3, 4]].detach().clone()
     strategy.prune_unseen(optimizer, statistics)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from sc3d.splatting.cpu.projection import RECORD, GaussianArrays, camera_array, 
 from sc3d.splatting.cpu.rasterization_backward import ImageGradients
 from sc3d.splatting.cpu.tile_binning import TileLists
 from sc3d.splatting.gaussians import Gaussians
-from sc3d.splatting.rendered_view import Rendering, ViewStatistics
+from sc3d.splatting.rendered_view import Rendering
 
 
 def render_cpu(
@@ -34,6 +34,16 @@ def render_cpu(
     return Rendering(color, alpha, normal, plane_distance, frame.radii, frame.statistics)
 
 
+@dataclass(frozen=True)
+class KernelStatistics:
+    """`ViewStatistics` that the kernels fill."""
+
+    weight: Tensor
+    max_transmittance: Tensor
+    gradient: Tensor
+    absolute_gradient: Tensor
+
+
 @dataclass
 class _Frame:
     """What a view is rendered with; `forward` adds what `backward` and the caller need."""
@@ -42,10 +52,10 @@ class _Frame:
     degree: int
     geometry: bool
     background: np.ndarray
-    tiles: TileLists = None
-    image: np.ndarray = None
-    radii: Tensor = None
-    statistics: ViewStatistics = None
+    tiles: TileLists = field(init=False)
+    image: np.ndarray = field(init=False)
+    radii: Tensor = field(init=False)
+    statistics: KernelStatistics = field(init=False)
 
 
 class _Render(torch.autograd.Function):
@@ -58,7 +68,7 @@ class _Render(torch.autograd.Function):
         frame.image = np.empty((rasterization.CHANNELS, height, width), np.float32)
         contributions = np.zeros((len(tiles.ranks), 2), np.float32)
         rasterization.rasterize(tiles, frame.background, frame.geometry, frame.image, contributions)
-        statistics = ViewStatistics(*torch.zeros(4, len(radii)))
+        statistics = KernelStatistics(*torch.zeros(4, len(radii)))
         rasterization.collect_contributions(
             tiles, contributions, statistics.weight.numpy(), statistics.max_transmittance.numpy()
         )

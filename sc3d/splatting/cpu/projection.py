@@ -79,7 +79,7 @@ def camera_array(view: View) -> np.ndarray:
 @lru_cache(maxsize=64)
 def interleaved(count: int) -> np.ndarray:
     """(count,) int64 permutation: 0, 16, 32, ..., 1, 17, ..."""
-    return np.concatenate([np.arange(first, count, _STREAMS, np.int64) for first in range(_STREAMS)])
+    return np.concatenate([np.arange(first, count, _STREAMS, dtype=np.int64) for first in range(_STREAMS)])
 
 
 def project_view(
@@ -236,10 +236,10 @@ def _touches(center, half, size):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _color(gaussians, degree, i, basis, channel):
-    value = 0.5 + basis[0] * gaussians.sh_dc[i, channel]
+def _color(sh_dc, sh_rest, degree, i, basis, channel):
+    value = 0.5 + basis[0] * sh_dc[i, channel]
     for k in range(1, (degree + 1) * (degree + 1)):
-        value += basis[k] * gaussians.sh_rest[i, k - 1, channel]
+        value += basis[k] * sh_rest[i, k - 1, channel]
     return value
 
 
@@ -307,7 +307,7 @@ def _project_one(i, gaussians, degree, camera, scratch, records):
     )
     records[i, 6], records[i, 7], records[i, 15] = half_x, half_y, half_x * sxy / sxx
     for k in range(3):
-        records[i, 8 + k] = max(_color(gaussians, degree, i, basis, k), 0.0)
+        records[i, 8 + k] = max(_color(gaussians.sh_dc, gaussians.sh_rest, degree, i, basis, k), 0.0)
         records[i, 11 + k] = sign * axes[k, axis]
     records[i, 14] = abs(facing)
     middle = 0.5 * (sxx + syy)

@@ -49,7 +49,8 @@ def _color_gradient(i, sums, gaussians, degree, camera, basis, slopes, gradients
     """Gradient of the SH coefficients, and of the mean through the viewing direction. Channels clamped at 0
     have none.
     """
-    means, rest = gaussians.means, gaussians.sh_rest
+    means, dc, rest = gaussians.means, gaussians.sh_dc, gaussians.sh_rest
+    grad_means, grad_dc, grad_rest = gradients.means, gradients.sh_dc, gradients.sh_rest
     dx, dy, dz = means[i, 0] - camera[18], means[i, 1] - camera[19], means[i, 2] - camera[20]
     distance = math.sqrt(dx * dx + dy * dy + dz * dz)
     dx, dy, dz = dx / distance, dy / distance, dz / distance
@@ -58,18 +59,18 @@ def _color_gradient(i, sums, gaussians, degree, camera, basis, slopes, gradients
     gx, gy, gz = 0.0, 0.0, 0.0
     for channel in range(3):
         gradient = sums[8 + channel]
-        if _color(gaussians, degree, i, basis, channel) < 0.0:
+        if _color(dc, rest, degree, i, basis, channel) < 0.0:
             continue
-        gradients.sh_dc[i, channel] = gradient * basis[0]
+        grad_dc[i, channel] = gradient * basis[0]
         for k in range(1, (degree + 1) * (degree + 1)):
-            gradients.sh_rest[i, k - 1, channel] = gradient * basis[k]
+            grad_rest[i, k - 1, channel] = gradient * basis[k]
             gx += gradient * rest[i, k - 1, channel] * slopes[k, 0]
             gy += gradient * rest[i, k - 1, channel] * slopes[k, 1]
             gz += gradient * rest[i, k - 1, channel] * slopes[k, 2]
     along = gx * dx + gy * dy + gz * dz
-    gradients.means[i, 0] += (gx - along * dx) / distance
-    gradients.means[i, 1] += (gy - along * dy) / distance
-    gradients.means[i, 2] += (gz - along * dz) / distance
+    grad_means[i, 0] += (gx - along * dx) / distance
+    grad_means[i, 1] += (gy - along * dy) / distance
+    grad_means[i, 2] += (gz - along * dz) / distance
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -25,7 +25,7 @@ from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import View
 from sc3d.splatting.device import INSTALL
 from sc3d.splatting.gaussians import Gaussians
-from sc3d.splatting.rendered_view import Rendering, ViewStatistics
+from sc3d.splatting.rendered_view import Rendering
 
 TILE = 16
 NEAR = 0.01
@@ -101,7 +101,7 @@ class _Screen:
         return *self.size, TILE, self.offsets, self.ids
 
 
-class GsplatStatistics(ViewStatistics):
+class GsplatStatistics:
     """`ViewStatistics` computed when asked for: listing all fragments costs about as much as the rendering
     itself, and only training needs it.
 
