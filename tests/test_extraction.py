@@ -8,9 +8,8 @@ import torch
 
 from sc3d.errors import Sc3dError
 from sc3d.extraction import DepthViews, center_cloud, extract_surface, wanted_coverage
-from sc3d.geometry.cameras import look_at, pinhole_view, rays
+from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.settings.reconstruction import Extract
-from sc3d.splatting.consistency import blocking
 from sc3d.splatting.gaussians import Gaussians
 
 STEP = 0.1
@@ -80,20 +79,6 @@ def test_centers_with_colors_and_normals_towards_the_cameras():
     assert np.abs(cloud.point.colors.numpy().astype(int) - [200, 120, 40]).max() <= 1
     with pytest.raises(Sc3dError, match="min-opacity"):
         center_cloud(gaussians, np.zeros((1, 3)), 0.99)
-
-
-def test_a_point_before_a_surface_that_others_see_is_blocked():
-    view, *others = views()[:3]
-    flat = []
-    for each in (view, *others):  # depth of the plane z = 0
-        directions, along = rays(each)
-        flat.append(np.float32(-each.center[2] / directions[:, 2] * along).reshape(120, 160))
-    sure = list(zip(flat[1:], others, strict=True))
-    on_plane = blocking(flat[0], view, sure, 0.03)
-    floating = blocking(0.8 * flat[0], view, sure, 0.03)
-    assert on_plane.max() == 0
-    assert (floating[40:80, 60:100] == 2).all()
-    assert blocking(0.8 * flat[0], view, [(np.zeros_like(flat[1]), others[0])], 0.03).max() == 0
 
 
 def test_only_flights_that_look_one_way_are_filled_without_limit():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sc3d.errors import InputError
@@ -11,6 +12,8 @@ from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import ViewCommand
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from sc3d.geometry.cameras import View
 
 logger = logging.getLogger(__name__)
@@ -23,11 +26,12 @@ def main(command: ViewCommand) -> None:
     views = scene.model.views if scene.sparse.is_dir() else []
     photo = None if command.photo is None else _find_photo(command.photo, views, scene)
     if command.flight is not None:
-        _write_flight(command, scene)
+        _write_flight(command, scene, command.flight)
     if command.web or command.html is not None:
         _show_page(command, scene, views)
     elif command.screenshot is not None:
-        _write_picture(command, scene, views, photo)
+        write_image(command.screenshot, _picture(command, scene, views, photo))
+        logger.info("wrote %s", command.screenshot)
     elif command.flight is None:
         _open_window(command, scene, views)
 
@@ -70,17 +74,18 @@ def _find_photo(name: str, views: list[View], scene: Scene) -> View:
     return photo
 
 
-def _write_flight(command: ViewCommand, scene: Scene) -> None:
+def _write_flight(command: ViewCommand, scene: Scene, path: Path) -> None:
     from sc3d.view.display_splats import splats_colored_by
     from sc3d.view.flight_video import write_flight
 
     by = command.by if command.splats else "photo"
     splats = splats_colored_by(scene, by, command.classes)
-    write_flight(command.flight, splats, by, scene.model.views, command.size)
-    logger.info("wrote %s", command.flight)
+    write_flight(path, splats, by, scene.model.views, command.size)
+    logger.info("wrote %s", path)
 
 
-def _write_picture(command: ViewCommand, scene: Scene, views: list[View], photo: View | None) -> None:
+def _picture(command: ViewCommand, scene: Scene, views: list[View], photo: View | None) -> np.ndarray:
+    """(H, W, 3) uint8 RGB"""
     from sc3d.view.display_cloud import class_ids, load_cloud, only_classes
     from sc3d.view.display_splats import splats_colored_by
     from sc3d.view.screenshot import Style, screenshot, screenshot_splats
@@ -90,14 +95,11 @@ def _write_picture(command: ViewCommand, scene: Scene, views: list[View], photo:
     if command.splats:
         splats = splats_colored_by(scene, command.by, command.classes)
         pixels = None if photo is None else read_image(scene.photo(photo.name))
-        image = screenshot_splats(splats, photo, pixels, command.size, style)
-    else:
-        table = scene.class_table() if scene.classes.exists() else None
-        cloud = load_cloud(scene, command.file, votes=command.by == "disagreement")
-        cloud = only_classes(cloud, class_ids(table, command.classes))
-        image = screenshot(cloud, photo, command.size, style, table)
-    write_image(command.screenshot, image)
-    logger.info("wrote %s", command.screenshot)
+        return screenshot_splats(splats, photo, pixels, command.size, style)
+    table = scene.class_table() if scene.classes.exists() else None
+    cloud = load_cloud(scene, command.file, votes=command.by == "disagreement")
+    cloud = only_classes(cloud, class_ids(table, command.classes))
+    return screenshot(cloud, photo, command.size, style, table)
 
 
 def _open_window(command: ViewCommand, scene: Scene, views: list[View]) -> None:
@@ -127,7 +129,7 @@ def _show_page(command: ViewCommand, scene: Scene, views: list[View]) -> None:
     splats_first = command.splats or not has_cloud
     splats = best_splats(scene) if splats_first else None
     votes = True if by == "disagreement" else None
-    cloud = load_cloud(scene, command.file, votes) if has_cloud else splats.centers()
+    cloud = load_cloud(scene, command.file, votes) if splats is None or has_cloud else splats.centers()
     inspector = Inspector.from_scene(scene, cloud, views)
     if splats_first and not can_color(cloud, by):
         by = "photo"

@@ -1,4 +1,4 @@
-"""The ground plane cut into blocks that share borders, so that what is large can be worked on block by block."""
+"""The ground plane cut into blocks that share borders, to work on what is large part by part."""
 
 from __future__ import annotations
 

@@ -37,9 +37,9 @@ class Similarity:
         return float(np.arccos(np.clip((np.trace(self.rotation) - 1) / 2, -1, 1)))
 
 
-# pycolmap 4.2 has `estimate_sim3d` and `estimate_sim3d_robust`. The former gives the same to 1e-15 and takes 2 us
-# for 20 points instead of 26; the robust one takes 1 ms for 60 photos instead of 24, once per model. Both
-# refuse points that lie exactly on a plane or a line, as the cameras of a flight at one height do.
+# pycolmap 4.2 has `estimate_sim3d`, which gives the same to 1e-15 in 2 us for 20 points instead of 26, and
+# `estimate_sim3d_robust`, 1 ms for 60 photos instead of 24, once per model. But both refuse points that lie
+# exactly on a plane or a line, as the cameras of a flight at one height may.
 def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     """Least-squares similarity from (N, 3) to (N, 3), N >= 3 (Umeyama 1991)."""
     share = np.full(len(source), 1 / len(source))
@@ -61,7 +61,7 @@ def fit_similarity_robust(
     (units of the target) and refits.
     returns: the similarity; (N,) bool, the pairs kept. Fewer than three may be left.
     """
-    fit, kept = fit_similarity(source, target), None
+    fit, kept = fit_similarity(source, target), np.zeros(len(source), bool)
     if len(source) > 3:
         fits = [fit_similarity(source[triple], target[triple]) for triple in _triples(len(source))]
         fit = min(
@@ -69,7 +69,7 @@ def fit_similarity_robust(
         )
     for _ in range(10):
         agreed = np.linalg.norm(fit.apply(source) - target, axis=1) <= max_error
-        if agreed.sum() < 3 or (kept is not None and (agreed == kept).all()):
+        if agreed.sum() < 3 or (agreed == kept).all():
             return fit, agreed
         fit, kept = fit_similarity(source[agreed], target[agreed]), agreed
     return fit, kept

@@ -15,10 +15,11 @@ Heights pass through unchanged (ellipsoidal as the GPS gives them; drones often 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -62,11 +63,6 @@ class Georeference:
     def crs(self) -> pyproj.CRS:
         return projected_crs(self.epsg)
 
-    @property
-    def wkt(self) -> str:
-        """OGC WKT 1, as LAS 1.4 wants it."""
-        return self.crs.to_wkt("WKT1_GDAL")
-
     @cached_property
     def unit(self) -> float:
         """Meters per unit of the CRS; heights have the same unit as eastings."""
@@ -83,7 +79,7 @@ class Georeference:
         local = np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         if self.origin is None:
             return local + self.offset + [0.0, 0.0, self.altitude_offset / self.unit]
-        return np.concatenate([self._project(part) for part in _chunks(local)])
+        return np.concatenate([self._project(part, self.origin) for part in _chunks(local)])
 
     def from_crs(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) easting, northing, height in the CRS to (N, 3) float64 world; the inverse of `to_crs`."""
@@ -91,27 +87,23 @@ class Georeference:
         if self.origin is None:
             local = points - self.offset - [0.0, 0.0, self.altitude_offset / self.unit]
         else:
-            local = np.concatenate([self._unproject(part) for part in _chunks(points)])
+            local = np.concatenate([self._unproject(part, self.origin) for part in _chunks(points)])
         matrix = np.asarray(self.local_from_world, np.float64)
         return np.linalg.solve(matrix[:3, :3], (local - matrix[:3, 3]).T).T
 
-    def enu_to_geodetic(self, enu: np.ndarray) -> np.ndarray:
-        """(N, 3) local ENU, m, to (N, 3) latitude, longitude (degrees), ellipsoidal height (m)."""
-        return enu_to_geodetic(enu, self.origin)
-
-    def _project(self, enu: np.ndarray) -> np.ndarray:
-        latitude, longitude, height = enu_to_geodetic(enu, self.origin).T
+    def _project(self, enu: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
+        latitude, longitude, height = enu_to_geodetic(enu, origin).T
         easting, northing = self._crs_from_geodetic.transform(longitude, latitude)
         return _require_finite(
             np.stack([easting, northing, (height + self.altitude_offset) / self.unit], axis=1), self.epsg
         )
 
-    def _unproject(self, points: np.ndarray) -> np.ndarray:
+    def _unproject(self, points: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
         longitude, latitude = self._crs_from_geodetic.transform(
             points[:, 0], points[:, 1], direction="INVERSE"
         )
         geodetic = np.stack([latitude, longitude, points[:, 2] * self.unit - self.altitude_offset], axis=1)
-        return geodetic_to_enu(_require_finite(geodetic, self.epsg), self.origin)
+        return geodetic_to_enu(_require_finite(geodetic, self.epsg), origin)
 
     @cached_property
     def _crs_from_geodetic(self) -> pyproj.Transformer:
@@ -127,12 +119,12 @@ def from_origin(
     """Georeference of a world in local ENU at `origin` (latitude, longitude, height); `epsg` None = the UTM
     zone there (WGS 84).
     """
-    origin = tuple(float(value) for value in origin)
+    origin = triple(origin)
     zone = epsg or utm_epsg(origin[0], origin[1])
     here = Georeference(zone, (0.0, 0.0, 0.0), origin, altitude_offset=altitude_offset).to_crs(
         np.zeros((1, 3))
     )[0]
-    offset = tuple(float(value) for value in np.round(here))
+    offset = triple(np.round(here))
     area = projected_crs(zone).area_of_use
     if area is not None and not (
         area.south <= origin[0] <= area.north and area.west <= origin[1] <= area.east
@@ -144,6 +136,12 @@ def from_origin(
             *origin[:2],
         )
     return Georeference(zone, offset, origin, altitude_offset=altitude_offset, figures=figures or {})
+
+
+def triple(values: Iterable[float]) -> tuple[float, float, float]:
+    """Three numbers as Python floats; ValueError for another count."""
+    first, second, third = values
+    return float(first), float(second), float(third)
 
 
 def with_epsg(georeference: Georeference, epsg: int | None) -> Georeference:
@@ -173,7 +171,11 @@ def read_georeference(scene: Scene) -> Georeference | None:
         return None
     content = read_json(path)
     try:
-        known = {name: content[name] for name in Georeference.__dataclass_fields__ if name in content}
+        if not isinstance(content, dict):
+            raise ValueError("it holds no object")
+        known: dict[str, Any] = {
+            name: content[name] for name in Georeference.__dataclass_fields__ if name in content
+        }
         for name in ("offset", "origin"):
             if known.get(name) is not None:
                 known[name] = _numbers(known[name], (3,))
@@ -264,7 +266,7 @@ def crs_to_geodetic(points: np.ndarray, crs: pyproj.CRS) -> np.ndarray:
 def _topocentric(origin: tuple[float, float, float]) -> pyproj.Transformer:
     import pyproj
 
-    latitude, longitude, height = (float(value) for value in origin)
+    latitude, longitude, height = triple(origin)
     return pyproj.Transformer.from_pipeline(
         f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0={height!r} "
         "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"

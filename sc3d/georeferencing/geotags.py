@@ -6,10 +6,11 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from sc3d.georeferencing.georeference import geodetic_to_enu
+from sc3d.georeferencing.georeference import geodetic_to_enu, triple
 from sc3d.io.images import open_image
 
 # m, of GPS that states none: what positions of one flight are worth against one another
@@ -112,7 +113,7 @@ def enu_positions(tags: dict[str, Geotag], origin: tuple[float, float, float]) -
 
 
 def _deviation(xmp: dict[str, float], horizontal_error: float) -> tuple[float, float, float] | None:
-    stated = tuple(xmp.get(name, 0.0) for name in ("RtkStdLon", "RtkStdLat", "RtkStdHgt"))
+    stated = triple(xmp.get(name, 0.0) for name in ("RtkStdLon", "RtkStdLat", "RtkStdHgt"))
     if all(value > 0 for value in stated):
         return stated
     if horizontal_error > 0:  # EXIF says nothing of the height, which GPS knows about half as well
@@ -120,7 +121,7 @@ def _deviation(xmp: dict[str, float], horizontal_error: float) -> tuple[float, f
     return None
 
 
-def _angle(parts: object, reference: object, negative: str) -> float:
+def _angle(parts: Any, reference: object, negative: str) -> float:
     """Degrees of (degrees, minutes, seconds); NaN if there is none."""
     try:
         degrees, minutes, seconds = (_number(part) for part in parts)
@@ -130,7 +131,7 @@ def _angle(parts: object, reference: object, negative: str) -> float:
     return -angle if str(reference).strip("\0 ").upper().startswith(negative) else angle
 
 
-def _number(value: object) -> float:
+def _number(value: Any) -> float:
     try:
         return float(value)
     except (TypeError, ValueError, ZeroDivisionError):

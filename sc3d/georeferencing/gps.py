@@ -22,6 +22,7 @@ from sc3d.georeferencing.georeference import (
     crs_to_geodetic,
     enu_to_geodetic,
     from_origin,
+    triple,
     utm_epsg,
 )
 from sc3d.georeferencing.geotags import Geotag, enu_positions, read_geotags
@@ -142,8 +143,8 @@ def residuals(flight: Flight, centers: dict[str, np.ndarray]) -> dict[str, float
 
 
 def georeference_photos(scene: Scene, epsg: int | None) -> Georeference:
-    """Georeference of a scene by the GPS of its photos; InputError if they are not there, or have none that fits
-    the cameras. epsg: None = the UTM zone
+    """Georeference of a scene by the GPS of its photos; InputError if they are not there, or have none that
+    fits the cameras. epsg: None = the UTM zone
     """
     views = [view for view in scene.model.views if scene.photo(view.name).is_file()]
     if not views:
@@ -175,9 +176,7 @@ def find_georeference(
     if fit is None:
         return None
     if abs(fit.scale - 1) < SAME_SCALE and fit.angle < SAME_ANGLE:
-        origin = tuple(
-            float(value) for value in enu_to_geodetic(fit.apply(np.zeros((1, 3))), flight.origin)[0]
-        )
+        origin = triple(enu_to_geodetic(fit.apply(np.zeros((1, 3))), flight.origin)[0])
         return from_origin(origin, epsg, figures={"gps": residuals(replace(flight, origin=origin), centers)})
     found = from_origin(
         flight.origin,

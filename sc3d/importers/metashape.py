@@ -1,11 +1,10 @@
 """Agisoft Metashape and PhotoScan: cameras exported as XML (File > Export > Export Cameras > Agisoft XML).
 
 A camera's `transform` is chunk from camera, axes as in COLMAP; the transform of its component (or of the
-chunk) is a similarity from there to
-geocentric coordinates, or to local ones without a CRS. Distortion (manual, appendix "Camera models"):
-    x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 xy        u = w/2 + cx + x' f + x' b1 +
-    y' b2
-    y' = y (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p2 (r2 + 2 y2) + 2 p1 xy        v = h/2 + cy + y' f
+chunk) is a similarity from there to geocentric coordinates, or to
+local ones without a CRS. Distortion (manual, appendix "Camera models"):
+    x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 xy    u = w/2 + cx + x' f + x' b1 + y' b2
+    y' = y (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p2 (r2 + 2 y2) + 2 p1 xy    v = h/2 + cy + y' f
 so p1 and p2 are OpenCV's p2 and p1. A fisheye has the angle from the axis in place of the radius.
 """
 
@@ -22,7 +21,13 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.georeferencing.alignment import Similarity, fit_similarity
-from sc3d.georeferencing.georeference import Georeference, crs_to_geodetic, from_origin, geodetic_to_enu
+from sc3d.georeferencing.georeference import (
+    Georeference,
+    crs_to_geodetic,
+    from_origin,
+    geodetic_to_enu,
+    triple,
+)
 from sc3d.importers.project import Project, rigid
 from sc3d.settings.reconstruction import Import
 
@@ -120,6 +125,8 @@ def _calibration(sensor: ElementTree.Element) -> ElementTree.Element | None:
 
 def _distortion_model(sensor: ElementTree.Element, path: Path) -> DistortionModel:
     where, calibration = f"{path}, sensor {sensor.get('label')!r}", _calibration(sensor)
+    if calibration is None:
+        raise InputError(f"{where} has no calibration")
     kind = calibration.get("type") or sensor.get("type", "frame")
     if kind != "frame" and kind not in FISHEYE:
         raise InputError(
@@ -128,10 +135,11 @@ def _distortion_model(sensor: ElementTree.Element, path: Path) -> DistortionMode
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     try:
-        width, height = int(resolution.get("width")), int(resolution.get("height"))
-        values = {child.tag: float(child.text) for child in calibration if child.tag in PARAMETERS}
+        size = {} if resolution is None else resolution.attrib
+        width, height = int(size["width"]), int(size["height"])
+        values = {child.tag: float(child.text or "") for child in calibration if child.tag in PARAMETERS}
         focal = values["f"] if "f" in values else values["fy"]
-    except (AttributeError, TypeError, ValueError, KeyError):
+    except (ValueError, KeyError):
         raise InputError(f"{where}: its calibration lacks size or focal length") from None
     if values.get("p3", 0) or values.get("p4", 0):
         raise InputError(
@@ -168,9 +176,9 @@ def _transforms(
         for component in chunk.iterfind("./components/component")
     }
     own = {
-        key: _similarity(components[key], path)
+        key: _similarity(transform, path)
         for key in dict.fromkeys(ids)
-        if components.get(key) is not None
+        if (transform := components.get(key)) is not None
     }
     if own:
         return own
@@ -184,18 +192,12 @@ def _similarity(transform: ElementTree.Element, path: Path) -> Similarity:
         matrix = _numbers(transform, 16, path).reshape(4, 4)
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
         return Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
-    rotation = (
-        np.eye(3)
-        if transform.find("rotation") is None
-        else _numbers(transform.find("rotation"), 9, path).reshape(3, 3)
+    rotation, translation, factor = (transform.find(name) for name in ("rotation", "translation", "scale"))
+    return Similarity(
+        1.0 if factor is None else float(_numbers(factor, 1, path)[0]),
+        np.eye(3) if rotation is None else _numbers(rotation, 9, path).reshape(3, 3),
+        np.zeros(3) if translation is None else _numbers(translation, 3, path),
     )
-    translation = (
-        np.zeros(3)
-        if transform.find("translation") is None
-        else _numbers(transform.find("translation"), 3, path)
-    )
-    scale = 1.0 if transform.find("scale") is None else float(_numbers(transform.find("scale"), 1, path)[0])
-    return Similarity(scale, rotation, translation)
 
 
 def _pose(camera: ElementTree.Element, world_from_chunk: Similarity, path: Path) -> np.ndarray:
@@ -209,7 +211,9 @@ def _pose(camera: ElementTree.Element, world_from_chunk: Similarity, path: Path)
     )
 
 
-def _numbers(element: ElementTree.Element, count: int, path: Path) -> np.ndarray:
+def _numbers(element: ElementTree.Element | None, count: int, path: Path) -> np.ndarray:
+    if element is None:
+        raise InputError(f"{path}: {count} finite numbers are expected and missing")
     try:
         values = np.array((element.text or "").replace(",", " ").split(), np.float64)
     except ValueError:
@@ -235,7 +239,7 @@ def _to_local(
     # points that show how one frame lies in the other
     frame = middle + 1000 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
     geodetic = _geodetic(frame, crs)
-    origin = tuple(round(float(value), digits) for value, digits in zip(geodetic[0], (6, 6, 0)))
+    origin = triple(round(float(value), digits) for value, digits in zip(geodetic[0], (6, 6, 0)))
     enu = fit_similarity(frame - middle, geodetic_to_enu(geodetic, origin))
     centers = enu.apply(np.array([view.center for view in views]) - middle)
     moved = [
@@ -255,17 +259,20 @@ def _crs(chunk: ElementTree.Element, path: Path) -> pyproj.CRS | None:
     except pyproj.exceptions.CRSError:
         raise InputError(f"{path}: its CRS cannot be understood: {text[:80]}") from None
     crs = crs.sub_crs_list[0] if crs.is_compound else crs
-    crs = crs.source_crs if crs.is_bound else crs
-    return pyproj.CRS.from_epsg(crs.to_epsg()) if crs.to_epsg() else crs
+    crs = crs.source_crs or crs if crs.is_bound else crs
+    epsg = crs.to_epsg()
+    return pyproj.CRS.from_epsg(epsg) if epsg else crs
 
 
 def _geodetic(points: np.ndarray, crs: pyproj.CRS) -> np.ndarray:
     """(N, 3) latitude, longitude, height on WGS 84 of geocentric coordinates on the datum of a CRS."""
     ellipsoid, geographic = crs.ellipsoid, crs.geodetic_crs
+    if ellipsoid is None:
+        raise InputError(f"{crs.name} has no ellipsoid, which places on Earth need")
     cart = pyproj.Transformer.from_pipeline(
         f"+proj=pipeline +step +inv +proj=cart +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r} +step +proj=unitconvert +xy_in=rad +xy_out=deg"
     )
     return crs_to_geodetic(
         np.stack(cart.transform(*points.T), axis=1),
-        geographic if geographic.is_geographic else pyproj.CRS.from_epsg(4326),
+        geographic if geographic is not None and geographic.is_geographic else pyproj.CRS.from_epsg(4326),
     )

@@ -2,11 +2,10 @@
 ODM's `coords.txt` for the place.
 
 Focal lengths and principal points are in units of the longer side of the photo, the latter from its middle;
-`rotation` is the axis-angle vector of
-cam from world. The world is local ENU at `reference_lla`. ODM keeps that as `reconstruction.topocentric.json`
-and writes `reconstruction.json` anew in
-UTM minus the offset of `odm_georeferencing/coords.txt`, with rotations that are then rounded to the nearest:
-the topocentric file is read if it is there.
+`rotation` is the axis-angle vector of cam from world. The world is local ENU at `reference_lla`. ODM keeps
+that as `reconstruction.topocentric.json` and writes `reconstruction.json` anew in UTM minus the offset of
+`odm_georeferencing/coords.txt`, with rotations that are then rounded to the nearest: the topocentric file is
+read if it is there.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.georeferencing.control_points import parse_crs
-from sc3d.georeferencing.georeference import Georeference, from_origin
-from sc3d.importers.project import Project, rigid
+from sc3d.georeferencing.georeference import Georeference, from_origin, triple
+from sc3d.importers.project import Project, require_found, rigid
 from sc3d.io.json_files import read_json
 from sc3d.settings.reconstruction import Import
 
@@ -50,7 +49,7 @@ def matches(path: Path) -> bool:
 
 
 def files(path: Path) -> list[Path]:
-    folder = _folder(path)
+    folder = require_found(_folder(path), path, EXPECTED)
     return [
         folder / FILE,
         folder / TOPOCENTRIC,
@@ -60,7 +59,7 @@ def files(path: Path) -> list[Path]:
 
 
 def read(path: Path, settings: Import) -> Project:
-    folder = _folder(path)
+    folder = require_found(_folder(path), path, EXPECTED)
     file = next(
         file
         for file in (path if path.is_file() else folder / TOPOCENTRIC, folder / TOPOCENTRIC, folder / FILE)
@@ -134,7 +133,7 @@ def _distortion_model(camera: dict, where: str) -> DistortionModel:
         )
         radial = tuple(float(camera.get(name, 0)) for name in (PERSPECTIVE | FISHEYE)[kind])
         tangential = (
-            tuple(float(camera.get(name, 0)) for name in ("p1", "p2"))
+            (float(camera.get("p1", 0)), float(camera.get("p2", 0)))
             if kind in ("brown", "fisheye62", "fisheye624")
             else (0.0, 0.0)
         )
@@ -148,7 +147,7 @@ def _distortion_model(camera: dict, where: str) -> DistortionModel:
     return DistortionModel(
         width,
         height,
-        tuple(focal),
+        (focal[0], focal[1]),
         principal,
         radial,
         tangential,
@@ -185,12 +184,15 @@ def _points(points: dict, file: Path) -> tuple[np.ndarray, np.ndarray, dict[str,
         ).reshape(-1, 3)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file} has points that cannot be used ({error!r})") from None
-    kept, colors = np.isfinite(positions).all(axis=1), np.nan_to_num(colors)
-    names = [name for name, keep in zip(points, kept) if keep]
+    kept, colors, names = (
+        np.flatnonzero(np.isfinite(positions).all(axis=1)),
+        np.nan_to_num(colors),
+        list(points),
+    )
     return (
         positions[kept],
         np.clip(np.rint(colors[kept]), 0, 255).astype(np.uint8),
-        {str(name): row for row, name in enumerate(names)},
+        {str(names[place]): row for row, place in enumerate(kept)},
     )
 
 
@@ -223,7 +225,7 @@ def _georeference(part: dict, file: Path, root: Path, views: list[View]) -> Geor
     if reference is None:
         return None
     try:
-        return from_origin(tuple(float(reference[key]) for key in ("latitude", "longitude", "altitude")))
+        return from_origin(triple(reference[key] for key in ("latitude", "longitude", "altitude")))
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{file}: reference_lla has no latitude, longitude and altitude") from None
 

@@ -1,7 +1,7 @@
 """Gaussians in the PLY that 3DGS viewers read, as plain arrays.
 
-Columns: x y z, nx ny nz, f_dc (3), f_rest (0, 9, 24 or 45, color channel by color channel), opacity (a logit),
-scale (3 logarithms), rot (wxyz).
+Columns: x y z, nx ny nz, f_dc (3), f_rest (0, 9, 24 or 45, color channel by color channel), opacity (a
+logit), scale (3 logarithms), rot (wxyz).
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.atomic import atomic_path
 from sc3d.io.limits import FARTHEST
-from sc3d.io.ply import check_ply
+from sc3d.io.ply import read_records, write_records
 
 # largest absolute values: the square of a larger scale is no float32
 LIMITS = {
@@ -59,17 +58,7 @@ def write_splat_ply(
     table = np.empty(size, [(name, "u1" if byte else "<f4") for name, byte in bytes_of.items()])
     for name, values in columns.items():
         table[name] = values
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        *(f"comment {line}" for text in comments for line in text.splitlines()),
-        f"element vertex {size}",
-        *(f"property {'uchar' if byte else 'float'} {name}" for name, byte in bytes_of.items()),
-        "end_header",
-    ]
-    with atomic_path(Path(path)) as temporary, open(temporary, "wb") as file:
-        file.write(("\n".join(lines) + "\n").encode())
-        file.write(table.tobytes())
+    write_records(path, table, comments=comments)
 
 
 def read_splat_ply(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -79,15 +68,16 @@ def read_splat_ply(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
         opacity_logits (N,); sh_dc (N, 3); sh_rest (N, K - 1, 3), K = 1, 4, 9, 16; and the comment lines
     Raises InputError for another file, and for values that cannot be rendered.
     """
-    table, comments = _read_vertices(Path(path))
+    table, comments = read_records(path)
+    known = set(table.dtype.names or ())
 
     def columns(names: list[str]) -> np.ndarray:
-        missing = [name for name in names if name not in table.dtype.names]
+        missing = [name for name in names if name not in known]
         if missing:
             raise InputError(f"{path} is not a Gaussian splat PLY: property {missing[0]} is missing")
         return np.stack([table[name].astype(np.float32) for name in names], 1)
 
-    num_rest = sum(name.startswith("f_rest_") for name in table.dtype.names)
+    num_rest = sum(name.startswith("f_rest_") for name in known)
     if num_rest not in (0, 9, 24, 45):
         raise InputError(f"{path} has {num_rest} f_rest properties; 0, 9, 24 or 45 belong to degrees 0 to 3")
     arrays = {
@@ -102,7 +92,7 @@ def read_splat_ply(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
         rest = columns(_numbered("f_rest", num_rest)).reshape(len(table), 3, num_rest // 3)
         arrays["sh_rest"] = np.ascontiguousarray(rest.transpose(0, 2, 1))
     check_splats(arrays, path)
-    return arrays, comments
+    return arrays, list(comments)
 
 
 def check_splats(arrays: Mapping[str, np.ndarray], origin: str | Path) -> None:
@@ -124,17 +114,3 @@ def _numbered(name: str, count: int) -> list[str]:
 
 def _split(names: list[str], values: np.ndarray) -> dict[str, np.ndarray]:
     return {name: values[:, column] for column, name in enumerate(names)}
-
-
-def _read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Structured (N,) table of the element "vertex", which comes first, and the comments."""
-    if not path.is_file():
-        raise InputError(f"{path} does not exist")
-    header = check_ply(path)
-    if header.order != "<":
-        raise InputError(f"{path} is not a binary little endian PLY")
-    vertex = header.elements[0] if header.elements else None
-    if vertex is None or vertex.name != "vertex" or vertex.has_lists:
-        raise InputError(f"{path} does not start with an element named vertex, without lists")
-    dtype = np.dtype([(entry.name, header.order + entry.dtype) for entry in vertex.properties])
-    return np.fromfile(path, dtype, vertex.rows, offset=header.size), list(header.comments)

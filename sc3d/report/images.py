@@ -50,7 +50,7 @@ def cloud_pictures(data: ReportData) -> dict[tuple[str, str], tuple[str, float]]
 
 def _colorings(data: ReportData) -> dict[str, np.ndarray]:
     """(N, 3) uint8 RGB by coloring, for the attributes that the cloud has."""
-    found = {}
+    found: dict[str, np.ndarray] = {}
     for by in COLORINGS:
         with suppress(InputError):
             found[by] = color_points(data.cloud, by, data.class_table)
@@ -122,7 +122,7 @@ def ground_picture(
 
 def _picture(image: np.ndarray) -> tuple[str, float]:
     """Data URI and aspect of a picture without its empty border, but for a margin."""
-    filled = (image != np.uint8(BACKGROUND)).any(axis=2)
+    filled = (image != np.array(BACKGROUND, np.uint8)).any(axis=2)
     rows, columns = np.flatnonzero(filled.any(axis=1)), np.flatnonzero(filled.any(axis=0))
     if len(rows):
         image = image[max(0, rows[0] - 20) : rows[-1] + 21, max(0, columns[0] - 20) : columns[-1] + 21]

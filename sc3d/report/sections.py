@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from html import escape
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -23,10 +24,10 @@ from sc3d.report.charts import (
 from sc3d.report.data import ReportData, class_areas, read_features
 from sc3d.report.images import cloud_pictures, comparison, ground_picture
 from sc3d.scene.labelled_cloud import LabelledSurface
-from sc3d.view.colors import STATES, color_points, confidence_colors, legend_entries
+from sc3d.view.colors import STATES, Coloring, color_points, confidence_colors, legend_entries
 
 _NUM_PHOTOS = 4
-_COLORING_NAMES = {
+_COLORING_NAMES: dict[Coloring | Literal["mesh"], str] = {
     "label": "Classes",
     "photo": "Photo colors",
     "confidence": "Confidence",
@@ -200,12 +201,10 @@ def _choose_views(data: ReportData) -> list:
         return [view for view in data.views if (folder / f"{Path(view.name).stem}.png").exists()]
 
     views = with_file(data.truth) or with_file(data.scene.masks) or data.views
-    chosen = (
-        np.unique(np.linspace(0, len(views) - 1, min(_NUM_PHOTOS, len(views))).round().astype(int))
-        if views
-        else []
-    )
-    return [views[position] for position in chosen]
+    if not views:
+        return []
+    spread = np.linspace(0, len(views) - 1, min(_NUM_PHOTOS, len(views))).round().astype(int)
+    return [views[position] for position in np.unique(spread)]
 
 
 def _photo_figures(data: ReportData, name: str) -> str:
@@ -223,11 +222,13 @@ def _photo_figures(data: ReportData, name: str) -> str:
     return " ".join(f"<small>{text} {value:.1%} right</small>" for text, value in found if value is not None)
 
 
-def _legend(data: ReportData, by: str, everything: bool = False) -> str:
+def _legend(data: ReportData, by: Coloring | Literal["mesh"], everything: bool = False) -> str:
     """What the colors mean; of classes and states only those that the cloud has, unless `everything`."""
     if by == "confidence":
         stops = ", ".join(css_color(color) for color in confidence_colors(np.linspace(0, 1, 9)))
         return f'<p class="legend">confidence 0 <i class="ramp" style="background:linear-gradient(90deg, {stops})"></i> 1</p>'
+    if by == "mesh":
+        return ""
     values = data.values(by) if by in ("label", "state") else None
     present = None if values is None or everything else set(np.unique(values).tolist())
     entries = legend_entries(by, data.class_table, present)
@@ -295,14 +296,10 @@ def iou_of(data: ReportData, source: str) -> dict[str, float | None]:
 
 
 def _class_table(data: ReportData) -> str:
-    counts = data.label_counts
-    if counts is None or data.class_table is None or not len(data.points):
+    counts, labels, confidence = data.label_counts, data.values("label"), data.values("confidence")
+    if counts is None or labels is None or data.class_table is None or not len(data.points):
         return ""
-    labels, confidence, iou = (
-        data.values("label"),
-        data.values("confidence"),
-        iou_of(data, "labels"),
-    )
+    iou = iou_of(data, "labels")
     areas = class_areas(data.points, labels.astype(np.uint8))
     sums, rows = (
         None if confidence is None else np.bincount(labels, np.nan_to_num(confidence), minlength=256),
@@ -405,9 +402,12 @@ def _reliability(data: ReportData) -> list[str]:
         or not all(row is None or isinstance(row, list) and len(row) == 3 for row in rows)
     ):
         return []
-    bins = [(None, None, None) if row is None else tuple(number(value) for value in row) for row in rows]
-    if any(None in row and any(value is not None for value in row) for row in bins):
-        return []
+    bins = []
+    for row in rows:
+        confidence, accuracy, count = (None, None, None) if row is None else map(number, row)
+        if None in (confidence, accuracy, count) and (confidence, accuracy, count) != (None, None, None):
+            return []
+        bins.append((confidence, accuracy, count))
     pixels = sum(count or 0 for _, _, count in bins)
     bins = [(confidence, accuracy, count and count / max(pixels, 1)) for confidence, accuracy, count in bins]
     error = number(figures.get("ece"))
@@ -423,7 +423,8 @@ def processing_section(data: ReportData) -> str:
         return ""
     rows, details = [], []
     for record in data.records:
-        summary = record.get("summary") if isinstance(record.get("summary"), dict) else {}
+        summary = record.get("summary")
+        summary = summary if isinstance(summary, dict) else {}
         text = "; ".join(
             f"{key} {_plain(value)}" for key, value in summary.items() if not isinstance(value, dict | list)
         )

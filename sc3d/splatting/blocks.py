@@ -2,9 +2,9 @@
 their cores become one model. Memory is that of a block, and blocks can be trained at the same time.
 
 A photo of a block also shows ground outside. Those pixels are left out of the loss, rather than explained by
-coarse Gaussians that are dropped afterwards: such a context costs the memory and time that blocks are to save,
-and what it gets wrong the block's own Gaussians would make up for. What a pixel shows is told by the nearest
-sparse points that its photo sees, so a roof before the block counts as what it is: outside.
+coarse Gaussians that are dropped afterwards: such a context costs the memory and time that blocks are to
+save, and what it gets wrong the block's own Gaussians would make up for. What a pixel shows is told by the
+nearest sparse points that its photo sees, so a roof before the block counts as what it is: outside.
 
 Each block is one task, here or on Dask workers. Beside the checkpoint of block 3, `3.checkpoint`, lie its
 Gaussians, `3.ply`, and, written last, `3.json` with the rest: with that it is finished and not begun again.
@@ -75,7 +75,11 @@ def train_blocks(job: BlockJob, data: TrainingData, tasks: Executor) -> tuple[Tr
     Raises InputError, before any work, for a block that fewer than two photos see.
     """
     indices = range(len(job.blocks))
-    _check(job, data)
+    for index in indices:
+        if len(job.views(data, index)) < 2:
+            raise InputError(
+                f"block {index} of {len(indices)} is seen by fewer than 2 photos: lower --blocks"
+            )
     job.folder.mkdir(exist_ok=True)
     tasks.run("blocks", partial(train_block, job), indices, GPU if job.settings.device == "cuda" else None)
     parts = [Gaussians.from_arrays(read_splat_ply(job.file(index, "ply"))[0]) for index in indices]
@@ -208,15 +212,6 @@ def _shown(view: View, points: np.ndarray, near: np.ndarray) -> np.ndarray:
     count = min(NEAREST, int(usable.sum()))
     nearest = cKDTree(pixels[usable]).query(cells, k=count)[1].reshape(-1, count)
     return (2 * near[usable][nearest].sum(axis=1) > count).astype(np.uint8).reshape(shape)
-
-
-def _check(job: BlockJob, data: TrainingData) -> None:
-    for index in range(len(job.blocks)):
-        count = len(job.views(data, index))
-        if count < 2:
-            raise InputError(
-                f"block {index} of {len(job.blocks)} is seen by {count} photos (with {MIN_POINTS} sparse points): lower --blocks"
-            )
 
 
 def _total(records: list[dict], num_gaussians: int) -> dict[str, object]:

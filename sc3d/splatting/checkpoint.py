@@ -69,10 +69,6 @@ def _check_tensors(tensors: dict, shapes: dict) -> None:
     if tensors.keys() != shapes.keys():
         raise ValueError("other tensors")
     for name, tensor in tensors.items():
-        if (
-            not isinstance(tensor, torch.Tensor)
-            or tensor.shape != shapes[name]
-            or tensor.dtype != torch.float32
-            or tensor.layout != torch.strided
-        ):
+        kind = torch.float32, torch.strided, shapes[name]
+        if not isinstance(tensor, torch.Tensor) or (tensor.dtype, tensor.layout, tensor.shape) != kind:
             raise ValueError(f"{name} has another shape or type")

@@ -32,22 +32,15 @@ def pixel_rays(view: View, device: torch.device | str = "cpu") -> Tensor:
     """(H, W, 3) rays ((u - cx) / fx, (v - cy) / fy, 1) of the pixel centers, camera frame: a pixel's point is
     depth * ray.
     """
-    return rays_of(view.width, view.height, pinhole(view), device)
-
-
-def rays_of(
-    width: int, height: int, calibration: tuple[float, float, float, float], device: torch.device | str
-) -> Tensor:
-    """`pixel_rays` of a size and (fx, fy, cx, cy), px."""
-    fx, fy, cx, cy = calibration
-    columns = (torch.arange(width, dtype=torch.float32, device=device) + 0.5 - cx) / fx
-    rows = (torch.arange(height, dtype=torch.float32, device=device) + 0.5 - cy) / fy
-    columns, rows = columns.expand(height, -1), rows[:, None].expand(-1, width)
+    fx, fy, cx, cy = pinhole(view)
+    columns = (torch.arange(view.width, dtype=torch.float32, device=device) + 0.5 - cx) / fx
+    rows = (torch.arange(view.height, dtype=torch.float32, device=device) + 0.5 - cy) / fy
+    columns, rows = columns.expand(view.height, -1), rows[:, None].expand(-1, view.width)
     return torch.stack([columns, rows, torch.ones_like(columns)], 2)
 
 
 def relative_pose(view: View, other: View, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
-    """(3, 3) and (3,) of other_from_view between the camera frames; composed in float64, returned as float32."""
+    """(3, 3) and (3,) float32 of other_from_view between the camera frames; composed in float64."""
     rotation = other.cam_from_world[:3, :3] @ view.cam_from_world[:3, :3].T
     translation = other.cam_from_world[:3, 3] - rotation @ view.cam_from_world[:3, 3]
     return tuple(torch.from_numpy(part.astype(np.float32)).to(device) for part in (rotation, translation))

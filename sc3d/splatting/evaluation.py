@@ -77,52 +77,33 @@ def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
 
 
 @torch.no_grad()
-def score_view(
-    gaussians: Gaussians,
-    view: View,
-    target: torch.Tensor,
-    mask: torch.Tensor | None = None,
-    fit_exposure: bool = False,
-) -> tuple[float, float]:
-    """PSNR (dB) and SSIM of a rendered view against its (H, W, 3) photo; outside the (H, W) mask nothing
-    counts.
-
-    target, mask: on any device
-    fit_exposure: allow the photo its own gain and offset, as in training
-    """
-    image = render(gaussians, view).color
-    target = target.to(image.device)
-    used = torch.ones(target.shape[:2], dtype=torch.bool) if mask is None else mask
-    used = used.to(image.device)
-    if fit_exposure:
-        image = losses.apply_exposure(image, losses.fit_exposure(image[used], target[used]))
-    image = torch.where(used[..., None], image.clamp(0, 1), target)
-    return psnr(image[used], target[used]), 1 - float(losses.ssim_loss(image.contiguous(), target))
-
-
 def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSettings) -> dict[str, float]:
-    """Mean "psnr" (dB) and "ssim" of the held-out views, whose exposure is fitted to the photo if exposures
-    are used; empty without any.
+    """Mean "psnr" (dB) and "ssim" of the held-out views inside their masks; empty without any. Their exposure
+    is fitted to the photo if exposures are used.
     """
-    scores = [
-        score_view(gaussians, *data.photo(index), settings.exposure)
-        for index in settings.held_out(len(data.views))
-    ]
+    scores = []
+    for index in settings.held_out(len(data.views)):
+        view, target, mask = data.photo(index, device=gaussians.means.device)
+        used = torch.ones_like(target[..., 0], dtype=torch.bool) if mask is None else mask
+        image = render(gaussians, view).color
+        if settings.exposure:
+            image = losses.apply_exposure(image, losses.fit_exposure(image[used], target[used]))
+        image = torch.where(used[..., None], image.clamp(0, 1), target).contiguous()
+        similarity = 1 - float(losses.image_loss(image, target, 1.0))
+        scores.append((psnr(image[used], target[used]), similarity))
     return dict(zip(("psnr", "ssim"), np.mean(scores, axis=0).tolist(), strict=True)) if scores else {}
 
 
 @torch.no_grad()
-def depth_map(
-    gaussians: Gaussians, view: View, min_alpha: float = 0.5
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def depth_map(gaussians: Gaussians, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The surface a view sees.
 
-    returns: (H, W) float32 depth z, world units, 0 where alpha < `min_alpha`; (H, W) alpha;
+    returns: (H, W) float32 depth z, world units, 0 where alpha < 0.5; (H, W) alpha;
         (H, W, 3) unit normals, camera frame, towards the camera, 0 where there is no depth
     """
     rendering = render(gaussians, view)
     depth = unbiased_depth(rendering, view)
-    present = (rendering.alpha >= min_alpha) & torch.isfinite(depth) & (depth > 0)
+    present = (rendering.alpha >= 0.5) & torch.isfinite(depth) & (depth > 0)
     normals = torch.nn.functional.normalize(rendering.normal, dim=2) * present[..., None]
     return torch.where(present, depth, 0).cpu().numpy(), rendering.alpha.cpu().numpy(), normals.cpu().numpy()
 

@@ -24,8 +24,8 @@ class Gaussians:
     quats: (N, 4) wxyz rotations world_from_gaussian, not necessarily normalized
     opacity_logits: (N,)
     sh_dc: (N, 3) spherical harmonic Y_0 of each color channel
-    sh_rest: (N, K - 1, 3) the others, K = 1, 4, 9, 16; color = 0.5 + Y_0 sh_dc + sum_k Y_k(direction) sh_rest_k;
-        direction from the camera to the mean; None = none
+    sh_rest: (N, K - 1, 3) the others, K = 1, 4, 9, 16; None = none
+    color = 0.5 + Y_0 sh_dc + sum_k Y_k(direction) sh_rest_k, direction from the camera to the mean
     """
 
     means: torch.Tensor
@@ -110,7 +110,13 @@ class Gaussians:
     @property
     def rotations(self) -> torch.Tensor:
         """(N, 3, 3) world_from_gaussian; the columns are the axes that `scales` belong to."""
-        return rotations_from_quats(self.quats)
+        w, x, y, z = torch.nn.functional.normalize(self.quats, dim=1).unbind(1)
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        return torch.stack([torch.stack(row, 1) for row in rows], 1)
 
     @property
     def normals(self) -> torch.Tensor:
@@ -147,20 +153,9 @@ class Gaussians:
         values = torch.from_numpy(np.ascontiguousarray(colors, np.float32)).to(self.means)
         return Gaussians(self.means, self.log_scales, self.quats, self.opacity_logits, (values - 0.5) / SH_C0)
 
-    def __getitem__(self, chosen: torch.Tensor) -> Gaussians:
+    def __getitem__(self, chosen: torch.Tensor | np.ndarray) -> Gaussians:
         """The Gaussians of an index or bool tensor."""
         return Gaussians(**{name: tensor[chosen] for name, tensor in self.parameters().items()})
-
-
-def rotations_from_quats(quats: torch.Tensor) -> torch.Tensor:
-    """(N, 3, 3) rotation matrices of (N, 4) wxyz quaternions of any length."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, 1) for row in rows], 1)
 
 
 def _plane_normals(groups: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Where training starts: Gaussians at the sparse points, and at points between them from a small plane sweep.
 
-Sparse points leave parts of the photos empty (trees, lawn, asphalt), and optimization moves a Gaussian by little
-per step, so a tree crown that starts on the ground stays there: starting depth matters.
+Sparse points leave parts of the photos empty (trees, lawn, asphalt), and optimization moves a Gaussian by
+little per step, so a tree crown that starts on the ground stays there: starting depth matters.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from sc3d.splatting.gaussians import Gaussians
 SWEEP_SIZE = 250  # px, longest side of the images compared: 7x7 patches must hold some texture
 MAX_COST = 0.5  # mean 1 - NCC of the two best neighbors
 AROUND = 5  # grid points whose costs are averaged
-"""Normal (camera frame, towards the camera) and distance."""
 
 
 def initial_gaussians(

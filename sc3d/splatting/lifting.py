@@ -1,9 +1,9 @@
 """Labels for the Gaussians themselves: each takes the class of the pixels that it shows, in closed form, A[i,
 c] += alpha T s.
 
-A fragment's weight w = alpha T is its share of a pixel; summed over the pixels of class c of all views (times
-the mask's confidence s) it is the evidence that Gaussian i belongs to c. It equals the gradient of sum(image *
-mask) with respect to the Gaussian's color.
+A fragment's weight w = alpha T is its share of a pixel; summed over the pixels of class c of all views
+(times the mask's confidence s) it is the evidence that Gaussian i belongs to c. It equals the gradient of
+sum(image * mask) with respect to the Gaussian's color.
 """
 
 from __future__ import annotations

@@ -53,18 +53,13 @@ def fit_exposure(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 
 def image_loss(image: torch.Tensor, target: torch.Tensor, ssim_weight: float = 0.2) -> torch.Tensor:
-    """(1 - ssim_weight) mean |image - target| + ssim_weight (1 - mean SSIM) of two (H, W, 3) images in [0, 1];
+    """(1 - ssim_weight) mean |image - target| + ssim_weight (1 - mean SSIM) of (H, W, 3) images in [0, 1];
     differentiable in `image` only.
 
     Fastest for float32 images stored plane by plane, as `render` and `TrainingData.photo` return them.
     """
     kernels = ssim if device.has_kernels(image) else gpu_losses
     return kernels.image_loss(image, target, ssim_weight)
-
-
-def ssim_loss(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """1 - mean SSIM of two (H, W, 3) images in [0, 1]; differentiable in `image` only."""
-    return image_loss(image, target, 1.0)
 
 
 def flatten_loss(log_scales: torch.Tensor, visible: torch.Tensor, extent: float) -> torch.Tensor:

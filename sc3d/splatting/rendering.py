@@ -26,8 +26,8 @@ def render(
     """Render Gaussians, differentiable in all their tensors (eq. 1-3; rules in `cpu.projection` and
     `cpu.rasterization`).
 
-    Gaussians on a GPU are rendered there by gsplat, with the differences that `gpu.gsplat_backend` lists; images
-    and statistics stay on it.
+    Gaussians on a GPU are rendered there by gsplat, with the differences that `gpu.gsplat_backend` lists;
+    images and statistics stay on it.
 
     view: pinhole, in the same local world as the Gaussians; its principal point is honored
     sh_degree: highest active degree, None = all that are stored; colors are clamped at 0 from below

@@ -57,7 +57,7 @@ class Statistics:
         self.inside.zero_()
 
     def restart(self) -> None:
-        """Forget the gradients and radii; `seen` and `inside` live until the end of the pass over all views."""
+        """Forget gradients and radii; `seen` and `inside` live until the end of the pass over all views."""
         for values in (self.gradient, self.absolute_gradient, self.count, self.radius):
             values.zero_()
 
@@ -158,15 +158,13 @@ def densify_masks(
 def clone_and_split(
     optimizer: Adam,
     statistics: Statistics,
-    clones: torch.Tensor,
-    splits: torch.Tensor,
+    masks: tuple[torch.Tensor, torch.Tensor],
     generator: torch.Generator,
 ) -> None:
-    """Add a copy of each of `clones`; replace each of `splits` by two samples of itself with 1 / 1.6 of its
-    scales.
-
-    clones, splits: (N,) bool, disjoint. New Gaussians start without momentum.
+    """Add a copy of each of the first mask's Gaussians; replace each of the second's by two samples of itself
+    with 1 / 1.6 of its scales. masks: (N,) bool, disjoint. New Gaussians start without momentum.
     """
+    clones, splits = masks
     kept, cloned, split = (torch.nonzero(mask)[:, 0] for mask in (~splits, clones, splits))
     source = torch.cat([kept, cloned, split, split])
     gather(optimizer, statistics, source, torch.arange(len(source), device=source.device) >= len(kept))
@@ -195,8 +193,8 @@ def densify(
         mask[faintest] = True
         prune(optimizer, statistics, mask)
     elif room > 0:
-        clones, splits = densify_masks(gaussians, statistics, limits, room)
-        clone_and_split(optimizer, statistics, clones, splits, generator)
+        masks = densify_masks(gaussians, statistics, limits, room)
+        clone_and_split(optimizer, statistics, masks, generator)
     statistics.restart()
 
 

@@ -95,7 +95,7 @@ class Trainer:
         self.train_views = [index for index in range(len(data.views)) if index not in held_out]
         if len(self.train_views) < 2:
             raise InputError(
-                f"{len(self.train_views)} photos to train on: at least 2 are needed (test_every holds {len(held_out)} out)"
+                f"{len(self.train_views)} photos to train on, and {len(held_out)} held out: at least 2 are needed"
             )
         self.generator = torch.Generator().manual_seed(settings.seed)
         used = data.subset(self.train_views)
@@ -205,13 +205,8 @@ class Trainer:
     def _identity(self) -> dict[str, object]:
         """What must be the same for a checkpoint to fit."""
         views = [f"{view.name} {view.width}x{view.height}" for view in self.data.views]
-        settings, num_points = asdict(self.settings), len(self.data.points)
-        return {
-            "version": CHECKPOINT_VERSION,
-            "settings": settings,
-            "views": views,
-            "num_points": num_points,
-        }
+        settings, size = asdict(self.settings), len(self.data.points)
+        return {"version": CHECKPOINT_VERSION, "settings": settings, "views": views, "num_points": size}
 
     def _next_view(self) -> int:
         if not self.queue:

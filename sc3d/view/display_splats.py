@@ -13,6 +13,8 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
+from sc3d.io.ply import read_records
+from sc3d.io.splats import read_splat_ply
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import Coloring, confidence_colors
@@ -57,9 +59,14 @@ class DisplaySplats:
             return self.gaussians.base_colors
         if by not in SPLAT_COLORINGS:
             raise InputError(f"splats have no {by}: choose --by photo, label or confidence")
-        if self.label is None:
+        label, confidence, table = self.labels()
+        return table.palette[label] if by == "label" else confidence_colors(confidence)
+
+    def labels(self) -> tuple[np.ndarray, np.ndarray, ClassTable]:
+        """`label`, `confidence` and `table`. InputError if there are none."""
+        if self.label is None or self.confidence is None or self.table is None:
             raise InputError("the splats have no labels: run `sc3d export SCENE --format splats`")
-        return self.table.palette[self.label] if by == "label" else confidence_colors(self.confidence)
+        return self.label, self.confidence, self.table
 
     def only(self, ids: set[int] | None) -> DisplaySplats:
         """Those of some classes, None = all. InputError if there are none."""
@@ -69,9 +76,10 @@ class DisplaySplats:
             raise InputError(
                 "--classes needs labels, and the splats have none: run `sc3d export SCENE --format splats`"
             )
-        chosen = np.isin(self.label, sorted(ids))
+        labels, _, table = self.labels()
+        chosen = np.isin(labels, sorted(ids))
         if not chosen.any():
-            names = ", ".join(self.table.name(label) for label in sorted(ids))
+            names = ", ".join(table.name(label) for label in sorted(ids))
             raise InputError(f"no splat has one of the classes {names}: nothing to show or write")
         return self[chosen]
 
@@ -84,10 +92,9 @@ class DisplaySplats:
         )
         cloud.point.colors = o3d.core.Tensor(self.colors("photo"))
         if self.label is not None:
-            cloud.point["label"], cloud.point["confidence"] = (
-                o3d.core.Tensor(self.label[:, None]),
-                o3d.core.Tensor(self.confidence[:, None]),
-            )
+            label, confidence, _ = self.labels()
+            cloud.point["label"] = o3d.core.Tensor(label[:, None])
+            cloud.point["confidence"] = o3d.core.Tensor(confidence[:, None])
         return cloud
 
     def most_visible(self, count: int) -> DisplaySplats:
@@ -116,18 +123,15 @@ def trained_splats(scene: Scene) -> DisplaySplats:
 
 def read_splats(path: Path, table: ClassTable) -> DisplaySplats:
     """What `sc3d export SCENE --format splats` wrote; InputError if the file has no labels."""
-    from sc3d.io.clouds import read_cloud
-    from sc3d.io.splats import read_splat_ply
     from sc3d.splatting.gaussians import Gaussians
 
     arrays, comments = read_splat_ply(path)
-    found = read_cloud(path).point
+    records, _ = read_records(path)
     origins = [line.split()[2:] for line in comments if line.startswith("sc3d origin ")]
-    if "label" not in found or "confidence" not in found or not origins:
+    if not {"label", "confidence"} <= set(records.dtype.names or ()) or not origins:
         raise InputError(f"{path} has no labels: run `sc3d export SCENE --format splats`")
-    label, confidence = (found[name].numpy().ravel() for name in ("label", "confidence"))
-    gaussians = Gaussians.from_arrays(arrays)
-    return DisplaySplats(gaussians, np.array(origins[0], float), label, confidence, table)
+    label, confidence = (np.ascontiguousarray(records[name]) for name in ("label", "confidence"))
+    return DisplaySplats(Gaussians.from_arrays(arrays), np.array(origins[0], float), label, confidence, table)
 
 
 def labelled_splats(scene: Scene) -> DisplaySplats:
@@ -151,8 +155,8 @@ def best_splats(scene: Scene) -> DisplaySplats:
 
 
 def splats_colored_by(scene: Scene, by: Coloring, classes: tuple[str, ...] = ()) -> DisplaySplats:
-    """The splats that can be colored in some way: gaussians.ply for the photos' colors, else the labelled ones,
-    of which only the named classes. For class colors, those of gaussians.ply do while there are no others.
+    """The splats that can be colored in some way, of the named classes: gaussians.ply for the photos' colors,
+    else the labelled ones. For class colors, gaussians.ply does while there are no others.
     """
     labelled = by == "confidence" or (by == "label" and scene.labelled_splats.exists())
     if labelled or classes:

@@ -100,27 +100,14 @@ def _read_splats(folder: Path) -> object:
 
 @cache
 def _trainer():
-    from sc3d.geometry.cameras import look_at, pinhole_view
-    from sc3d.splatting.dataset import TrainingData
-    from sc3d.splatting.trainer import Trainer
-    from tests.splatting.test_trainer import SHORT, trace
-
-    views = [
-        pinhole_view(
-            f"{i}.png",
-            (96, 64),
-            (90, 90, 48, 32),
-            look_at(np.array([4 * np.cos(i), 3 * np.sin(i), 9]), np.zeros(3)),
-        )
-        for i in range(3)
-    ]
-    points = np.random.default_rng(0).uniform(-3, 3, (60, 3)) * [1, 1, 0.1]
     from dataclasses import replace
 
-    trainer = Trainer(
-        TrainingData(views, [trace(view)[0] for view in views], points, np.full((60, 3), 99, np.uint8)),
-        replace(SHORT, fill=False, max_gaussians=60),
-    )
+    from sc3d.splatting.trainer import Trainer
+    from tests.splatting.scenes import photographed, ring, valley
+    from tests.splatting.test_trainer import SHORT
+
+    data, *_ = photographed(ring()[:3], valley(), wave=3.0, noise=0.05, num_points=60)
+    trainer = Trainer(data, replace(SHORT, fill=False, max_gaussians=60))
     trainer.step()  # before it, the optimizers are empty
     return trainer
 
@@ -356,7 +343,7 @@ def _read_project(folder: Path) -> object:
 
 def _build_project(kind: str):
     def build(folder: Path) -> None:
-        import test_imports as made
+        from tests.importers import test_importers as made
 
         views, points = made.fly(), made.probe(20)
         folder.mkdir(parents=True, exist_ok=True)
@@ -399,7 +386,7 @@ def _read_geometries(folder: Path) -> object:
 
 def _build_las(suffix: str):
     def build(folder: Path) -> None:
-        import test_imports as made
+        from tests.importers import test_importers as made
 
         folder.mkdir(parents=True, exist_ok=True)
         made.write_las(folder / f"cloud.{suffix}", made.surveyed(60))

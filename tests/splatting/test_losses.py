@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from sc3d.geometry.cameras import look_at, pinhole_view, pixel_centers, rays
-from sc3d.geometry.view_selection import nearest_views, neighbor_views
 from sc3d.splatting import device, losses
-from sc3d.splatting.consistency import consistent, pinhole, pixel_rays, reprojection_error
+from sc3d.splatting.consistency import pinhole
 from sc3d.splatting.cpu import normal_loss
 from sc3d.splatting.gpu import losses as gpu_losses
 
@@ -48,61 +47,6 @@ def plane_maps(view) -> tuple[torch.Tensor, torch.Tensor]:
     normal = view.cam_from_world[:3, :3] @ PLANE
     alpha = 0.3 + 0.7 * torch.rand(view.height, view.width, generator=torch.Generator().manual_seed(0))
     return alpha[..., None] * torch.from_numpy(normal).float(), alpha * float(view.center @ PLANE)
-
-
-def test_rays_are_those_of_the_camera_module():
-    view = camera(2, 1)
-    points = (pixel_rays(view) * plane_depth(view)[..., None]).reshape(-1, 3).double().numpy()
-    world = (points - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
-    assert np.abs(world @ PLANE).max() < 1e-4
-
-
-def test_plane_has_no_geometric_error():
-    view, other = camera(2, 1), camera(-1, 2, 12, (80, 70), (100.0, 99.0, 41.0, 33.0))
-    depth, other_depth = plane_depth(view), plane_depth(other)
-    points_cam = (pixel_rays(view) * depth[..., None]).reshape(-1, 3)
-    error, valid = reprojection_error(points_cam, view, other_depth, other)
-    assert valid.float().mean() > 0.5
-    assert error[valid].max() < 2e-3
-    assert losses.geometric_loss(error, valid) < 1e-3
-
-
-def test_wrong_depth_has_the_epipolar_error_and_useful_gradients():
-    view, other = camera(2, 1), camera(-1, 2)
-    depth = (plane_depth(view) * 1.01).requires_grad_()
-    error, valid = reprojection_error(
-        (pixel_rays(view) * depth[..., None]).reshape(-1, 3), view, plane_depth(other), other
-    )
-    assert 0.05 < error[valid].median() < 1
-    losses.geometric_loss(error, valid).backward()
-    assert torch.isfinite(depth.grad).all()
-    assert (depth.grad[depth.grad != 0] > 0).float().mean() > 0.95  # all depths are too large
-
-
-def test_depth_that_is_missing_is_not_compared():
-    view, other = camera(2, 1), camera(-1, 2)
-    other_depth = plane_depth(other)
-    other_depth[:, :40] = 0
-    depth = plane_depth(view)
-    points_cam = (pixel_rays(view) * depth[..., None]).reshape(-1, 3)
-    _, all_valid = reprojection_error(points_cam, view, plane_depth(other), other)
-    error, valid = reprojection_error(points_cam, view, other_depth, other)
-    assert 0.1 < valid.sum() / all_valid.sum() < 0.9
-    assert error[valid].max() < 2e-3
-    behind = pixel_rays(view).reshape(-1, 3) * -5.0
-    assert not reprojection_error(behind, view, other_depth, camera(3, 0))[1].any()
-
-
-def test_consistency_counts_views():
-    view, others = camera(2, 1), [camera(-1, 2), camera(0, -1), camera(1, 3)]
-    depth = plane_depth(view)
-    depth[:5] = 0
-    depth[30:40] *= 1.08
-    maps = [(plane_depth(other), other) for other in others]
-    maps[2] = (maps[2][0] * 0.9, others[2])
-    count = consistent(depth.numpy(), view, [(other.numpy(), pose) for other, pose in maps])
-    assert (count[:5] == 0).all() and (count[30:40] == 0).all()
-    assert (count[15:25, 30:60] == 2).all() and count.max() == 2
 
 
 def test_normals_from_depth_are_exact_on_a_tilted_plane():
@@ -231,22 +175,3 @@ def test_image_edges_are_relative():
     image[:, 6:] = 0.3
     edges = losses.image_edges(image)
     assert edges.max() == 1 and not edges[:, :5].any() and not edges[:, 7:].any()
-
-
-def test_neighbors_share_points_at_a_good_angle():
-    points = np.random.default_rng(0).uniform(-5, 5, (200, 3)) * [1, 1, 0]
-    centers = np.array([[0, 0, 20], [0.2, 0, 20], [4, 0, 20], [-4, 0, 20], [0, 30, 5], [6, 0, 20]], float)
-    everything = np.arange(200)
-    tracks = [everything, everything, everything[:150], everything[:100], everything[:120], np.zeros(0, int)]
-    found = neighbor_views(tracks, points, centers, count=2)
-    assert found[0].tolist() == [2, 3]  # 1 is too close, 4 too oblique, 5 shares nothing
-    assert found[5].tolist()[0] == 2  # without tracks: the nearest
-    assert [len(others) for others in neighbor_views(None, points, centers, count=3)] == [3] * 6
-
-
-def test_nearest_views_do_not_depend_on_units():
-    centers = np.random.default_rng(1).uniform(0, 10, (20, 3))
-    for one, other in zip(nearest_views(centers), nearest_views(centers * 1000 + 5e5), strict=True):
-        assert one.tolist() == other.tolist()
-    assert nearest_views(np.zeros((1, 3)))[0].size == 0
-    assert nearest_views(np.eye(3)[:2])[0].tolist() == [1]

@@ -89,7 +89,7 @@ def test_split_samples_have_the_covariance():
         current_gaussians(optimizer).means[0].detach().clone(),
     )
     nothing = torch.zeros(20000, dtype=torch.bool)
-    strategy.clone_and_split(optimizer, statistics, nothing, ~nothing, torch.Generator().manual_seed(0))
+    strategy.clone_and_split(optimizer, statistics, (nothing, ~nothing), torch.Generator().manual_seed(0))
     assert torch.allclose(
         torch.cov((current_gaussians(optimizer).means.detach() - mean).T), covariance, atol=0.02
     )

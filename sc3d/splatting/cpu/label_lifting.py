@@ -1,8 +1,8 @@
 """Numba kernels: how much of each class every Gaussian shows in a view.
 
 The walk of `rasterization` with the same operations, hence the same fragments and weights; instead of
-compositing colors it sums the weights w of a fragment over the pixels of each class. A tile keeps one plane of
-mask weights per class that occurs in it, mostly one or two.
+compositing colors it sums the weights w of a fragment over the pixels of each class. A tile keeps one plane
+of mask weights per class that occurs in it, mostly one or two.
 """
 
 from __future__ import annotations

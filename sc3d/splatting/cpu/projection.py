@@ -226,7 +226,7 @@ def _covariance(axes, scales, j00, j11, j02, j12, rows):
 
 @numba.njit(cache=True, error_model="numpy")
 def _touches(center, half, size):
-    """Whether [center - half, center + half] holds a pixel center of 0.5, 1.5, ... size - 0.5; False for NaN."""
+    """Whether [center - half, center + half] holds a pixel center 0.5, 1.5, ... size - 0.5; False for NaN."""
     low, high = center - half, center + half
     return (
         low <= size - 0.5
@@ -267,8 +267,8 @@ def _near_image(i, means, log_scales, camera):
 
 @numba.njit(cache=True, error_model="numpy")
 def _project_one(i, gaussians, degree, camera, scratch, records):
-    """Fills the record of Gaussian i, which is near the image; returns (depth, 3 sigma radius in px), both 0 if
-    it cannot touch the image.
+    """Fills the record of Gaussian i, which is near the image; returns (depth, 3 sigma radius in px), both 0
+    if it cannot touch the image.
     """
     rotation, axes, scales, rows, basis = scratch
     means, log_scales = gaussians.means, gaussians.log_scales

@@ -1,4 +1,4 @@
-"""Numba kernels: from per-instance raster gradients to gradients of the parameters (reverse of `projection`)."""
+"""Numba kernels: the reverse of `projection`, from raster gradients of instances to those of parameters."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _color_gradient(i, sums, gaussians, degree, camera, basis, slopes, gradients
 
 @numba.njit(cache=True, error_model="numpy")
 def _quat_gradient(i, quats, scale, g, grad_quats):
-    """Gradient of the unnormalized quaternion from g (3, 3), that of the rotation matrix; scale = 1 / |quat|."""
+    """Gradient of the unnormalized quaternion from g (3, 3), that of the rotation; scale = 1 / |quat|."""
     w, x, y, z = quats[i, 0] * scale, quats[i, 1] * scale, quats[i, 2] * scale, quats[i, 3] * scale
     gw = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
     gx = 2 * (
@@ -153,12 +153,12 @@ def _projection_gradient(
 def project_backward(
     tiles, sums_of_instances, gaussians, degree, camera, gradients, lengths, absolute_lengths
 ):
-    """Fills the rows of visible Gaussians in their gradients and in the two densification statistics, all zero
-    on entry.
+    """Fills the rows of visible Gaussians in their gradients and in the two densification statistics, all
+    zero on entry.
 
     tiles: `TileLists`; sums_of_instances: (P, 16) raster gradients; gradients: `GaussianArrays`
-    lengths, absolute_lengths: (N,) length of the gradient by the 2D mean, NDC units, and the same from absolute
-        gradients of pixels
+    lengths, absolute_lengths: (N,) length of the gradient by the 2D mean, NDC units, and the same from
+        absolute gradients of pixels
     """
     visible, offsets = tiles.visible, tiles.offsets
     means, log_scales = gaussians.means, gaussians.log_scales

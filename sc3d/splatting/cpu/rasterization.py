@@ -1,9 +1,9 @@
 """Numba kernels that composite tiles front to back.
 
 Inside a tile the Gaussian is the outer loop, its rows come next, and runs of 8 pixels between the ends of its
-ellipse are the inner one. All pixel state of a tile lives in one small flat buffer, plane after plane, with rows
-padded so that a run may start at any column; padding and pixels outside the image have transmittance 0 and so
-never count. See `projection` for the record and its u, m, a, h.
+ellipse are the inner one. All pixel state of a tile lives in one small flat buffer, plane after plane, with
+rows padded so that a run may start at any column; padding and pixels outside the image have transmittance 0
+and so never count. See `projection` for the record and its u, m, a, h.
 
 `rasterization_backward` and `label_lifting` repeat the walk with the functions of this module, so all see the
 same fragments.

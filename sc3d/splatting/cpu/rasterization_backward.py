@@ -1,4 +1,4 @@
-"""Numba kernels: the reverse of `rasterization`, from image gradients to sums over the pixels of each instance.
+"""Numba kernels: the reverse of `rasterization`, from image gradients to sums over the pixels of instances.
 
 Tiles are walked front to back again: the part of the loss that lies behind a fragment is what the finished
 image holds minus what has passed so far, so no list of fragments has to be kept. Each instance writes sums of
@@ -73,7 +73,7 @@ def _values(records, base):
 
 @numba.njit(cache=True, error_model="numpy")
 def _backward_tile(tiles, tile, frame, geometry, pixels, gradients):
-    """Runs a tile front to back again and writes the pixel sums of each instance (`projection_backward.SUMS`).
+    """Runs a tile front to back again; writes the pixel sums of each instance (`projection_backward.SUMS`).
 
     pixels: planes transmittance; rest = sum_c g_c (output_c of the fragments still to come); g of alpha,
         color 3, normal 3, plane distance.

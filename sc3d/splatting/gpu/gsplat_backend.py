@@ -1,9 +1,9 @@
 """The GPU backend of `rendering.render`: gsplat's low-level functions (written against gsplat 1.5.3).
 
 The rules are those of the CPU kernels: near plane 0.01, +0.3 px^2, Jacobian clamp at 1.3 tan(fov / 2) around
-the real principal point, pixel centers at +0.5, fragments from alpha 1/255 on. gsplat bins boxes of min(3.33,
-sqrt(2 ln(255 opacity))) standard deviations, rounded up to whole pixels; alpha is below 1/255 outside of them,
-so no fragment is lost. It differs in four ways:
+the real principal point, pixel centers at +0.5, fragments from alpha 1/255 on. gsplat bins boxes of
+min(3.33, sqrt(2 ln(255 opacity))) standard deviations, rounded up to whole pixels; alpha is below 1/255
+outside of them, so no fragment is lost. It differs in four ways:
 - alpha is limited to 0.999 instead of 0.99;
 - a pixel ends before the fragment that would bring its transmittance to 1e-4 instead of after it;
 - a Gaussian is visible (radius > 0) if that box touches the image, the CPU's if the box without rounding
@@ -77,7 +77,7 @@ class _Screen:
     """N Gaussians projected into one view, in gsplat's form: a leading dimension of 1 for the view.
 
     means2d: (1, N, 2) px; conics: (1, N, 3) xx, xy, yy of the inverse covariance, 1 / px^2; opacities: (1, N)
-    radii: (1, N, 2) int32 half extents, px, 0 = cannot touch the image, all else of that row is then undefined
+    radii: (1, N, 2) int32 half extents, px; 0 = cannot touch the image, the rest of that row is undefined
     offsets: (1, rows, columns) int32 first entry of each tile in ids
     ids: (P,) int32 Gaussians tile by tile, near to far; size: width, height, px
     """

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sc3d.splatting.consistency import rays_of, sample
+from sc3d.splatting.consistency import ray_slopes, sample
 from sc3d.splatting.cpu.patch_ncc import NOISE, PATCH_RADIUS
 from sc3d.splatting.cpu.ssim import C1, C2, WINDOW
 
@@ -48,7 +48,9 @@ def normals_from_depth(depth: Tensor, calibration: tuple[float, float, float, fl
     depth: (H, W), 0 = none; calibration: fx fy cx cy, px. Zero at the image border and where one of the four
         has no depth.
     """
-    points = rays_of(depth.shape[1], depth.shape[0], calibration, depth.device) * depth[..., None]
+    slopes = ray_slopes(depth.shape[1], depth.shape[0], calibration)
+    columns, rows = (torch.from_numpy(array).to(depth.device) for array in slopes)
+    points = torch.stack([columns * depth, rows[:, None] * depth, depth], 2)
     across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
     known = (depth[1:-1, 2:] > 0) & (depth[1:-1, :-2] > 0) & (depth[2:, 1:-1] > 0) & (depth[:-2, 1:-1] > 0)
     normals = torch.linalg.cross(down, across)

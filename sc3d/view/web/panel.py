@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -101,16 +102,19 @@ class ShowPanel:
             box = gui.add_checkbox(
                 table.name(label), label not in self.hidden, hint=f"{counts.get(label, 0):,} points"
             )
-            box.on_update(lambda _, label=label, box=box: self._show_class(label, box.value))
+            box.on_update(partial(self._switch_class, label))
 
     def _choose_layers(self, name: str) -> None:
         self._page.cloud.show(name != "splats")
+        if self._page.splats is None:
+            return
         try:
             self._page.splats.show(name != "cloud")
         except Sc3dError as error:  # they are read when they are first shown
             logger.warning("the splats cannot be shown: %s", error)
 
-    def _show_class(self, label: int, visible: bool) -> None:
+    def _switch_class(self, label: int, event: viser.GuiEvent) -> None:
+        visible = event.target.value
         (self.hidden.discard if visible else self.hidden.add)(label)
         for layer in (self._page.cloud, self._page.splats):
             if layer is not None:
@@ -143,7 +147,7 @@ class PhotoPanel:
 
     def choose(self, name: str) -> None:
         """Show a photo."""
-        self._names.value = name  # calls `_show`
+        self._names.value = name  # type: ignore[misc]  # calls `_show`; viser types it as read-only
 
     def _show(self, name: str) -> None:
         self._page.cameras.hide(None)
