@@ -98,8 +98,12 @@ def write_splats(path: Path, splats: DisplaySplats, projection: MapProjection) -
             f"sc3d EPSG:{projection.epsg} origin "
             + " ".join(f"{value:.3f}" for value in origin_in_crs(splats, projection))
         )
-    comments += [f"sc3d label {entry.id} {entry.name}" for entry in splats.table]
-    extra = {"label": splats.label.astype(np.uint8), "confidence": splats.confidence.astype(np.float32)}
+    label, confidence, table = splats.labels()
+    comments += [f"sc3d label {entry.id} {entry.name}" for entry in table]
+    extra: dict[str, np.ndarray] = {
+        "label": label.astype(np.uint8),
+        "confidence": confidence.astype(np.float32),
+    }
     write_splat_ply(path, splats.gaussians.arrays(), comments, extra)
 
 
@@ -110,12 +114,13 @@ def origin_in_crs(splats: DisplaySplats, projection: MapProjection) -> np.ndarra
 
 def figures(splats: DisplaySplats, projection: MapProjection) -> dict[str, object]:
     """What the summary and the sidecar say."""
-    labelled, counts = splats.label > 0, np.bincount(splats.label, minlength=256)
+    label, confidence, table = splats.labels()
+    counts = np.bincount(label, minlength=256)
     return {
-        "splats": len(splats.label),
-        "labelled": f"{labelled.mean():.1%}",
-        "mean_confidence": round(float(splats.confidence[labelled].mean()), 3),
+        "splats": len(label),
+        "labelled": f"{(label > 0).mean():.1%}",
+        "mean_confidence": round(float(confidence[label > 0].mean()), 3),
         "origin": np.round(origin_in_crs(splats, projection) + 0.0, 3).tolist(),
         **projection.figures(),
-        "splats_by_class": {splats.table.name(int(row)): int(counts[row]) for row in np.flatnonzero(counts)},
+        "splats_by_class": {table.name(int(row)): int(counts[row]) for row in np.flatnonzero(counts)},
     }

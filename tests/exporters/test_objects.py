@@ -16,7 +16,7 @@ from sc3d.exporters.buildings import join_enclosed, roof_tops, split_buildings
 from sc3d.exporters.polygonize import main_direction, orthogonalized, polygonize, simplified
 from sc3d.exporters.regions import cells_by_number, connected_cells, renumbered
 from sc3d.exporters.terrain import block_medians, ground_height
-from sc3d.exporters.trees import grow_crowns, split_crowns
+from sc3d.exporters.trees import split_crowns, watershed
 from sc3d.geometry.raster import Raster
 from sc3d.settings.outputs import Export
 from sc3d.settings.synthesize import Synthesize
@@ -311,11 +311,11 @@ def test_a_lumpy_crown_is_one_tree():
     assert split_crowns(canopy_of(lobes + [(20, 15, 1.6, 8.2)]), GRID, 2.0).max() == 1
 
 
-def test_crowns_fill_the_canopy_around_their_tops():
+def test_every_cell_climbs_upwards():
     rng = np.random.default_rng(6)
     heights = ndimage.gaussian_filter(rng.random((60, 60)), 3) * 40
     tall = heights > np.quantile(heights, 0.3)
-    crowns = grow_crowns(heights, tall, 0.5)
+    crowns = watershed(heights, tall, 0.5)
     assert (crowns > 0).sum() == tall.sum() and (crowns[~tall] == 0).all()
     for cells in cells_by_number(crowns, crowns.max()):
         peak = cells[np.argmax(heights.ravel()[cells])]
