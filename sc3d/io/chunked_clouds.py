@@ -34,21 +34,27 @@ class CloudFile:
         """InputError if the file is damaged, empty, or of a kind that cannot be read in chunks."""
         kind = path.suffix.lower()
         if kind in (".las", ".laz"):
-            header = check_las(path)
-            return cls(path, np.dtype(LAS_FIELDS + LAS_COLORS * header.has_colors), header.count)
+            las = check_las(path)
+            return cls(path, np.dtype(LAS_FIELDS + LAS_COLORS * las.has_colors), las.num_points)
         if kind != ".ply":
             raise InputError(
                 f"{path} does not fit into --max-memory, and can be read in parts as PLY, LAS or LAZ only: convert it, or allow more memory"
             )
         header = check_ply(path)
-        if header.record is None:
+        record = header.record
+        if record is None:
             raise InputError(
                 f"{path} does not fit into --max-memory, and can be read in parts as binary PLY with the vertices first only: write it anew"
             )
-        num_points = header.elements[0].rows
-        if not num_points or not {"x", "y", "z"} <= set(header.record.names):
+        cloud = cls(path, record, header.elements[0].rows, header.size)
+        if not cloud.num_points or not {"x", "y", "z"} <= set(cloud.names):
             raise InputError(f"{path} holds no points")
-        return cls(path, header.record, num_points, header.size)
+        return cloud
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the fields of a record."""
+        return self.dtype.names or ()
 
     def chunks(self) -> Iterator[tuple[int, np.ndarray]]:
         """First row and records of each chunk; InputError at positions that are not finite or too far away."""
@@ -79,7 +85,7 @@ def _read_las(cloud: CloudFile) -> Iterator[tuple[int, np.ndarray]]:
             records = np.empty(len(points), cloud.dtype)
             for axis in "xyz":
                 records[axis] = getattr(points, axis)
-            for name in cloud.dtype.names[3:]:
+            for name in cloud.names[3:]:
                 records[name] = np.asarray(points[name]) >> 8  # 16 bits, by the standard
             yield start, records
             start += len(records)
@@ -93,6 +99,6 @@ def positions(records: np.ndarray) -> np.ndarray:
 def columns(records: np.ndarray, names: Iterable[str]) -> np.ndarray | None:
     """(N, K) of the named fields, of their common type; None if the records lack one."""
     names = list(names)
-    if not set(names) <= set(records.dtype.names):
+    if not set(names) <= set(records.dtype.names or ()):
         return None
     return np.stack([records[name] for name in names], axis=1)

@@ -31,6 +31,7 @@ POINT = np.array([[0, 43, 0, 0, 0], [8, 8, 0, LARGEST, 0]])
 FRAME = np.array([[0, 64, 0, 0, 0], [4, 16, 0, LARGEST, 0]])
 MAX_NAME = 4096  # bytes of a photo name
 NO_POINTS = np.zeros((0, 3))
+NO_OBSERVATIONS = (np.zeros(0, np.int64), np.zeros((0, 2)))
 NOT_RIGID = 0.01  # largest error of R R^T: text models are rounded
 
 
@@ -65,9 +66,14 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
 class Photo(Protocol):
     """A photo's camera; cam_from_world: (4, 4) rigid transform. `geometry.cameras.View` is one."""
 
-    name: str
-    camera: pycolmap.Camera
-    cam_from_world: np.ndarray
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def camera(self) -> pycolmap.Camera: ...
+
+    @property
+    def cam_from_world(self) -> np.ndarray: ...
 
 
 def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
@@ -117,7 +123,7 @@ def build_model(
     observations: per view the rows (K,) of points that it sees and their pixels (K, 2); None = nothing
     """
     model, cameras = pycolmap.Reconstruction(), {}
-    observations = [((), ())] * len(views) if observations is None else observations
+    observations = [NO_OBSERVATIONS] * len(views) if observations is None else observations
     for number, (view, (_, pixels)) in enumerate(zip(views, observations, strict=True), start=1):
         key = (view.camera.model_name, view.camera.width, view.camera.height, *view.camera.params)
         if key not in cameras:
@@ -226,7 +232,7 @@ def _read(form: str, data: mmap.mmap, position: int) -> tuple:
 
 
 def _walk_cameras(data: mmap.mmap, count: int) -> int:
-    position, ids = 8, set()
+    position, ids = 8, set[int]()
     for _ in range(count):
         number, model = _read("<Ii", data, position)
         _once(number, ids, "camera")
@@ -243,7 +249,7 @@ def _num_params(model: int) -> int:
 
 
 def _walk_rigs(data: mmap.mmap, count: int) -> int:
-    position, ids = 8, set()
+    position, ids = 8, set[int]()
     for _ in range(count):
         number, sensors = _read("<II", data, position)
         _once(number, ids, "rig")
@@ -276,7 +282,7 @@ def _walk_records(data: mmap.mmap, count: int, fields: np.ndarray) -> int:
 
 
 def _walk_images(data: mmap.mmap, count: int) -> int:
-    position, ids = 8, set()
+    position, ids = 8, set[int]()
     for _ in range(count):
         _once(_read("<I", data, position)[0], ids, "photo")
         end = data.find(b"\0", position + 64, position + 64 + MAX_NAME)

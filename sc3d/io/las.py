@@ -33,8 +33,7 @@ STREAMED = -1  # the chunk table's position is at the end of the file
 
 class LasHeader(NamedTuple):
     """size: bytes, then num_vlrs records up to `offset`, where the points begin; form: point format, 128 more if
-    they are compressed; record: bytes of a point; count: of points; evlrs: position and number of extended
-    records.
+    they are compressed; record: bytes of a point; evlrs: position and number of extended records.
     """
 
     size: int
@@ -42,7 +41,7 @@ class LasHeader(NamedTuple):
     num_vlrs: int
     form: int
     record: int
-    count: int
+    num_points: int
     evlrs: tuple[int, int]
 
     @property
@@ -70,16 +69,18 @@ def _check(data: mmap.mmap) -> LasHeader:
     _walk_evlrs(data, *header.evlrs)
     room = len(data) - header.offset
     if header.form < 128:
-        if header.count * header.record > room:
+        if header.num_points * header.record > room:
             raise DamagedFileError(
-                f"announces {header.count} points of {header.record} bytes, {room} bytes are there"
+                f"announces {header.num_points} points of {header.record} bytes, {room} bytes are there"
             )
         return header
-    if header.count * header.record > RATIO * room + SLACK:
-        raise DamagedFileError(f"announces {header.count} points in {room} compressed bytes, which cannot be")
+    if header.num_points * header.record > RATIO * room + SLACK:
+        raise DamagedFileError(
+            f"announces {header.num_points} points in {room} compressed bytes, which cannot be"
+        )
     if laszip is None:
         raise DamagedFileError("is compressed, but does not say how")
-    if header.count:
+    if header.num_points:
         _check_chunks(data, header, laszip)
     return header
 
@@ -133,7 +134,7 @@ def _check_chunks(data: mmap.mmap, header: LasHeader, laszip: bytes) -> None:
         not one_size
         and kind != LAYERED
         or one_size
-        and not 0 < chunk * header.record <= max(LARGEST_CHUNK, header.count * header.record)
+        and not 0 < chunk * header.record <= max(LARGEST_CHUNK, header.num_points * header.record)
     ):
         raise DamagedFileError(f"has compressed chunks of {chunk} points, which cannot be")
     if kind not in (POINTWISE, LAYERED) or sum(size for _, size, _ in items) != header.record:
@@ -145,8 +146,8 @@ def _check_chunks(data: mmap.mmap, header: LasHeader, laszip: bytes) -> None:
     if not header.offset + 8 <= table <= len(data) - 8:
         raise DamagedFileError("has no table of compressed chunks")
     num_chunks = struct.unpack_from("<I", data, table + 4)[0]
-    if num_chunks > header.count or (one_size and num_chunks != -(-header.count // chunk)):
-        raise DamagedFileError(f"announces {num_chunks} compressed chunks for {header.count} points")
+    if num_chunks > header.num_points or (one_size and num_chunks != -(-header.num_points // chunk)):
+        raise DamagedFileError(f"announces {num_chunks} compressed chunks for {header.num_points} points")
     if kind == LAYERED:
         _walk_layers(
             data, header, (table, num_chunks), sum(LAYERS.get(item, size) for item, size, _ in items)
@@ -161,5 +162,7 @@ def _walk_layers(data: mmap.mmap, header: LasHeader, chunks: tuple[int, int], nu
         position, total = position + header.record + 4 + 4 * num_layers + sum(sizes), total + count
         if position > table:
             raise DamagedFileError("has a compressed chunk that is cut off")
-    if position != table or total != header.count:
-        raise DamagedFileError(f"has {total} points in its compressed chunks, {header.count} are announced")
+    if position != table or total != header.num_points:
+        raise DamagedFileError(
+            f"has {total} points in its compressed chunks, {header.num_points} are announced"
+        )

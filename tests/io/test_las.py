@@ -17,7 +17,7 @@ def test_count_and_colors_are_those_of_laspy(tmp_path, form, suffix):
     las.x = las.y = las.z = np.arange(25.0)
     las.write(tmp_path / f"a{suffix}")
     found, has_colors = check_las(tmp_path / f"a{suffix}"), "red" in las.point_format.dimension_names
-    assert found.count == 25 and found.has_colors == has_colors
+    assert found.num_points == 25 and found.has_colors == has_colors
     cloud = CloudFile.open(tmp_path / f"a{suffix}")
     assert cloud.num_points == 25 and ("red" in cloud.dtype.names) == has_colors
     assert [records["x"].tolist() for _, records in cloud.chunks()] == [list(range(25))]
