@@ -122,7 +122,7 @@ def _write_priors(database: Path, flight: Flight | None) -> None:
             if prior is None:
                 continue
             prior.corr_data_id = image.data_id
-            prior.position = flight.positions[image.name] if tag else none
+            prior.position = flight.positions[image.name] if flight and tag else none
             prior.position_covariance = np.diag(tag.sigma**2 if tag else none)
             prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
             if image_id in priors:
@@ -207,7 +207,7 @@ def _georeference(
             {"control_points": figures},
         )
     fit = place(flight, _centers(model), _points(model)) if flight else None
-    if fit is None:
+    if flight is None or fit is None:
         if flight:
             logger.warning(
                 "the registered photos do not fit their GPS: the model has no scale, no north and no position"
@@ -258,7 +258,7 @@ def _summary(
         "points": model.num_points3D(),
         "reprojection_error_px": round(float(model.compute_mean_reprojection_error()), 3),
         "frame": "ENU" if georeference else "local",
-        "origin_lat_lon_alt": list(georeference.origin) if georeference else None,
+        "origin_lat_lon_alt": list(georeference.origin) if georeference and georeference.origin else None,
         "epsg": georeference.epsg if georeference else None,
     } | _errors(georeference)
 

@@ -61,7 +61,7 @@ def fit_similarity_robust(
     (units of the target) and refits.
     returns: the similarity; (N,) bool, the pairs kept. Fewer than three may be left.
     """
-    fit, kept = fit_similarity(source, target), None
+    fit, kept = fit_similarity(source, target), np.zeros(len(source), bool)
     if len(source) > 3:
         fits = [fit_similarity(source[triple], target[triple]) for triple in _triples(len(source))]
         fit = min(
@@ -69,7 +69,7 @@ def fit_similarity_robust(
         )
     for _ in range(10):
         agreed = np.linalg.norm(fit.apply(source) - target, axis=1) <= max_error
-        if agreed.sum() < 3 or (kept is not None and (agreed == kept).all()):
+        if agreed.sum() < 3 or (agreed == kept).all():
             return fit, agreed
         fit, kept = fit_similarity(source[agreed], target[agreed]), agreed
     return fit, kept

@@ -69,7 +69,9 @@ def read_control_points(path: Path, photos: list[str]) -> ControlPoints:
         )
     crs = parse_crs(lines[0][1], path)
     known = {Path(name).name: name for name in photos} | {name: name for name in photos}
-    positions, observations, unknown = {}, {}, set()
+    positions: dict[str, tuple[float, ...]] = {}
+    observations: dict[str, dict[str, np.ndarray]] = {}
+    unknown = set[str]()
     for number, line in lines[1:]:
         position, pixel, photo, name = _parse(line, f"{path}, line {number}")
         if photo not in known:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -65,11 +66,12 @@ def anchor_focal(model: pycolmap.Reconstruction, photos: Path, flight: Flight | 
 
     returns: estimated and stated focal length (px) of the first camera; empty if EXIF states none
     """
-    first = {}
+    first = dict[int, str]()
     for image in registered_images(model):
         first.setdefault(image.camera_id, image.name)
-    stated = {camera_id: exif_focal(photos / name) for camera_id, name in first.items()}
-    if not stated or any(focal is None for focal in stated.values()):
+    found = {camera_id: exif_focal(photos / name) for camera_id, name in first.items()}
+    stated = {camera_id: focal for camera_id, focal in found.items() if focal is not None}
+    if not stated or len(stated) < len(found):
         logger.warning(
             "EXIF states no focal length to keep: where all photos look the same way from one height, heights may be wrong by a constant factor"
         )
@@ -147,7 +149,8 @@ def _depth_below(model: pycolmap.Reconstruction, direction: np.ndarray) -> np.nd
     return np.median(points @ direction) - centers @ direction
 
 
-def _number(value: object) -> float:
+def _number(value: Any) -> float:
+    """What EXIF has for a number; 0 if it is none."""
     try:
         return float(value)
     except (TypeError, ValueError, ZeroDivisionError):

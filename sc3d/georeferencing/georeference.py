@@ -15,6 +15,7 @@ Heights pass through unchanged (ellipsoidal as the GPS gives them; drones often 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -83,7 +84,7 @@ class Georeference:
         local = np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         if self.origin is None:
             return local + self.offset + [0.0, 0.0, self.altitude_offset / self.unit]
-        return np.concatenate([self._project(part) for part in _chunks(local)])
+        return np.concatenate([self._project(part, self.origin) for part in _chunks(local)])
 
     def from_crs(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) easting, northing, height in the CRS to (N, 3) float64 world; the inverse of `to_crs`."""
@@ -91,31 +92,33 @@ class Georeference:
         if self.origin is None:
             local = points - self.offset - [0.0, 0.0, self.altitude_offset / self.unit]
         else:
-            local = np.concatenate([self._unproject(part) for part in _chunks(points)])
+            local = np.concatenate([self._unproject(part, self.origin) for part in _chunks(points)])
         matrix = np.asarray(self.local_from_world, np.float64)
         return np.linalg.solve(matrix[:3, :3], (local - matrix[:3, 3]).T).T
 
-    def enu_to_geodetic(self, enu: np.ndarray) -> np.ndarray:
-        """(N, 3) local ENU, m, to (N, 3) latitude, longitude (degrees), ellipsoidal height (m)."""
-        return enu_to_geodetic(enu, self.origin)
-
-    def _project(self, enu: np.ndarray) -> np.ndarray:
-        latitude, longitude, height = enu_to_geodetic(enu, self.origin).T
+    def _project(self, enu: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
+        latitude, longitude, height = enu_to_geodetic(enu, origin).T
         easting, northing = self._crs_from_geodetic.transform(longitude, latitude)
         return _require_finite(
             np.stack([easting, northing, (height + self.altitude_offset) / self.unit], axis=1), self.epsg
         )
 
-    def _unproject(self, points: np.ndarray) -> np.ndarray:
+    def _unproject(self, points: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
         longitude, latitude = self._crs_from_geodetic.transform(
             points[:, 0], points[:, 1], direction="INVERSE"
         )
         geodetic = np.stack([latitude, longitude, points[:, 2] * self.unit - self.altitude_offset], axis=1)
-        return geodetic_to_enu(_require_finite(geodetic, self.epsg), self.origin)
+        return geodetic_to_enu(_require_finite(geodetic, self.epsg), origin)
 
     @cached_property
     def _crs_from_geodetic(self) -> pyproj.Transformer:
         return _transformer("EPSG:4326", self.crs)
+
+
+def triple(values: Iterable[float]) -> tuple[float, float, float]:
+    """Three numbers; ValueError for more or fewer."""
+    first, second, third = (float(value) for value in values)
+    return first, second, third
 
 
 def from_origin(
@@ -127,12 +130,12 @@ def from_origin(
     """Georeference of a world in local ENU at `origin` (latitude, longitude, height); `epsg` None = the UTM
     zone there (WGS 84).
     """
-    origin = tuple(float(value) for value in origin)
+    origin = triple(origin)
     zone = epsg or utm_epsg(origin[0], origin[1])
     here = Georeference(zone, (0.0, 0.0, 0.0), origin, altitude_offset=altitude_offset).to_crs(
         np.zeros((1, 3))
     )[0]
-    offset = tuple(float(value) for value in np.round(here))
+    offset = triple(np.round(here))
     area = projected_crs(zone).area_of_use
     if area is not None and not (
         area.south <= origin[0] <= area.north and area.west <= origin[1] <= area.east
@@ -173,6 +176,8 @@ def read_georeference(scene: Scene) -> Georeference | None:
         return None
     content = read_json(path)
     try:
+        if not isinstance(content, dict):
+            raise TypeError("no JSON object")
         known = {name: content[name] for name in Georeference.__dataclass_fields__ if name in content}
         for name in ("offset", "origin"):
             if known.get(name) is not None:

@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -112,15 +113,15 @@ def enu_positions(tags: dict[str, Geotag], origin: tuple[float, float, float]) -
 
 
 def _deviation(xmp: dict[str, float], horizontal_error: float) -> tuple[float, float, float] | None:
-    stated = tuple(xmp.get(name, 0.0) for name in ("RtkStdLon", "RtkStdLat", "RtkStdHgt"))
-    if all(value > 0 for value in stated):
-        return stated
+    east, north, up = (xmp.get(name, 0.0) for name in ("RtkStdLon", "RtkStdLat", "RtkStdHgt"))
+    if east > 0 and north > 0 and up > 0:
+        return east, north, up
     if horizontal_error > 0:  # EXIF says nothing of the height, which GPS knows about half as well
         return (horizontal_error, horizontal_error, 2 * horizontal_error)
     return None
 
 
-def _angle(parts: object, reference: object, negative: str) -> float:
+def _angle(parts: Any, reference: object, negative: str) -> float:
     """Degrees of (degrees, minutes, seconds); NaN if there is none."""
     try:
         degrees, minutes, seconds = (_number(part) for part in parts)
@@ -130,7 +131,8 @@ def _angle(parts: object, reference: object, negative: str) -> float:
     return -angle if str(reference).strip("\0 ").upper().startswith(negative) else angle
 
 
-def _number(value: object) -> float:
+def _number(value: Any) -> float:
+    """What EXIF or XMP has for a number; NaN if it is none."""
     try:
         return float(value)
     except (TypeError, ValueError, ZeroDivisionError):

@@ -22,6 +22,7 @@ from sc3d.georeferencing.georeference import (
     crs_to_geodetic,
     enu_to_geodetic,
     from_origin,
+    triple,
     utm_epsg,
 )
 from sc3d.georeferencing.geotags import Geotag, enu_positions, read_geotags
@@ -175,9 +176,7 @@ def find_georeference(
     if fit is None:
         return None
     if abs(fit.scale - 1) < SAME_SCALE and fit.angle < SAME_ANGLE:
-        origin = tuple(
-            float(value) for value in enu_to_geodetic(fit.apply(np.zeros((1, 3))), flight.origin)[0]
-        )
+        origin = triple(enu_to_geodetic(fit.apply(np.zeros((1, 3))), flight.origin)[0])
         return from_origin(origin, epsg, figures={"gps": residuals(replace(flight, origin=origin), centers)})
     found = from_origin(
         flight.origin,
