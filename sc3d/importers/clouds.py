@@ -124,7 +124,7 @@ def _las_geometry(file: laspy.LasData, path: Path) -> Geometry:
     )
 
 
-def _las_epsg(header: object, path: Path) -> int | None:
+def _las_epsg(header: laspy.LasHeader, path: Path) -> int | None:
     """EPSG code of the horizontal CRS in a LAS header."""
     import pyproj
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+import pycolmap
 import pyproj
 
 from sc3d.errors import InputError
@@ -64,11 +65,9 @@ def files(path: Path) -> list[Path]:
 def read(path: Path, settings: Import) -> Project:
     chunk = _chunk(path)
     cameras = {
-        sensor.get("id"): to_camera(
-            _distortion_model(sensor, path), settings.tolerance, f"{path}, sensor {sensor.get('label')!r}"
-        )
+        sensor.get("id"): _camera(sensor, calibration, settings.tolerance, path)
         for sensor in chunk.iterfind("./sensors/sensor")
-        if _calibration(sensor) is not None
+        if (calibration := _calibration(sensor)) is not None
     }
     enabled = [
         camera
@@ -118,8 +117,16 @@ def _calibration(sensor: ElementTree.Element) -> ElementTree.Element | None:
     )
 
 
-def _distortion_model(sensor: ElementTree.Element, path: Path) -> DistortionModel:
-    where, calibration = f"{path}, sensor {sensor.get('label')!r}", _calibration(sensor)
+def _camera(
+    sensor: ElementTree.Element, calibration: ElementTree.Element, tolerance: float, path: Path
+) -> pycolmap.Camera:
+    where = f"{path}, sensor {sensor.get('label')!r}"
+    return to_camera(_distortion_model(sensor, calibration, where), tolerance, where)
+
+
+def _distortion_model(
+    sensor: ElementTree.Element, calibration: ElementTree.Element, where: str
+) -> DistortionModel:
     kind = calibration.get("type") or sensor.get("type", "frame")
     if kind != "frame" and kind not in FISHEYE:
         raise InputError(
@@ -127,11 +134,12 @@ def _distortion_model(sensor: ElementTree.Element, path: Path) -> DistortionMode
         )
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
+    size = {} if resolution is None else resolution.attrib
     try:
-        width, height = int(resolution.get("width")), int(resolution.get("height"))
-        values = {child.tag: float(child.text) for child in calibration if child.tag in PARAMETERS}
+        width, height = int(size["width"]), int(size["height"])
+        values = {child.tag: float(child.text or "") for child in calibration if child.tag in PARAMETERS}
         focal = values["f"] if "f" in values else values["fy"]
-    except (AttributeError, TypeError, ValueError, KeyError):
+    except (ValueError, KeyError):
         raise InputError(f"{where}: its calibration lacks size or focal length") from None
     if values.get("p3", 0) or values.get("p4", 0):
         raise InputError(
@@ -168,9 +176,9 @@ def _transforms(
         for component in chunk.iterfind("./components/component")
     }
     own = {
-        key: _similarity(components[key], path)
+        key: _similarity(transform, path)
         for key in dict.fromkeys(ids)
-        if components.get(key) is not None
+        if (transform := components.get(key)) is not None
     }
     if own:
         return own
@@ -179,23 +187,17 @@ def _transforms(
 
 
 def _similarity(transform: ElementTree.Element, path: Path) -> Similarity:
+    rotation, translation, scale = (transform.find(tag) for tag in ("rotation", "translation", "scale"))
     # a 4x4 matrix, as PhotoScan 1.0 writes it
-    if transform.find("rotation") is None and transform.text and transform.text.strip():
+    if rotation is None and transform.text and transform.text.strip():
         matrix = _numbers(transform, 16, path).reshape(4, 4)
-        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-        return Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
-    rotation = (
-        np.eye(3)
-        if transform.find("rotation") is None
-        else _numbers(transform.find("rotation"), 9, path).reshape(3, 3)
+        factor = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        return Similarity(factor, matrix[:3, :3] / factor, matrix[:3, 3])
+    return Similarity(
+        1.0 if scale is None else float(_numbers(scale, 1, path)[0]),
+        np.eye(3) if rotation is None else _numbers(rotation, 9, path).reshape(3, 3),
+        np.zeros(3) if translation is None else _numbers(translation, 3, path),
     )
-    translation = (
-        np.zeros(3)
-        if transform.find("translation") is None
-        else _numbers(transform.find("translation"), 3, path)
-    )
-    scale = 1.0 if transform.find("scale") is None else float(_numbers(transform.find("scale"), 1, path)[0])
-    return Similarity(scale, rotation, translation)
 
 
 def _pose(camera: ElementTree.Element, world_from_chunk: Similarity, path: Path) -> np.ndarray:
@@ -209,7 +211,9 @@ def _pose(camera: ElementTree.Element, world_from_chunk: Similarity, path: Path)
     )
 
 
-def _numbers(element: ElementTree.Element, count: int, path: Path) -> np.ndarray:
+def _numbers(element: ElementTree.Element | None, count: int, path: Path) -> np.ndarray:
+    if element is None:
+        raise InputError(f"{path}: an element with {count} finite numbers is missing")
     try:
         values = np.array((element.text or "").replace(",", " ").split(), np.float64)
     except ValueError:
@@ -224,7 +228,7 @@ def _to_local(
 ) -> tuple[list[View], Georeference | None]:
     """Views in local ENU and the georeference, if the chunk has a CRS on Earth; unchanged views otherwise."""
     crs = _crs(chunk, path)
-    if not views or crs is None:
+    if not views or crs is None or crs.ellipsoid is None or crs.geodetic_crs is None:
         return views, None
     middle = np.median([view.center for view in views], axis=0)
     if np.linalg.norm(middle) < GEOCENTRIC:
@@ -234,8 +238,9 @@ def _to_local(
         return views, None
     # points that show how one frame lies in the other
     frame = middle + 1000 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
-    geodetic = _geodetic(frame, crs)
-    origin = tuple(round(float(value), digits) for value, digits in zip(geodetic[0], (6, 6, 0)))
+    geodetic = _geodetic(frame, crs.ellipsoid, crs.geodetic_crs)
+    latitude, longitude, height = geodetic[0].tolist()
+    origin = (round(latitude, 6), round(longitude, 6), round(height, 0))
     enu = fit_similarity(frame - middle, geodetic_to_enu(geodetic, origin))
     centers = enu.apply(np.array([view.center for view in views]) - middle)
     moved = [
@@ -255,13 +260,14 @@ def _crs(chunk: ElementTree.Element, path: Path) -> pyproj.CRS | None:
     except pyproj.exceptions.CRSError:
         raise InputError(f"{path}: its CRS cannot be understood: {text[:80]}") from None
     crs = crs.sub_crs_list[0] if crs.is_compound else crs
-    crs = crs.source_crs if crs.is_bound else crs
-    return pyproj.CRS.from_epsg(crs.to_epsg()) if crs.to_epsg() else crs
+    base = crs.source_crs if crs.is_bound else None
+    crs = crs if base is None else base
+    epsg = crs.to_epsg()
+    return pyproj.CRS.from_epsg(epsg) if epsg else crs
 
 
-def _geodetic(points: np.ndarray, crs: pyproj.CRS) -> np.ndarray:
+def _geodetic(points: np.ndarray, ellipsoid: pyproj.crs.Ellipsoid, geographic: pyproj.CRS) -> np.ndarray:
     """(N, 3) latitude, longitude, height on WGS 84 of geocentric coordinates on the datum of a CRS."""
-    ellipsoid, geographic = crs.ellipsoid, crs.geodetic_crs
     cart = pyproj.Transformer.from_pipeline(
         f"+proj=pipeline +step +inv +proj=cart +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r} +step +proj=unitconvert +xy_in=rad +xy_out=deg"
     )

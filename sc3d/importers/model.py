@@ -39,7 +39,7 @@ def write_project(
         observations = guess_observations(project.views, points)
         told = told.replace("from the project", "from the project, seen where they are nearest")
     if project.model is not None and len(project.points):
-        write_copy(scene.sparse, project)
+        write_copy(scene.sparse, project.model, project)
     else:
         write_model(scene.sparse, build_model(project.views, points, colors, observations))
     if photos is not None:
@@ -59,11 +59,10 @@ def _sparse_points(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
     return sample(geometry.positions, gray if geometry.colors is None else geometry.colors)
 
 
-def write_copy(path: Path, project: Project) -> None:
+def write_copy(path: Path, model: pycolmap.Reconstruction, project: Project) -> None:
     """Write the COLMAP model that a project was read from, with the names and the frame of the project; all
     else in it is kept.
     """
-    model = project.model
     for image, view in zip(registered_images(model), project.views, strict=True):
         image.name = view.name
     if project.offset.any():

@@ -41,7 +41,8 @@ def read(path: Path, settings: Import) -> Project:
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise InputError(f"{file} has no list of frames")
     original, scale = _original_from_saved(content, file)
-    cameras, views = {}, []
+    cameras: dict[DistortionModel, pycolmap.Camera] = {}
+    views = []
     for number, frame in enumerate(content["frames"]):
         where = f"{file}, frame {number}"
         name = str(frame.get("file_path", "")) if isinstance(frame, dict) else ""
@@ -51,9 +52,9 @@ def read(path: Path, settings: Import) -> Project:
         world_from_cam = original[:3, :3] @ matrix[:3, :3] * OPENGL
         center = original[:3, :3] @ (matrix[:3, 3] / scale) + original[:3, 3]
         distortion = _distortion_model(content, frame, file.parent / name, where)
-        camera = cameras.setdefault(distortion, None) or to_camera(distortion, settings.tolerance, where)
-        cameras[distortion] = camera
-        views.append(View(_tidy(name), camera, rigid(world_from_cam.T, center, where)))
+        if distortion not in cameras:
+            cameras[distortion] = to_camera(distortion, settings.tolerance, where)
+        views.append(View(_tidy(name), cameras[distortion], rigid(world_from_cam.T, center, where)))
     points, colors = _points(file.parent, content, original, scale)
     return Project(
         "nerfstudio",
@@ -66,30 +67,37 @@ def read(path: Path, settings: Import) -> Project:
 
 
 def _distortion_model(content: dict, frame: dict, photo: Path, where: str) -> DistortionModel:
-    """Parameters of a frame: those at the top of the file count first, as in nerfstudio."""
+    """Parameters of a frame: those at the top of the file count first, as in nerfstudio; null says nothing."""
 
-    def number(key: str, default: float | None = None) -> float | None:
-        value = content.get(key, frame.get(key, default))
+    def stated(key: str) -> float | None:
+        value = next((table[key] for table in (content, frame) if table.get(key) is not None), None)
         try:
             return None if value is None else float(value)
         except (TypeError, ValueError):
             raise InputError(f"{where}: {key} is no number") from None
+
+    def number(key: str, default: float) -> float:
+        value = stated(key)
+        return default if value is None else value
 
     model = str(content.get("camera_model", frame.get("camera_model", "OPENCV")))
     if model not in PERSPECTIVE | {"OPENCV_FISHEYE"}:
         raise InputError(
             f"{where}: the camera model {model} has no COLMAP model that is known here; {', '.join(sorted(PERSPECTIVE))} and OPENCV_FISHEYE have"
         )
-    width, height = number("w"), number("h")
+    width, height = stated("w"), stated("h")
     if width is None or height is None:
         width, height = image_size(photo)
-    angle = number("camera_angle_x")
-    focal = number("fl_x", width / 2 / np.tan(angle / 2) if angle else None)
+    angle, focal = stated("camera_angle_x"), stated("fl_x")
+    if focal is None and angle:
+        focal = width / 2 / float(np.tan(angle / 2))
     if focal is None:
         raise InputError(f"{where}: neither fl_x nor camera_angle_x is given")
     listed = content.get("distortion_params", frame.get("distortion_params"))
     k1, k2, k3, k4, p1, p2 = (
-        listed if listed is not None else [number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+        [number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+        if listed is None
+        else [float(value) for value in listed]
     )
     fisheye = model == "OPENCV_FISHEYE"
     return DistortionModel(

@@ -21,8 +21,8 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.georeferencing.control_points import parse_crs
-from sc3d.georeferencing.georeference import Georeference, from_origin
-from sc3d.importers.project import Project, rigid
+from sc3d.georeferencing.georeference import Georeference, from_origin, triple
+from sc3d.importers.project import Project, require, rigid
 from sc3d.io.json_files import read_json
 from sc3d.settings.reconstruction import Import
 
@@ -50,7 +50,7 @@ def matches(path: Path) -> bool:
 
 
 def files(path: Path) -> list[Path]:
-    folder = _folder(path)
+    folder = require(_folder(path), path, EXPECTED)
     return [
         folder / FILE,
         folder / TOPOCENTRIC,
@@ -60,7 +60,7 @@ def files(path: Path) -> list[Path]:
 
 
 def read(path: Path, settings: Import) -> Project:
-    folder = _folder(path)
+    folder = require(_folder(path), path, EXPECTED)
     file = next(
         file
         for file in (path if path.is_file() else folder / TOPOCENTRIC, folder / TOPOCENTRIC, folder / FILE)
@@ -125,18 +125,20 @@ def _distortion_model(camera: dict, where: str) -> DistortionModel:
     try:
         width, height = int(camera["width"]), int(camera["height"])
         size = max(width, height)
-        focal = [float(camera.get(key, camera.get("focal", "nan"))) * size for key in ("focal_x", "focal_y")]
         if kind in ("perspective", "fisheye"):
-            focal = [float(camera["focal"]) * size] * 2
+            fx = fy = float(camera["focal"]) * size
+        else:
+            fx, fy = (
+                float(camera.get(key, camera.get("focal", "nan"))) * size for key in ("focal_x", "focal_y")
+            )
         principal = (
             float(camera.get("c_x", 0)) * size + width / 2,
             float(camera.get("c_y", 0)) * size + height / 2,
         )
         radial = tuple(float(camera.get(name, 0)) for name in (PERSPECTIVE | FISHEYE)[kind])
-        tangential = (
-            tuple(float(camera.get(name, 0)) for name in ("p1", "p2"))
-            if kind in ("brown", "fisheye62", "fisheye624")
-            else (0.0, 0.0)
+        p1, p2 = (
+            float(camera.get(name, 0)) if kind in ("brown", "fisheye62", "fisheye624") else 0.0
+            for name in ("p1", "p2")
         )
         prism = [float(camera.get(f"s{number}", 0)) for number in range(4)]
     except (KeyError, TypeError, ValueError) as error:
@@ -148,10 +150,10 @@ def _distortion_model(camera: dict, where: str) -> DistortionModel:
     return DistortionModel(
         width,
         height,
-        tuple(focal),
+        (fx, fy),
         principal,
         radial,
-        tangential,
+        (p1, p2),
         kind in FISHEYE,
         prism=(prism[0], prism[2]) if kind == "fisheye624" else (0.0, 0.0),
     )
@@ -186,11 +188,11 @@ def _points(points: dict, file: Path) -> tuple[np.ndarray, np.ndarray, dict[str,
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file} has points that cannot be used ({error!r})") from None
     kept, colors = np.isfinite(positions).all(axis=1), np.nan_to_num(colors)
-    names = [name for name, keep in zip(points, kept) if keep]
+    names = list(points)
     return (
         positions[kept],
         np.clip(np.rint(colors[kept]), 0, 255).astype(np.uint8),
-        {str(name): row for row, name in enumerate(names)},
+        {str(names[old]): row for row, old in enumerate(np.flatnonzero(kept))},
     )
 
 
@@ -223,7 +225,7 @@ def _georeference(part: dict, file: Path, root: Path, views: list[View]) -> Geor
     if reference is None:
         return None
     try:
-        return from_origin(tuple(float(reference[key]) for key in ("latitude", "longitude", "altitude")))
+        return from_origin(triple(reference[key] for key in ("latitude", "longitude", "altitude")))
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{file}: reference_lla has no latitude, longitude and altitude") from None
 

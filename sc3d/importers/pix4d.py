@@ -11,13 +11,14 @@ import logging
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pyproj
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, to_camera
-from sc3d.georeferencing.georeference import Georeference
-from sc3d.importers.project import Project, rigid
+from sc3d.georeferencing.georeference import Georeference, triple
+from sc3d.importers.project import Project, require, rigid
 from sc3d.settings.reconstruction import Import
 
 logger = logging.getLogger(__name__)
@@ -34,11 +35,12 @@ def matches(path: Path) -> bool:
 
 
 def files(path: Path) -> list[Path]:
-    return [_file(path), *_place_files(_file(path))]
+    file = require(_file(path), path, EXPECTED)
+    return [file, *_place_files(file)]
 
 
 def read(path: Path, settings: Import) -> Project:
-    file = _file(path)
+    file = require(_file(path), path, EXPECTED)
     try:
         lines = [
             (number, line.strip())
@@ -54,7 +56,7 @@ def read(path: Path, settings: Import) -> Project:
         raise InputError(
             f"{file} is cut off or of another layout: {LINES} lines per photo are expected after the header, {len(body)} lines are there"
         )
-    cameras: dict[DistortionModel, object] = {}
+    cameras: dict[DistortionModel, pycolmap.Camera] = {}
     views = []
     for start in range(0, len(body), LINES):
         name, distortion, rotation, center = _block(body[start : start + LINES], file)
@@ -148,9 +150,10 @@ def _georeference(file: Path) -> Georeference | None:
             f"{projection} or {offset_file} cannot be understood: a WKT of a CRS and three numbers are expected"
         ) from None
     crs = crs.sub_crs_list[0] if crs.is_compound else crs
-    if not crs.is_projected or crs.to_epsg() is None or offset.shape != (3,):
+    epsg = crs.to_epsg()
+    if not crs.is_projected or epsg is None or offset.shape != (3,):
         logger.warning(
             "%s: %s has no EPSG code of a projected CRS: the place stays unknown", projection, crs.name
         )
         return None
-    return Georeference(crs.to_epsg(), tuple(offset.tolist()))
+    return Georeference(epsg, triple(offset))

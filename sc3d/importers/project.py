@@ -99,6 +99,13 @@ def find_importer(path: Path, source: str) -> ModuleType:
     raise InputError(f"{path} is no {source} project: {modules[0].EXPECTED}")
 
 
+def require(found: Path | None, path: Path, expected: str) -> Path:
+    """What an importer found at a path; InputError if that is nothing, with what is `expected` there."""
+    if found is None:
+        raise InputError(f"{path}: {expected}")
+    return found
+
+
 def rigid(rotation: np.ndarray, center: np.ndarray, where: str) -> np.ndarray:
     """(4, 4) cam_from_world of a camera at `center` (3,); `rotation` (3, 3) cam from world up to rounding.
     InputError if it is none.
