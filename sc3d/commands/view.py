@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sc3d.errors import InputError
@@ -23,11 +24,11 @@ def main(command: ViewCommand) -> None:
     views = scene.model.views if scene.sparse.is_dir() else []
     photo = None if command.photo is None else _find_photo(command.photo, views, scene)
     if command.flight is not None:
-        _write_flight(command, scene)
+        _write_flight(command.flight, command, scene)
     if command.web or command.html is not None:
         _show_page(command, scene, views)
     elif command.screenshot is not None:
-        _write_picture(command, scene, views, photo)
+        _write_picture(command.screenshot, command, scene, views, photo)
     elif command.flight is None:
         _open_window(command, scene, views)
 
@@ -70,17 +71,19 @@ def _find_photo(name: str, views: list[View], scene: Scene) -> View:
     return photo
 
 
-def _write_flight(command: ViewCommand, scene: Scene) -> None:
+def _write_flight(path: Path, command: ViewCommand, scene: Scene) -> None:
     from sc3d.view.display_splats import splats_colored_by
     from sc3d.view.flight_video import write_flight
 
     by = command.by if command.splats else "photo"
     splats = splats_colored_by(scene, by, command.classes)
-    write_flight(command.flight, splats, by, scene.model.views, command.size)
-    logger.info("wrote %s", command.flight)
+    write_flight(path, splats, by, scene.model.views, command.size)
+    logger.info("wrote %s", path)
 
 
-def _write_picture(command: ViewCommand, scene: Scene, views: list[View], photo: View | None) -> None:
+def _write_picture(
+    path: Path, command: ViewCommand, scene: Scene, views: list[View], photo: View | None
+) -> None:
     from sc3d.view.display_cloud import class_ids, load_cloud, only_classes
     from sc3d.view.display_splats import splats_colored_by
     from sc3d.view.screenshot import Style, screenshot, screenshot_splats
@@ -96,8 +99,8 @@ def _write_picture(command: ViewCommand, scene: Scene, views: list[View], photo:
         cloud = load_cloud(scene, command.file, votes=command.by == "disagreement")
         cloud = only_classes(cloud, class_ids(table, command.classes))
         image = screenshot(cloud, photo, command.size, style, table)
-    write_image(command.screenshot, image)
-    logger.info("wrote %s", command.screenshot)
+    write_image(path, image)
+    logger.info("wrote %s", path)
 
 
 def _open_window(command: ViewCommand, scene: Scene, views: list[View]) -> None:
@@ -127,7 +130,7 @@ def _show_page(command: ViewCommand, scene: Scene, views: list[View]) -> None:
     splats_first = command.splats or not has_cloud
     splats = best_splats(scene) if splats_first else None
     votes = True if by == "disagreement" else None
-    cloud = load_cloud(scene, command.file, votes) if has_cloud else splats.centers()
+    cloud = load_cloud(scene, command.file, votes) if has_cloud or splats is None else splats.centers()
     inspector = Inspector.from_scene(scene, cloud, views)
     if splats_first and not can_color(cloud, by):
         by = "photo"

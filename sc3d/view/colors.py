@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import open3d as o3d
 
 Coloring = Literal["photo", "label", "confidence", "state", "disagreement"]
-COLORINGS: tuple[str, ...] = get_args(Coloring)
+COLORINGS: tuple[Coloring, ...] = get_args(Coloring)
 
 
 class State(NamedTuple):
@@ -70,7 +70,10 @@ def color_points(
     if not can_color(cloud, by):
         raise InputError(_MAKERS[by])
     if by == "disagreement":
-        return disagreement_colors(disagreement(read_votes(cloud)))
+        votes = read_votes(cloud)
+        if votes is None:  # those of some classes are missing
+            raise InputError(_MAKERS[by])
+        return disagreement_colors(disagreement(votes))
     values = _attributes(cloud)[_ATTRIBUTES[by]].cpu().numpy()
     if by == "photo":
         return as_uint8(values)
@@ -149,8 +152,10 @@ def legend_entries(
     if by != "label" or class_table is None:
         return []
     entries = [(entry.name, entry.color) for entry in class_table if present is None or entry.id in present]
-    unlabelled = [("unlabelled", tuple(int(value) for value in class_table.palette[0]))]
-    return entries + (unlabelled if present is None or 0 in present else [])
+    if present is None or 0 in present:
+        red, green, blue = class_table.palette[0].tolist()
+        entries.append(("unlabelled", (red, green, blue)))
+    return entries
 
 
 class ColorScale(NamedTuple):
@@ -179,7 +184,7 @@ def shaded(colors: np.ndarray, normals: np.ndarray) -> np.ndarray:
         colors on level ground
     """
     lengths = np.linalg.norm(normals, axis=1)
-    cosine = normals @ np.float32(_LIGHT) / np.where(lengths > 0, lengths, 1)
+    cosine = normals @ np.array(_LIGHT, np.float32) / np.where(lengths > 0, lengths, 1)
     light = np.where(lengths > 0, _AMBIENT + (1 - _AMBIENT) * np.clip(cosine, 0, 1) / _LIGHT[2], 1)
     return np.round(np.clip(colors * light[:, None], 0, 255)).astype(np.uint8)
 

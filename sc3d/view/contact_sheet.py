@@ -165,7 +165,7 @@ def _heads(
     sheet.paste(Image.fromarray(bar), (round(start), middle - size // 2))
     place = lefts[3] + font.getlength("normals   ")
     for name, direction in (("up", (0, 0, 1)), ("+x", (1, 0, 0)), ("+y", (0, 1, 0))):
-        color = tuple(normal_colors(np.float32([[direction]]))[0, 0].tolist())
+        color = tuple(normal_colors(np.array([[direction]], np.float32))[0, 0].tolist())
         draw.rectangle((place, middle - size // 2, place + size, middle + size // 2), fill=color)
         draw.text((place + 1.4 * size, middle), name, font=font, fill=INK, anchor="lm")
         place += 1.4 * size + font.getlength(name + "   ")

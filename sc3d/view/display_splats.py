@@ -7,7 +7,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,14 @@ logger = logging.getLogger(__name__)
 SPLAT_COLORINGS: tuple[Coloring, ...] = ("photo", "label", "confidence")
 
 
+class SplatLabels(NamedTuple):
+    """As in `DisplaySplats`."""
+
+    label: np.ndarray
+    confidence: np.ndarray
+    table: ClassTable
+
+
 @dataclass(frozen=True)
 class DisplaySplats:
     """N Gaussians in the frame shifted by `origin` (3,), and their labels where `sc3d export --format splats`
@@ -42,6 +50,13 @@ class DisplaySplats:
     label: np.ndarray | None = None
     confidence: np.ndarray | None = None
     table: ClassTable | None = None
+
+    @property
+    def labels(self) -> SplatLabels | None:
+        """What belongs together; None for gaussians.ply."""
+        if self.label is None or self.confidence is None or self.table is None:
+            return None
+        return SplatLabels(self.label, self.confidence, self.table)
 
     def painted(self, by: Coloring) -> Gaussians:
         """Class colors or confidences instead of the photos' colors. InputError if there are no labels."""
@@ -63,21 +78,23 @@ class DisplaySplats:
             )
         if by not in SPLAT_COLORINGS:
             raise InputError(f"splats have no {by}: choose --by photo, label or confidence")
-        if self.label is None:
+        labels = self.labels
+        if labels is None:
             raise InputError("the splats have no labels: run `sc3d export SCENE --format splats`")
-        return self.table.palette[self.label] if by == "label" else confidence_colors(self.confidence)
+        return labels.table.palette[labels.label] if by == "label" else confidence_colors(labels.confidence)
 
     def only(self, ids: set[int] | None) -> DisplaySplats:
         """Those of some classes, None = all. InputError if there are none."""
         if ids is None:
             return self
-        if self.label is None:
+        labels = self.labels
+        if labels is None:
             raise InputError(
                 "--classes needs labels, and the splats have none: run `sc3d export SCENE --format splats`"
             )
-        chosen = np.isin(self.label, sorted(ids))
+        chosen = np.isin(labels.label, sorted(ids))
         if not chosen.any():
-            names = ", ".join(self.table.name(label) for label in sorted(ids))
+            names = ", ".join(labels.table.name(label) for label in sorted(ids))
             raise InputError(f"no splat has one of the classes {names}: nothing to show or write")
         return self[chosen]
 
@@ -89,11 +106,10 @@ class DisplaySplats:
             o3d.core.Tensor(self.gaussians.means.numpy().astype(np.float64) + self.origin)
         )
         cloud.point.colors = o3d.core.Tensor(self.colors("photo"))
-        if self.label is not None:
-            cloud.point["label"], cloud.point["confidence"] = (
-                o3d.core.Tensor(self.label[:, None]),
-                o3d.core.Tensor(self.confidence[:, None]),
-            )
+        labels = self.labels
+        if labels is not None:
+            cloud.point["label"] = o3d.core.Tensor(labels.label[:, None])
+            cloud.point["confidence"] = o3d.core.Tensor(labels.confidence[:, None])
         return cloud
 
     def most_visible(self, count: int) -> DisplaySplats:
@@ -110,7 +126,8 @@ class DisplaySplats:
         label, confidence = (
             None if values is None else values[chosen] for values in (self.label, self.confidence)
         )
-        return replace(self, gaussians=self.gaussians[chosen], label=label, confidence=confidence)
+        gaussians = self.gaussians[chosen]  # type: ignore[index]  # tensors take NumPy's rows too
+        return replace(self, gaussians=gaussians, label=label, confidence=confidence)
 
 
 def trained_splats(scene: Scene) -> DisplaySplats:

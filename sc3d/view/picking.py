@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import open3d as o3d
@@ -94,7 +94,8 @@ class Inspector:
         """Looks points up as `label` saw them: with the voxel size that it wrote down."""
         table, voxel_size = scene.class_table() if scene.classes.exists() else None, None
         with suppress(InputError, KeyError, TypeError, ValueError):
-            voxel_size = float(read_json(sidecar(scene.seeds))["summary"]["voxel_size"])
+            record: Any = read_json(sidecar(scene.seeds))
+            voxel_size = float(record["summary"]["voxel_size"])
         return cls(cloud, views, table, scene.mesh, voxel_size)
 
     def nearest(self, position: np.ndarray) -> int:

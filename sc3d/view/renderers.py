@@ -119,7 +119,7 @@ def _tensor_geometries(renderable: Renderable) -> dict:
         )
         mesh.vertex.colors = colors
         # unused, but asked for
-        mesh.vertex.normals = tensor(np.tile(np.float32([0, 0, 1]), (len(renderable.points), 1)))
+        mesh.vertex.normals = tensor(np.tile(np.array([0, 0, 1], np.float32), (len(renderable.points), 1)))
         geometries["mesh"] = mesh
     elif renderable.triangles is None and len(renderable.points):
         cloud = o3d.t.geometry.PointCloud(points)

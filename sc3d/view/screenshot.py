@@ -119,9 +119,9 @@ def screenshot_splats(
     """
     from sc3d.view.splat_images import compare, rendered
 
-    labelled = splats.label is not None and style.by != "photo"
-    gaussians = splats.painted(style.by) if labelled else splats.gaussians
-    if view is None:
+    labels = splats.labels if style.by != "photo" else None
+    gaussians = splats.gaussians if labels is None else splats.painted(style.by)
+    if view is None or photo is None:
         seen = gaussians.means[gaussians.opacities > 0.5].numpy()
         points = without_outliers(seen if len(seen) else gaussians.means.numpy())
         image = rendered(gaussians, overview(points, size, style.from_above), style.background)
@@ -129,17 +129,15 @@ def screenshot_splats(
         source = view.shifted(splats.origin)
         target = fitted(source, half_of(size))
         pixels = resample(photo, source, target)
-        if labelled:
+        if labels is not None:
             drawn, caption = rendered(gaussians, target, style.background), f"splats by {style.by}"
         else:
             found = compare(gaussians, target, pixels)
             pixels, drawn, caption = found.photo, found.rendered, f"splats, PSNR {found.psnr:.2f} dB"
         image = side_by_side((pixels, drawn), (view.name, caption))
-    return (
-        add_legend(image, style.by, splats.table, set(np.unique(splats.label).tolist()))
-        if labelled
-        else image
-    )
+    if labels is None:
+        return image
+    return add_legend(image, style.by, labels.table, set(np.unique(labels.label).tolist()))
 
 
 def draw_points(points: np.ndarray, view: View | None, size: tuple[int, int], style: Style) -> PointImage:

@@ -5,8 +5,9 @@ clicked point. Needs a display.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -90,7 +91,7 @@ class _PanelWindow:
         self._add_cameras(lines)
         self._look()
 
-    def choose(self, by: str) -> None:
+    def choose(self, by: Coloring) -> None:
         """Color the cloud by an attribute and explain its colors."""
         self._radio.selected_index = self._display.colorings.index(by)
         colors = self._display.colors(by).astype(np.float32) / np.float32(255)
@@ -121,7 +122,7 @@ class _PanelWindow:
         self._scene.setup_camera(50.0, bounds, middle.astype(np.float32))
         self._scene.look_at(middle, middle + np.array([0.0, -0.75, 0.75]) * span, [0, 0, 1])
 
-    def _build_panel(self) -> object:
+    def _build_panel(self) -> Any:
         gui, half = self._gui, self._em // 2
         panel = gui.ScrollableVert(half, gui.Margins(self._em, self._em, self._em, self._em))
         panel.add_child(gui.Label("Color by"))
@@ -146,7 +147,7 @@ class _PanelWindow:
         panel.add_child(self._description)
         return panel
 
-    def _build_legend(self, by: str) -> object:
+    def _build_legend(self, by: Coloring) -> Any:
         gui, scale = self._gui, color_scale(by)
         legend = gui.Vert(self._em // 4, gui.Margins(0, self._em // 2, 0, self._em // 2))
         entries = legend_entries(by, self._display.class_table)
@@ -155,13 +156,15 @@ class _PanelWindow:
         for name, color in entries:
             row = gui.Horiz(self._em // 2)
             row.add_child(
-                gui.ImageWidget(o3d.geometry.Image(np.tile(np.uint8(color), (self._em, self._em, 1))))
+                gui.ImageWidget(
+                    o3d.geometry.Image(np.tile(np.array(color, np.uint8), (self._em, self._em, 1)))
+                )
             )
             row.add_child(gui.Label(name))
             legend.add_child(row)
         return legend
 
-    def _add_class_boxes(self, panel: object) -> None:
+    def _add_class_boxes(self, panel: Any) -> None:
         if self._display.class_table is None or "label" not in self._display.cloud.point:
             return
         panel.add_child(self._gui.Label("Classes"))
@@ -171,10 +174,10 @@ class _PanelWindow:
                 panel,
                 name,
                 label not in self._hidden,
-                lambda visible, label=label: self._show_class(label, visible),
+                partial(self._show_class, label),
             )
 
-    def _add_box(self, panel: object, name: str, checked: bool, changed: object) -> None:
+    def _add_box(self, panel: Any, name: str, checked: bool, changed: Callable[[bool], None]) -> None:
         box = self._gui.Checkbox(name)
         box.checked = checked
         box.set_on_checked(changed)
@@ -197,7 +200,7 @@ class _PanelWindow:
         for label in self._display.class_counts:
             self._scene.scene.modify_geometry_material(f"class {label}", self._material)
 
-    def _on_mouse(self, event: object) -> object:
+    def _on_mouse(self, event: Any) -> Any:
         gui = self._gui
         if event.type != gui.MouseEvent.Type.BUTTON_DOWN or not event.is_modifier_down(gui.KeyModifier.CTRL):
             return gui.Widget.EventCallbackResult.IGNORED
@@ -295,7 +298,7 @@ class _KeyWindow:
         display: DisplayCloud,
         inspector: Inspector,
         hidden: set[int],
-        by: str,
+        by: Coloring,
     ) -> None:
         self._visualizer, self._display, self._inspector = visualizer, display, inspector
         self._hidden, self._by = hidden, by
@@ -303,7 +306,7 @@ class _KeyWindow:
         self._fill()
         visualizer.add_geometry(self._cloud)
 
-    def choose(self, by: str) -> bool:
+    def choose(self, by: Coloring) -> bool:
         """Color by an attribute."""
         self._by = by
         return self._update()

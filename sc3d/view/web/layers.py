@@ -5,7 +5,7 @@ and the cameras.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,7 +41,7 @@ class CloudLayer:
         display: DisplayCloud,
         root: str,
         by: Coloring,
-        hidden: set[int] = frozenset(),
+        hidden: Collection[int] = (),
     ) -> None:
         self._scene, self._display, self._by, self._relief, self._scale = server.scene, display, by, True, 1.0
         self._root = server.scene.add_frame(f"/{root}", show_axes=False)
@@ -132,7 +132,7 @@ class SplatLayer:
         load: Callable[[], DisplaySplats],
         display: DisplayCloud,
         by: Coloring,
-        hidden: set[int] = frozenset(),
+        hidden: Collection[int] = (),
     ) -> None:
         """load: reads them; display: has the frame of the viewer and the class table"""
         self._server, self._load, self._display, self._by, self._hidden = (
@@ -152,7 +152,7 @@ class SplatLayer:
         with self._lock:
             self._by = by
             if self._splats is not None:
-                colors = self._colors()
+                colors = self._colors(self._splats)
                 for rows, handle in self._nodes.values():
                     handle.rgbs = colors[rows]
 
@@ -160,7 +160,7 @@ class SplatLayer:
         """Show or hide a class; splats without labels stay."""
         with self._lock:
             (self._hidden.discard if visible else self._hidden.add)(label)
-            if label in self._nodes and self._splats.label is not None:
+            if label in self._nodes and self._splats is not None and self._splats.label is not None:
                 self._nodes[label][1].visible = visible
 
     def show(self, visible: bool) -> None:
@@ -173,7 +173,7 @@ class SplatLayer:
 
     def _add(self) -> None:
         splats = self._splats = self._load()
-        scene, gaussians, colors = self._server.scene, splats.gaussians, self._colors()
+        scene, gaussians, colors = self._server.scene, splats.gaussians, self._colors(splats)
         self._root = scene.add_frame("/splats", show_axes=False)
         means, opacities = (
             gaussians.means.numpy() + (splats.origin - self._display.origin),
@@ -195,9 +195,9 @@ class SplatLayer:
             )
             self._nodes[present] = rows, handle
 
-    def _colors(self) -> np.ndarray:
-        labelled = self._splats.label is not None and self._by in SPLAT_COLORINGS
-        return self._splats.colors(self._by if labelled else "photo")
+    def _colors(self, splats: DisplaySplats) -> np.ndarray:
+        labelled = splats.label is not None and self._by in SPLAT_COLORINGS
+        return splats.colors(self._by if labelled else "photo")
 
 
 class CameraLayer:
@@ -206,7 +206,7 @@ class CameraLayer:
     def __init__(self, server: viser.ViserServer, views: Sequence[View], depth: float) -> None:
         """depth: length of the pyramids, world units"""
         self._root = server.scene.add_frame("/cameras", show_axes=False)
-        self._handles = {}
+        self._handles: dict[str, viser.CameraFrustumHandle] = {}
         for view in views:
             pinhole = undistorted(view)
             fov, aspect = field_of_view(pinhole)
@@ -227,7 +227,7 @@ class CameraLayer:
     def on_click(self, chosen: Callable[[str, viser.ClientHandle], None]) -> None:
         """Call `chosen` with the name of the photo whose camera is clicked, and the browser."""
         for name, handle in self._handles.items():
-            handle.on_click(lambda event, name=name: chosen(name, event.client))
+            _call_on_click(handle, name, chosen)
 
     def set_images(self, images: dict[str, np.ndarray]) -> None:
         """Photos in the pyramids of these cameras, and of no others: (h, w, 3) uint8 RGB by name."""
@@ -248,6 +248,12 @@ class CameraLayer:
     def show(self, visible: bool) -> None:
         """Show or hide all of them."""
         self._root.visible = visible
+
+
+def _call_on_click(
+    handle: viser.CameraFrustumHandle, name: str, chosen: Callable[[str, viser.ClientHandle], None]
+) -> None:
+    handle.on_click(lambda event: chosen(name, event.client))
 
 
 def node_name(table: ClassTable | None, label: int) -> str:

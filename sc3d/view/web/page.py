@@ -133,10 +133,9 @@ def write_page(path: Path, view: WebView) -> None:
             layer = CloudLayer(server, display, f"cloud by {by}", by, hidden)
             layer.show_points(min(len(display.points), view.num_points or FILE_POINTS))
             layer.show(by == view.by and not view.splats_first)
-        if view.splats_first:
-            SplatLayer(
-                server, lambda: view.load_splats().most_visible(FILE_SPLATS), display, view.by, hidden
-            ).show(True)
+        load = view.load_splats
+        if view.splats_first and load is not None:
+            SplatLayer(server, lambda: load().most_visible(FILE_SPLATS), display, view.by, hidden).show(True)
         views = [one.shifted(display.origin) for one in view.drawn_views]
         CameraLayer(server, views, frustum_depth(views, display.points) if views else 1.0)
         _start(server, view, display, views)

@@ -52,12 +52,13 @@ class ShowPanel:
     def __init__(self, page: Page, by: Coloring, hidden: set[int], splats_first: bool) -> None:
         self._page, self.hidden, gui = page, set(hidden), page.server.gui
         with gui.add_folder("Show"):
-            if page.splats is not None:
+            splats = page.splats
+            if splats is not None:
                 layers = gui.add_dropdown(
                     "Layers", ("cloud", "splats", "both"), initial_value="splats" if splats_first else "cloud"
                 )
-                layers.on_update(lambda _: self._choose_layers(layers.value))
-                self._choose_layers(layers.value)
+                layers.on_update(lambda _: self._choose_layers(layers.value, splats))
+                self._choose_layers(layers.value, splats)
             self._by = gui.add_dropdown("Color by", page.display.colorings, initial_value=by)
             self._legend = gui.add_html(legend_html(by, page.display))
             has_relief = page.display.has_relief
@@ -98,15 +99,16 @@ class ShowPanel:
             *(label for label in counts if label),
             *([0] if 0 in counts or self._page.splats is not None else []),
         ]:
-            box = gui.add_checkbox(
-                table.name(label), label not in self.hidden, hint=f"{counts.get(label, 0):,} points"
-            )
-            box.on_update(lambda _, label=label, box=box: self._show_class(label, box.value))
+            self._add_class(gui, label, table.name(label), counts.get(label, 0))
 
-    def _choose_layers(self, name: str) -> None:
+    def _add_class(self, gui: viser.GuiApi, label: int, name: str, count: int) -> None:
+        box = gui.add_checkbox(name, label not in self.hidden, hint=f"{count:,} points")
+        box.on_update(lambda _: self._show_class(label, box.value))
+
+    def _choose_layers(self, name: str, splats: SplatLayer) -> None:
         self._page.cloud.show(name != "splats")
         try:
-            self._page.splats.show(name != "cloud")
+            splats.show(name != "cloud")
         except Sc3dError as error:  # they are read when they are first shown
             logger.warning("the splats cannot be shown: %s", error)
 
@@ -143,7 +145,8 @@ class PhotoPanel:
 
     def choose(self, name: str) -> None:
         """Show a photo."""
-        self._names.value = name  # calls `_show`
+        # calls `_show`
+        self._names.value = name  # type: ignore[misc]  # viser defines the setter apart from its property
 
     def _show(self, name: str) -> None:
         self._page.cameras.hide(None)
