@@ -91,7 +91,11 @@ def reliability_curve(bins: Sequence[tuple[float | None, float | None, float | N
         pixels
     """
     height, width = 190, 100 / len(bins)
-    filled = [(*entry, position) for position, entry in enumerate(bins) if None not in entry]
+    filled = [
+        (confidence, accuracy, share, position)
+        for position, (confidence, accuracy, share) in enumerate(bins)
+        if confidence is not None and accuracy is not None and share is not None
+    ]
     largest = max([share for _, _, share, _ in filled], default=0) or 1
     parts = [
         f'<line class="axis" x1="0" x2="100%" y1="{y:g}" y2="{y:g}"/>' for y in (0.5, height / 2, height)

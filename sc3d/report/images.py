@@ -15,7 +15,7 @@ from sc3d.geometry.cameras import View
 from sc3d.io.images import data_uri, read_image, read_index_image
 from sc3d.report.data import ReportData
 from sc3d.scene.labelled_cloud import LabelledSurface
-from sc3d.view.colors import COLORINGS, color_points
+from sc3d.view.colors import COLORINGS, Coloring, color_points
 from sc3d.view.screenshot import Style, draw_points, screenshot
 
 logger = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ def cloud_pictures(data: ReportData) -> dict[tuple[str, str], tuple[str, float]]
     """Data URIs and width/height by (coloring or "mesh", "oblique" or "above"), of what the cloud has; empty
     where no renderer works.
     """
-    pictures = {}
+    pictures: dict[tuple[str, str], tuple[str, float]] = {}
     try:
         for direction, size in _SIZES.items():
             style = Style(
@@ -48,7 +48,7 @@ def cloud_pictures(data: ReportData) -> dict[tuple[str, str], tuple[str, float]]
     return pictures
 
 
-def _colorings(data: ReportData) -> dict[str, np.ndarray]:
+def _colorings(data: ReportData) -> dict[Coloring, np.ndarray]:
     """(N, 3) uint8 RGB by coloring, for the attributes that the cloud has."""
     found = {}
     for by in COLORINGS:
@@ -122,7 +122,7 @@ def ground_picture(
 
 def _picture(image: np.ndarray) -> tuple[str, float]:
     """Data URI and aspect of a picture without its empty border, but for a margin."""
-    filled = (image != np.uint8(BACKGROUND)).any(axis=2)
+    filled = (image != np.array(BACKGROUND, np.uint8)).any(axis=2)
     rows, columns = np.flatnonzero(filled.any(axis=1)), np.flatnonzero(filled.any(axis=0))
     if len(rows):
         image = image[max(0, rows[0] - 20) : rows[-1] + 21, max(0, columns[0] - 20) : columns[-1] + 21]

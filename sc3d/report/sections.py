@@ -6,9 +6,11 @@ import json
 from collections.abc import Iterator
 from html import escape
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
+from sc3d.geometry.cameras import View
 from sc3d.io.images import data_uri, read_image
 from sc3d.report.charts import (
     css_color,
@@ -23,10 +25,10 @@ from sc3d.report.charts import (
 from sc3d.report.data import ReportData, class_areas, read_features
 from sc3d.report.images import cloud_pictures, comparison, ground_picture
 from sc3d.scene.labelled_cloud import LabelledSurface
-from sc3d.view.colors import STATES, color_points, confidence_colors, legend_entries
+from sc3d.view.colors import STATES, Coloring, color_points, confidence_colors, legend_entries
 
 _NUM_PHOTOS = 4
-_COLORING_NAMES = {
+_COLORING_NAMES: dict[Coloring | Literal["mesh"], str] = {
     "label": "Classes",
     "photo": "Photo colors",
     "confidence": "Confidence",
@@ -151,8 +153,7 @@ def quality_section(data: ReportData) -> str:
 
 def photo_section(data: ReportData) -> str:
     """A handful of photos with mask, fused labels and truth."""
-    chosen, rows = _choose_views(data), []
-    labelled = None
+    chosen, rows, labelled = _choose_views(data), list[str](), None
     if chosen and data.label_counts is not None:
         labelled = LabelledSurface.build(data.cloud, data.views, data.scene.mesh)
     for view in chosen:
@@ -193,19 +194,17 @@ def training_section(data: ReportData) -> str:
     )
 
 
-def _choose_views(data: ReportData) -> list:
+def _choose_views(data: ReportData) -> list[View]:
     """Photos spread evenly over the flight; those with truth first, then those with a mask."""
 
-    def with_file(folder: Path) -> list:
+    def with_file(folder: Path) -> list[View]:
         return [view for view in data.views if (folder / f"{Path(view.name).stem}.png").exists()]
 
     views = with_file(data.truth) or with_file(data.scene.masks) or data.views
-    chosen = (
-        np.unique(np.linspace(0, len(views) - 1, min(_NUM_PHOTOS, len(views))).round().astype(int))
-        if views
-        else []
-    )
-    return [views[position] for position in chosen]
+    if not views:
+        return []
+    chosen = np.linspace(0, len(views) - 1, min(_NUM_PHOTOS, len(views))).round().astype(int)
+    return [views[position] for position in np.unique(chosen)]
 
 
 def _photo_figures(data: ReportData, name: str) -> str:
@@ -223,8 +222,10 @@ def _photo_figures(data: ReportData, name: str) -> str:
     return " ".join(f"<small>{text} {value:.1%} right</small>" for text, value in found if value is not None)
 
 
-def _legend(data: ReportData, by: str, everything: bool = False) -> str:
+def _legend(data: ReportData, by: Coloring | Literal["mesh"], everything: bool = False) -> str:
     """What the colors mean; of classes and states only those that the cloud has, unless `everything`."""
+    if by == "mesh":
+        return ""
     if by == "confidence":
         stops = ", ".join(css_color(color) for color in confidence_colors(np.linspace(0, 1, 9)))
         return f'<p class="legend">confidence 0 <i class="ramp" style="background:linear-gradient(90deg, {stops})"></i> 1</p>'
@@ -295,14 +296,10 @@ def iou_of(data: ReportData, source: str) -> dict[str, float | None]:
 
 
 def _class_table(data: ReportData) -> str:
-    counts = data.label_counts
-    if counts is None or data.class_table is None or not len(data.points):
+    counts, labels = data.label_counts, data.values("label")
+    if counts is None or labels is None or data.class_table is None or not len(data.points):
         return ""
-    labels, confidence, iou = (
-        data.values("label"),
-        data.values("confidence"),
-        iou_of(data, "labels"),
-    )
+    confidence, iou = data.values("confidence"), iou_of(data, "labels")
     areas = class_areas(data.points, labels.astype(np.uint8))
     sums, rows = (
         None if confidence is None else np.bincount(labels, np.nan_to_num(confidence), minlength=256),
@@ -405,11 +402,11 @@ def _reliability(data: ReportData) -> list[str]:
         or not all(row is None or isinstance(row, list) and len(row) == 3 for row in rows)
     ):
         return []
-    bins = [(None, None, None) if row is None else tuple(number(value) for value in row) for row in rows]
-    if any(None in row and any(value is not None for value in row) for row in bins):
+    found = [[None] * 3 if row is None else [number(value) for value in row] for row in rows]
+    if any(None in row and any(value is not None for value in row) for row in found):
         return []
-    pixels = sum(count or 0 for _, _, count in bins)
-    bins = [(confidence, accuracy, count and count / max(pixels, 1)) for confidence, accuracy, count in bins]
+    pixels = sum(count or 0 for _, _, count in found)
+    bins = [(confidence, accuracy, count and count / max(pixels, 1)) for confidence, accuracy, count in found]
     error = number(figures.get("ece"))
     note = "Share of right pixels (dots) against the confidence of their label; on the line, confidence is exactly that share. Bars: share of the pixels."
     if error is not None:
@@ -423,9 +420,10 @@ def processing_section(data: ReportData) -> str:
         return ""
     rows, details = [], []
     for record in data.records:
-        summary = record.get("summary") if isinstance(record.get("summary"), dict) else {}
+        summary = record.get("summary")
+        figures = summary if isinstance(summary, dict) else {}
         text = "; ".join(
-            f"{key} {_plain(value)}" for key, value in summary.items() if not isinstance(value, dict | list)
+            f"{key} {_plain(value)}" for key, value in figures.items() if not isinstance(value, dict | list)
         )
         rows.append(
             f"<tr><th>{escape(record['stage'])}</th><td>{formatted(number(record.get('seconds')), ',.1f')}</td>"
