@@ -91,7 +91,7 @@ class AnnotationServer(ThreadingHTTPServer):
     def server_bind(self) -> None:
         """Without the look-up of the machine's name that HTTPServer does, which may take seconds."""
         TCPServer.server_bind(self)
-        self.server_name, self.server_port = self.server_address
+        self.server_name, self.server_port = ADDRESS, self.server_address[1]
 
     def handle_error(self, request: object, client_address: object) -> None:
         """A browser that leaves in the middle of an answer is no error."""

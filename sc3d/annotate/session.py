@@ -101,7 +101,7 @@ class Session:
             for shape in self._plain(content, "the drawing", stem)
         ]
         width, height = self.sizes[stem]
-        head = {
+        head: dict[str, object] = {
             "version": "5.5.0",
             "flags": {},
             "imagePath": self.photos[stem].name,

@@ -51,7 +51,7 @@ class CloudWriter:
         """positions: (N, 3) float64; normals: (N, 3) float32; colors: (N, 3) uint8; label: (N, 1) uint8."""
         table = np.empty(len(positions), CLOUD)
         for name, column in zip(
-            CLOUD.names, [*positions.T, *normals.T, *colors.T, label.ravel()], strict=True
+            CLOUD.names or (), [*positions.T, *normals.T, *colors.T, label.ravel()], strict=True
         ):
             table[name] = column
         self.write(table)
