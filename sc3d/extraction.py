@@ -12,7 +12,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import open3d as o3d
-import torch
 from tqdm import tqdm
 
 from sc3d.errors import Sc3dError
@@ -23,7 +22,7 @@ from sc3d.geometry.tsdf import DepthFusion, Part, cloud_in_order, drop_small_par
 from sc3d.io.atomic import temporary_name
 from sc3d.settings.reconstruction import Extract
 from sc3d.splatting.consistency import blocking, consistent, pixel_rays
-from sc3d.splatting.evaluation import depth_map
+from sc3d.splatting.evaluation import facing_depth
 from sc3d.splatting.gaussians import Gaussians
 
 MAX_ANGLE = 80.0  # degrees between ray and normal
@@ -142,7 +141,7 @@ def _complete(
     surface, data, parts = _surface(mesh), maps.data, []
     for row in tqdm(rows, desc="completing", unit="view", disable=None):
         view = data.views[row]
-        first, depth = first_surface(surface, view), maps.read(row).numpy()
+        first, depth = first_surface(surface, view), maps.read(row)
         # where nothing is hit, or only something far behind
         before = depth < (1 - MARGIN) * first.range * first.ray_z
         squares, centers = pixel_squares(view, depth, data.image(row), before & accept(maps, row, first))
@@ -251,7 +250,8 @@ class _DepthMaps:
         """Write all maps; returns the median size of a pixel on the surface, world units."""
         footprints = []
         for row, view in enumerate(tqdm(self.data.views, desc="depth", unit="view", disable=None)):
-            depth = _reliable_depth(gaussians, view, self.data.depth_range)
+            depth, (nearest, farthest) = facing_depth(gaussians, view, MAX_ANGLE), self.data.depth_range
+            depth[(depth <= nearest) | (depth >= farthest)] = 0
             np.save(self.folder / f"{row}.npy", depth)
             if (depth > 0).any():
                 footprints.append(float(np.median(depth[depth > 0])) / view.focal)
@@ -259,8 +259,8 @@ class _DepthMaps:
             raise Sc3dError("no view shows a surface: train longer, or check the cameras")
         return float(np.median(footprints))
 
-    def read(self, row: int, kind: str = "") -> torch.Tensor:
-        return torch.from_numpy(np.load(self.folder / f"{row}{kind}.npy"))
+    def read(self, row: int, kind: str = "") -> np.ndarray:
+        return np.load(self.folder / f"{row}{kind}.npy")
 
     def counts(self, row: int, tolerance: float) -> np.ndarray:
         """(H, W) number of neighbors that see a pixel's surface within `tolerance` px of where this view has
@@ -269,12 +269,12 @@ class _DepthMaps:
         others = [
             (self.read(other), self.data.views[other]) for other in self.data.neighbors[row][:NUM_NEIGHBORS]
         ]
-        return consistent(self.read(row), self.data.views[row], others, tolerance).numpy()
+        return consistent(self.read(row), self.data.views[row], others, tolerance)
 
     def confirmed(self, row: int, min_views: int) -> np.ndarray:
         """(H, W) float32 depth that enough neighbors confirm, else 0."""
         enough = self.counts(row, 1.0) >= min(min_views, len(self.data.neighbors[row]))
-        return np.where(enough, self.read(row).numpy(), 0).astype(np.float32)
+        return np.where(enough, self.read(row), 0).astype(np.float32)
 
     def trust(self, mesh: o3d.t.geometry.TriangleMesh) -> None:
         """Take what the views see of a mesh for sure."""
@@ -291,7 +291,7 @@ class _DepthMaps:
         """(H, W) whether a pixel's point is as high as something sure around it on the map; a floater is
         higher. After `trust`.
         """
-        view, depth = self.data.views[row], self.read(row).numpy()
+        view, depth = self.data.views[row], self.read(row)
         points_cam = pixel_rays(view).numpy() * depth[..., None]
         points = (points_cam - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
         cells, height = self.relief.place(points.reshape(-1, 3))
@@ -309,7 +309,7 @@ class _DepthMaps:
             (self.read(other, "-sure"), self.data.views[other])
             for other in self.data.neighbors[row][:NUM_NEIGHBORS]
         ]
-        return blocking(self.read(row), self.data.views[row], sure, MARGIN).numpy()
+        return blocking(self.read(row), self.data.views[row], sure, MARGIN)
 
 
 def center_cloud(gaussians: Gaussians, centers: np.ndarray, min_opacity: float) -> o3d.t.geometry.PointCloud:
@@ -321,19 +321,11 @@ def center_cloud(gaussians: Gaussians, centers: np.ndarray, min_opacity: float) 
         raise Sc3dError(f"no Gaussian has an opacity of {min_opacity} or more: lower --min-opacity")
     points = chosen.means.numpy()
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
-    colors = np.clip(0.5 + 0.28209479177387814 * chosen.sh[:, 0].numpy(), 0, 1)
-    cloud.point.colors = o3d.core.Tensor(np.round(colors * 255).astype(np.uint8))
+    cloud.point.colors = o3d.core.Tensor(chosen.base_colors)
     cloud.point.normals = o3d.core.Tensor(
         orient_normals(points, chosen.normals.numpy(), centers).astype(np.float32)
     )
     return cloud
-
-
-def _reliable_depth(gaussians: Gaussians, view: View, depth_range: tuple[float, float]) -> np.ndarray:
-    depth, _, normals_cam = depth_map(gaussians, view)
-    rays_cam = torch.nn.functional.normalize(pixel_rays(view), dim=2).numpy()
-    facing = -(normals_cam * rays_cam).sum(axis=2) > np.cos(np.deg2rad(MAX_ANGLE))
-    return np.where(facing & (depth > depth_range[0]) & (depth < depth_range[1]), depth, 0).astype(np.float32)
 
 
 def _default_voxel_size(gaussians: Gaussians, footprint: float) -> float:

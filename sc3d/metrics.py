@@ -250,7 +250,7 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
     table, truth_files = scene.class_table(), truth_masks(scene, settings)
     mask_files = scene.mask_files(scene.masks, table) if scene.masks.is_dir() else {}
     views = [view for view in scene.model.views if view.name in truth_files]
-    per_photo, beliefs = {}, []
+    per_photo, reliabilities = {}, []
     for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
         truth = read_index_image(truth_files[view.name])
         rows, first = surface.rows(view, truth.shape[::-1], truth > 0)
@@ -262,11 +262,11 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
             mask = cv2.resize(mask, truth.shape[::-1], interpolation=cv2.INTER_NEAREST)
             found["masks"] = Confusion.from_labels(truth, mask, table.num_ids)
         per_photo[view.name] = found
-        beliefs.append(pixels.reliability(labels.label, labels.confidence))
+        reliabilities.append(pixels.reliability(labels.label, labels.confidence))
     sources = SOURCES if mask_files else [key for key in SOURCES if key != "masks"]
     parts = {key: [photo[key] for photo in per_photo.values() if key in photo] for key in sources}
     totals = {key: total(found, table.num_ids).summary(table) for key, found in parts.items()}
-    believed = Reliability.merge(beliefs) if beliefs else None
+    overall = Reliability.merge(reliabilities) if reliabilities else None
     photos = {
         name: {key: found[key].summary(table) for key in SOURCES if key in found}
         for name, found in per_photo.items()
@@ -274,9 +274,9 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
     metrics = {"photos": [view.name for view in views], "classes": [entry.name for entry in table]} | totals
     write_json(
         settings.output or scene.metrics,
-        metrics | {"reliability": believed.summary() if believed else {}, "per_photo": photos},
+        metrics | {"reliability": overall.summary() if overall else {}, "per_photo": photos},
     )
-    return EvaluationSummary(totals, believed.ece if believed else None)
+    return EvaluationSummary(totals, overall.ece if overall else None)
 
 
 def truth_masks(scene: Scene, settings: Evaluate) -> dict[str, Path]:

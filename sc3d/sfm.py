@@ -118,11 +118,12 @@ def _write_priors(database: Path, flight: Flight | None) -> None:
         priors = {prior.corr_data_id.id: prior for prior in opened.read_all_pose_priors()}
         for image_id, image in sorted(images.items()):
             tag = flight.tags.get(image.name) if flight else None
+            position = flight.positions.get(image.name) if flight else None
             prior = priors.get(image_id) or (pycolmap.PosePrior() if tag else None)
             if prior is None:
                 continue
             prior.corr_data_id = image.data_id
-            prior.position = flight.positions[image.name] if flight and tag else none
+            prior.position = none if position is None else position
             prior.position_covariance = np.diag(tag.sigma**2 if tag else none)
             prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
             if image_id in priors:

@@ -14,6 +14,8 @@ from PIL import Image
 
 from sc3d.geometry.cameras import View, look_at, rays
 from sc3d.scene.scene import Scene
+from sc3d.segmentation.instances import Instance
+from sc3d.segmentation.rle import find_runs
 from sc3d.view.picking import Inspector
 
 ROOT = Path(__file__).parents[1]  # of the checkout
@@ -156,3 +158,10 @@ def inspector_of(scene: Scene) -> Inspector:
     return Inspector(
         o3d.t.io.read_point_cloud(str(scene.labelled)), scene.model.views, scene.class_table(), scene.mesh
     )
+
+
+def instance_of(
+    mask: np.ndarray, class_id: int, box_score: float, mask_score: float, prompt: str = ""
+) -> Instance:
+    """What a segmenter found: an (H, W) bool mask of the whole photo."""
+    return Instance(find_runs(mask, mask.shape[0]), mask.shape, class_id, box_score, mask_score, prompt)

@@ -7,7 +7,11 @@ The device is called `meta`, which torch knows without drivers; real meta tensor
 exist inside the block.
 """
 
+from contextlib import ExitStack
+from unittest.mock import patch
+
 import torch
+from torch.optim import optimizer
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
@@ -57,6 +61,8 @@ def _run(function, args, kwargs):
         if there and not stays and name.startswith("aten.index"):
             raise RuntimeError(f"{name}: CPU tensor indexed from a device")
     result = function(*tree_map(_inside, args), **tree_map(_inside, kwargs))
+    if not function._schema.returns:  # lists of tensors, changed in place
+        return None
     first = function._schema.arguments[0].alias_info if function._schema.arguments else None
     if first is not None and first.is_write:
         return args[0]
@@ -78,17 +84,21 @@ class _Dispatch(TorchDispatchMode):
 
 class PretendDevice(TorchFunctionMode):
     """Context in which `meta` is a device with values. `new_tensor` needs help: torch makes empty tensors of
-    it there.
+    it there. Optimizers may be fused on it.
     """
 
     def __enter__(self):
-        self._dispatch = _Dispatch()
-        self._dispatch.__enter__()
+        self._stack = ExitStack()
+        supported = [*optimizer._get_fused_kernels_supported_devices(), "meta"]
+        self._stack.enter_context(
+            patch.object(optimizer, "_get_fused_kernels_supported_devices", lambda: supported)
+        )
+        self._stack.enter_context(_Dispatch())
         return super().__enter__()
 
     def __exit__(self, *error):
         super().__exit__(*error)
-        self._dispatch.__exit__(*error)
+        self._stack.__exit__(*error)
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
         if getattr(function, "__name__", "") == "new_tensor" and isinstance(args[0], _Tensor):

@@ -81,39 +81,6 @@ def test_centers_with_colors_and_normals_towards_the_cameras():
         center_cloud(gaussians, np.zeros((1, 3)), 0.99)
 
 
-def test_a_point_before_a_surface_that_others_see_is_blocked():
-    from sc3d.splatting.consistency import blocking
-
-    view, *others = views()[:3]
-    flat = [
-        torch.from_numpy(
-            (
-                other.center[2]
-                / -(
-                    np.linalg.inv(other.matrix)
-                    @ np.concatenate(
-                        [
-                            np.stack(np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5), -1),
-                            np.ones((120, 160, 1)),
-                        ],
-                        -1,
-                    )[..., None]
-                )[..., 0].dot(
-                    # depth of the plane z = 0
-                    other.cam_from_world[:3, 2]
-                )
-            ).astype(np.float32)
-        )
-        for other in (view, *others)
-    ]
-    sure = list(zip(flat[1:], others, strict=True))
-    on_plane = blocking(flat[0], view, sure, 0.03).numpy()
-    floating = blocking(0.8 * flat[0], view, sure, 0.03).numpy()
-    assert on_plane.max() == 0
-    assert (floating[40:80, 60:100] == 2).all()
-    assert blocking(0.8 * flat[0], view, [(torch.zeros_like(flat[1]), others[0])], 0.03).numpy().max() == 0
-
-
 def test_only_flights_that_look_one_way_are_filled_without_limit():
     ahead, aside = np.array([0.0, 0.0, 12.0]), np.array([9.0, 0.0, 12.0])
     down = [

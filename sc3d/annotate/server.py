@@ -1,10 +1,9 @@
 """HTTP for the annotation page, on the loopback address only.
 
 What keeps others out: the Host header must name this server (a foreign name that resolves to 127.0.0.1 does
-not), requests that a browser
-marks as coming from another site are refused, and whatever writes or computes must come from the page's own
-origin and carry the token that
-only this page was given. Photos are found by their names in a list, never by a path.
+not), requests that a browser marks as coming from another site are refused, and whatever writes or computes
+must come from the page's own origin and carry the token that only this page was given. Photos are found by
+their names in a list, never by a path.
 """
 
 from __future__ import annotations
@@ -91,7 +90,7 @@ class AnnotationServer(ThreadingHTTPServer):
     def server_bind(self) -> None:
         """Without the look-up of the machine's name that HTTPServer does, which may take seconds."""
         TCPServer.server_bind(self)
-        self.server_name, self.server_port = ADDRESS, self.server_address[1]
+        self.server_name, self.server_port = ADDRESS, self.socket.getsockname()[1]
 
     def handle_error(self, request: object, client_address: object) -> None:
         """A browser that leaves in the middle of an answer is no error."""

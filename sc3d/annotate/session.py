@@ -16,7 +16,7 @@ from sc3d.io.images import find_photos, image_size, read_image
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.provenance import digest
 from sc3d.scene.scene import Scene
-from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, reduced
+from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, shrink
 from sc3d.segmentation.strokes.files import BACKGROUND, parse_shapes
 
 DISPLAY_SIZE = 4096  # px, longest side of the photo in the browser
@@ -147,9 +147,9 @@ class Session:
             if self._learned is None or self._learned[0] != state:
                 self._learned = (
                     state,
-                    Strokes.learn(self._scene.strokes, self._scene.images, self.class_table, self._settings),
+                    Strokes.fit(self._scene.strokes, self._scene.images, self.class_table, self._settings),
                 )
-            labels = self._learned[1].segment(reduced(read_image(photo), TRIAL_SIZE)).labels
+            labels = self._learned[1].segment(shrink(read_image(photo), TRIAL_SIZE)).labels
         finally:
             self._trying.release()
         return _png(
@@ -159,7 +159,7 @@ class Session:
         )
 
     def _encode(self, stem: str) -> bytes:
-        shown = np.ascontiguousarray(reduced(read_image(self.photos[stem]), DISPLAY_SIZE)[..., ::-1])
+        shown = np.ascontiguousarray(shrink(read_image(self.photos[stem]), DISPLAY_SIZE)[..., ::-1])
         return cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
 

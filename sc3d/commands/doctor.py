@@ -11,7 +11,7 @@ from pathlib import Path
 
 from sc3d.errors import Sc3dError
 from sc3d.io.provenance import versions
-from sc3d.segmentation.weights import find_weights
+from sc3d.segmentation.models import find_weights
 from sc3d.settings.labels import Segment
 from sc3d.settings.outputs import Doctor
 

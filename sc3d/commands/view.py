@@ -12,6 +12,8 @@ from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import ViewCommand
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from sc3d.geometry.cameras import View
 
 logger = logging.getLogger(__name__)
@@ -24,11 +26,12 @@ def main(command: ViewCommand) -> None:
     views = scene.model.views if scene.sparse.is_dir() else []
     photo = None if command.photo is None else _find_photo(command.photo, views, scene)
     if command.flight is not None:
-        _write_flight(command.flight, command, scene)
+        _write_flight(command, scene, command.flight)
     if command.web or command.html is not None:
         _show_page(command, scene, views)
     elif command.screenshot is not None:
-        _write_picture(command.screenshot, command, scene, views, photo)
+        write_image(command.screenshot, _picture(command, scene, views, photo))
+        logger.info("wrote %s", command.screenshot)
     elif command.flight is None:
         _open_window(command, scene, views)
 
@@ -71,7 +74,7 @@ def _find_photo(name: str, views: list[View], scene: Scene) -> View:
     return photo
 
 
-def _write_flight(path: Path, command: ViewCommand, scene: Scene) -> None:
+def _write_flight(command: ViewCommand, scene: Scene, path: Path) -> None:
     from sc3d.view.display_splats import splats_colored_by
     from sc3d.view.flight_video import write_flight
 
@@ -81,9 +84,8 @@ def _write_flight(path: Path, command: ViewCommand, scene: Scene) -> None:
     logger.info("wrote %s", path)
 
 
-def _write_picture(
-    path: Path, command: ViewCommand, scene: Scene, views: list[View], photo: View | None
-) -> None:
+def _picture(command: ViewCommand, scene: Scene, views: list[View], photo: View | None) -> np.ndarray:
+    """(H, W, 3) uint8 RGB"""
     from sc3d.view.display_cloud import class_ids, load_cloud, only_classes
     from sc3d.view.display_splats import splats_colored_by
     from sc3d.view.screenshot import Style, screenshot, screenshot_splats
@@ -93,14 +95,11 @@ def _write_picture(
     if command.splats:
         splats = splats_colored_by(scene, command.by, command.classes)
         pixels = None if photo is None else read_image(scene.photo(photo.name))
-        image = screenshot_splats(splats, photo, pixels, command.size, style)
-    else:
-        table = scene.class_table() if scene.classes.exists() else None
-        cloud = load_cloud(scene, command.file, votes=command.by == "disagreement")
-        cloud = only_classes(cloud, class_ids(table, command.classes))
-        image = screenshot(cloud, photo, command.size, style, table)
-    write_image(path, image)
-    logger.info("wrote %s", path)
+        return screenshot_splats(splats, photo, pixels, command.size, style)
+    table = scene.class_table() if scene.classes.exists() else None
+    cloud = load_cloud(scene, command.file, votes=command.by == "disagreement")
+    cloud = only_classes(cloud, class_ids(table, command.classes))
+    return screenshot(cloud, photo, command.size, style, table)
 
 
 def _open_window(command: ViewCommand, scene: Scene, views: list[View]) -> None:
@@ -130,7 +129,7 @@ def _show_page(command: ViewCommand, scene: Scene, views: list[View]) -> None:
     splats_first = command.splats or not has_cloud
     splats = best_splats(scene) if splats_first else None
     votes = True if by == "disagreement" else None
-    cloud = load_cloud(scene, command.file, votes) if has_cloud or splats is None else splats.centers()
+    cloud = load_cloud(scene, command.file, votes) if splats is None or has_cloud else splats.centers()
     inspector = Inspector.from_scene(scene, cloud, views)
     if splats_first and not can_color(cloud, by):
         by = "photo"

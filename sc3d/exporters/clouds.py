@@ -9,7 +9,7 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.exporters.projected_cloud import chosen_classes, read_placed_cloud
+from sc3d.exporters.projected_cloud import chosen_classes, read_projected_cloud
 from sc3d.io.atomic import atomic_path
 from sc3d.io.clouds import write_geometry
 from sc3d.scene.scene import Scene
@@ -24,28 +24,28 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/clouds/<id>_<name>.ply` for each class that has points, unlabelled ones too; float64 positions
     in the CRS, points in their order.
     """
-    placed = read_placed_cloud(scene, settings)
+    projected = read_projected_cloud(scene, settings)
     table = scene.class_table()
     present = [
-        label for label in sorted(chosen_classes(scene, settings)) if (placed.labels.label == label).any()
+        label for label in sorted(chosen_classes(scene, settings)) if (projected.labels.label == label).any()
     ]
     if not present:
         raise InputError(f"no point has one of the classes {', '.join(settings.classes)}: nothing to write")
-    cloud = placed.cloud.clone()
+    cloud = projected.cloud.clone()
     if "normals" in cloud.point:
-        normals = placed.placement.directions(
+        normals = projected.projection.directions_to_crs(
             cloud.point.positions.numpy().astype(np.float64), cloud.point.normals.numpy()
         )
         cloud.point.normals = o3d.core.Tensor(np.ascontiguousarray(normals))
-    cloud.point.positions = o3d.core.Tensor(np.ascontiguousarray(placed.points))
+    cloud.point.positions = o3d.core.Tensor(np.ascontiguousarray(projected.points))
     counts = {}
     with atomic_path(outputs(scene, settings)[0]) as folder:
         folder.mkdir()
         for label in present:
-            part = cloud.select_by_mask(o3d.core.Tensor(placed.labels.label == label))
+            part = cloud.select_by_mask(o3d.core.Tensor(projected.labels.label == label))
             write_geometry(folder / f"{label}_{file_name(table.name(label))}.ply", part)
             counts[table.name(label)] = len(part.point.positions)
-    return {**placed.placement.figures(), "points_by_class": counts}
+    return {**projected.projection.figures(), "points_by_class": counts}
 
 
 def file_name(name: str) -> str:

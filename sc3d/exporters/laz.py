@@ -11,13 +11,13 @@ import numpy as np
 
 import sc3d
 from sc3d.errors import InputError
-from sc3d.exporters.projected_cloud import PlacedCloud, chosen_classes, placed_chunks
+from sc3d.exporters.projected_cloud import ProjectedCloud, chosen_classes, projected_chunks
 from sc3d.io.atomic import atomic_path
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
 
-CHUNK = 1_000_000  # points written at a time
+POINTS_AT_ONCE = 1_000_000  # points written at a time
 SCALE = 0.001  # of the stored whole numbers, units of the CRS
 OFFSET_STEP = 1000.0  # offsets are multiples of this, so that neighboring files share theirs
 UNASSIGNED = 1  # ASPRS code of points without a label
@@ -39,28 +39,29 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     scene's frame without one.
     """
     ids, codes = sorted(chosen_classes(scene, settings)), asprs_codes(scene.class_table())
-    low, high, counts, placed = np.full(3, np.inf), np.full(3, -np.inf), np.zeros(256, np.int64), None
-    for placed in placed_chunks(scene, settings):
-        rows = np.isin(placed.labels.label, ids)
-        if rows.any():
-            low, high = (
-                np.minimum(low, placed.points[rows].min(axis=0)),
-                np.maximum(high, placed.points[rows].max(axis=0)),
-            )
-        counts += np.bincount(codes[placed.labels.label[rows]], minlength=256)
-    if not counts.any():
+    low, high, counts = np.full(3, np.inf), np.full(3, -np.inf), np.zeros(256, np.int64)
+    projected: ProjectedCloud | None = None
+    for projected in projected_chunks(scene, settings):
+        rows = np.flatnonzero(np.isin(projected.labels.label, ids))
+        if len(rows):
+            low = np.minimum(low, projected.points[rows].min(axis=0))
+            high = np.maximum(high, projected.points[rows].max(axis=0))
+        counts += np.bincount(codes[projected.labels.label[rows]], minlength=256)
+    if projected is None or not counts.any():
         raise InputError(f"no point has one of the classes {', '.join(settings.classes)}: nothing to write")
-    header, placement = make_header(low, high, placed), placed.placement
+    header, projection = make_header(low, high, projected), projected.projection
     with (
         atomic_path(outputs(scene, settings)[0]) as temporary,
         laspy.open(str(temporary), mode="w", header=header) as writer,
     ):
-        for placed in placed_chunks(scene, settings):
-            rows = np.flatnonzero(np.isin(placed.labels.label, ids))
-            for start in range(0, len(rows), CHUNK):
-                writer.write_points(point_record(placed, rows[start : start + CHUNK], header, codes))
+        for projected in projected_chunks(scene, settings):
+            rows = np.flatnonzero(np.isin(projected.labels.label, ids))
+            for start in range(0, len(rows), POINTS_AT_ONCE):
+                writer.write_points(
+                    point_record(projected, rows[start : start + POINTS_AT_ONCE], header, codes)
+                )
     used = {str(code): int(counts[code]) for code in np.flatnonzero(counts)}
-    return {"points": int(counts.sum()), **placement.figures(), "points_by_asprs_code": used}
+    return {"points": int(counts.sum()), **projection.figures(), "points_by_asprs_code": used}
 
 
 def asprs_codes(table: ClassTable) -> np.ndarray:
@@ -71,7 +72,7 @@ def asprs_codes(table: ClassTable) -> np.ndarray:
     return codes
 
 
-def make_header(low: np.ndarray, high: np.ndarray, placed: PlacedCloud) -> laspy.LasHeader:
+def make_header(low: np.ndarray, high: np.ndarray, projected: ProjectedCloud) -> laspy.LasHeader:
     """LAS 1.4 header of points between low and high (3,), CRS; InputError if they span more than whole
     millimeters in 32 bits can hold.
 
@@ -82,11 +83,11 @@ def make_header(low: np.ndarray, high: np.ndarray, placed: PlacedCloud) -> laspy
         raise InputError(
             f"the cloud spans {(high - low).max():.0f} units, too much for LAZ at 1 mm: remove stray points first"
         )
-    header = laspy.LasHeader(version="1.4", point_format=PLAIN if placed.colors is None else COLORS)
+    header = laspy.LasHeader(version="1.4", point_format=PLAIN if projected.colors is None else COLORS)
     header.scales, header.offsets = np.full(3, SCALE), offsets
     header.generating_software = f"sc3d {sc3d.__version__}"
     header.add_extra_dims([laspy.ExtraBytesParams(name, dtype, text) for name, dtype, text in DIMENSIONS])
-    crs = placed.placement.crs
+    crs = projected.projection.crs
     header.global_encoding.wkt = True  # point formats 6 and up know no other
     if crs is not None:
         # LAS 1.4 asks for WKT 1
@@ -95,17 +96,17 @@ def make_header(low: np.ndarray, high: np.ndarray, placed: PlacedCloud) -> laspy
 
 
 def point_record(
-    placed: PlacedCloud, rows: np.ndarray, header: laspy.LasHeader, codes: np.ndarray
+    projected: ProjectedCloud, rows: np.ndarray, header: laspy.LasHeader, codes: np.ndarray
 ) -> laspy.ScaleAwarePointRecord:
     """The points `rows` (K,) as LAS points; codes: (256,) uint8 ASPRS code of each class id."""
     record = laspy.ScaleAwarePointRecord.zeros(len(rows), header=header)
-    record.x, record.y, record.z = placed.points[rows].T
-    labels = placed.labels
+    record.x, record.y, record.z = projected.points[rows].T
+    labels = projected.labels
     record.classification = codes[labels.label[rows]]
     record.return_number = record.number_of_returns = np.ones(len(rows), np.uint8)
-    if placed.colors is not None:
+    if projected.colors is not None:
         # 255 becomes 65535
-        record.red, record.green, record.blue = placed.colors[rows].T.astype(np.uint16) * 257
+        record.red, record.green, record.blue = projected.colors[rows].T.astype(np.uint16) * 257
     record.confidence, record.state, record.label = (
         labels.confidence[rows],
         labels.state[rows],

@@ -4,21 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.exporters.buildings import roof_heights, roof_tops, split_buildings
-from sc3d.exporters.polygonize import simplified, squared, trace
-from sc3d.exporters.projected_cloud import PlacedCloud, find_placement, read_placed_cloud
+from sc3d.exporters.packages import load
+from sc3d.exporters.polygonize import orthogonalized, polygonize, simplified
+from sc3d.exporters.projected_cloud import ProjectedCloud, find_projection, read_projected_cloud
 from sc3d.exporters.regions import cells_by_number
 from sc3d.exporters.terrain import ground_height
 from sc3d.exporters.trees import canopy_height, split_crowns
-from sc3d.exporters.vector_files import MapObject, has_geopackage, shapely, write_geojson, write_geopackage
+from sc3d.exporters.vector_files import Feature, has_geopackage, write_geojson, write_geopackage
 from sc3d.geometry.raster import Raster, spacing_of_all
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
+
+if TYPE_CHECKING:
+    import shapely
+else:
+    shapely = load("shapely")
 
 LAYERS = ("buildings", "trees")
 CELL = 1.5  # side of the cells, in point spacings
@@ -38,8 +45,25 @@ class Kinds:
     ground: np.ndarray
 
 
+@dataclass(frozen=True)
+class Site:
+    """A labelled cloud and what is known of it on a grid; all lengths are meters.
+
+    points: (N, 3) CRS; ground: (H, W) z of the ground; above: (N,) bool, points as high above it as a building
+        or tree
+    """
+
+    projected: ProjectedCloud
+    table: ClassTable
+    points: np.ndarray
+    kinds: Kinds
+    grid: Raster
+    ground: np.ndarray
+    above: np.ndarray
+
+
 def outputs(scene: Scene, settings: Export) -> list[Path]:
-    crs = find_placement(scene, settings).crs
+    crs = find_projection(scene, settings).crs
     paths = [scene.export / f"{layer}{'' if crs else '_local'}.geojson" for layer in LAYERS]
     return paths + ([scene.export / "objects.gpkg"] if crs and has_geopackage() else [])
 
@@ -48,61 +72,60 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/buildings.geojson` and `trees.geojson` (`*_local.geojson` without a CRS), and both as
     `objects.gpkg` where pyogrio is installed.
     """
-    placed = read_placed_cloud(scene, settings)
-    layers = find_objects(placed, scene.class_table(), settings)
+    projected = read_projected_cloud(scene, settings)
+    layers = find_objects(projected, scene.class_table(), settings)
     paths = outputs(scene, settings)
     for layer, path in zip(LAYERS, paths):
-        write_geojson(path, layers[layer], placed.placement)
+        write_geojson(path, layers[layer], projected.projection)
     if len(paths) > len(LAYERS):
-        write_geopackage(paths[-1], layers, placed.placement)
-    figures = {layer: len(layers[layer]) for layer in LAYERS}
+        write_geopackage(paths[-1], layers, projected.projection)
+    figures: dict[str, object] = {layer: len(layers[layer]) for layer in LAYERS}
     figures |= {f"{layer}_area": f"{sum(item.area for item in layers[layer]):.0f} m2" for layer in LAYERS}
-    return {**figures, **placed.placement.figures()}
+    return {**figures, **projected.projection.figures()}
 
 
-def find_objects(placed: PlacedCloud, table: ClassTable, settings: Export) -> dict[str, list[MapObject]]:
+def find_objects(projected: ProjectedCloud, table: ClassTable, settings: Export) -> dict[str, list[Feature]]:
     """Buildings and trees of a labelled cloud, from north to south; InputError if its classes cannot tell
     them from the ground.
     """
-    kinds = split_kinds(placed.labels.label, table)
-    points = placed.points * placed.placement.unit  # all lengths below are meters
-    pixel = max(CELL * spacing_of_all(points), MIN_CELL)
-    grid = Raster.around(points, pixel)
+    kinds = split_kinds(projected.labels.label, table)
+    points = projected.points * projected.projection.unit
+    grid = Raster.around(points, max(CELL * spacing_of_all(points), MIN_CELL))
     ground = ground_height(points, kinds.ground, grid)
     above = points[:, 2] >= ground.ravel()[grid.flat_cells(points)] + settings.min_height
-    covered, roofs = roof_heights(points, kinds.building, above, grid)
+    site = Site(projected, table, points, kinds, grid, ground, above)
+    return {"buildings": _find_buildings(site, settings), "trees": _find_trees(site, settings)}
+
+
+def _find_buildings(site: Site, settings: Export) -> list[Feature]:
+    grid, is_building = site.grid, site.kinds.building
+    covered, roofs = roof_heights(site.points, is_building, site.above, grid)
     buildings = split_buildings(covered, roofs, grid, settings.min_area)
-    canopy = canopy_height(points, kinds.tree, ground, grid)
+    draw = orthogonalized if settings.rectangular else simplified
+    outlines = {
+        number: draw(traced, 2 * grid.pixel) for number, traced in polygonize(buildings, grid).items()
+    }
+    ground = _quantiles(site.ground, buildings, 0.5)
+    heights = roof_tops(buildings, roofs, grid.pixel) - ground
+    return _features(site, buildings, is_building, outlines, (heights, ground))
+
+
+def _find_trees(site: Site, settings: Export) -> list[Feature]:
+    grid, is_tree = site.grid, site.kinds.tree
+    canopy = canopy_height(site.points, is_tree, site.ground, grid)
     crowns = split_crowns(canopy, grid, settings.min_height)
-    draw = squared if settings.rectangular else simplified
-    building_outlines = {
-        number: draw(outline, 2 * pixel) for number, outline in trace(buildings, grid).items()
+    outlines = {
+        number: simplified(shapely.Polygon(traced.exterior), grid.pixel)
+        for number, traced in polygonize(crowns, grid).items()
     }
-    tree_outlines = {
-        number: simplified(shapely.Polygon(outline.exterior), pixel)
-        for number, outline in trace(crowns, grid).items()
-    }
-    tops = np.array(
-        [np.quantile(canopy.ravel()[cells], TREE_TOP) for cells in cells_by_number(crowns, int(crowns.max()))]
-    )
-    ground_of = [
-        np.array([np.median(ground.ravel()[cells]) for cells in cells_by_number(regions, int(regions.max()))])
-        for regions in (buildings, crowns)
-    ]
-    members = [
-        np.where(chosen, regions.ravel()[grid.flat_cells(points)], 0)
-        for regions, chosen in ((buildings, kinds.building & above), (crowns, kinds.tree & above))
-    ]
-    return {
-        "buildings": _describe(
-            building_outlines,
-            roof_tops(buildings, roofs, pixel) - ground_of[0],
-            ground_of[0],
-            members[0],
-            (placed, table),
-        ),
-        "trees": _describe(tree_outlines, tops, ground_of[1], members[1], (placed, table)),
-    }
+    heights, ground = _quantiles(canopy, crowns, TREE_TOP), _quantiles(site.ground, crowns, 0.5)
+    return _features(site, crowns, is_tree, outlines, (heights, ground))
+
+
+def _quantiles(values: np.ndarray, regions: np.ndarray, share: float) -> np.ndarray:
+    """(R,) float64 quantile of the values (H, W) in each of the regions (H, W) numbered from 1."""
+    cells = cells_by_number(regions, int(regions.max()))
+    return np.array([np.quantile(values.ravel()[region], share) for region in cells])
 
 
 def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
@@ -132,35 +155,26 @@ def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
     return Kinds(building, tree, ground)
 
 
-def _describe(
-    outlines: dict,
-    heights: np.ndarray,
-    ground: np.ndarray,
-    members: np.ndarray,
-    cloud: tuple[PlacedCloud, ClassTable],
-) -> list[MapObject]:
-    """Objects of numbered outlines in meters; members: (N,) int number of the object that each point belongs
-    to, 0 = none.
+def _features(
+    site: Site,
+    regions: np.ndarray,
+    chosen: np.ndarray,
+    outlines: dict[int, shapely.Polygon],
+    heights: tuple[np.ndarray, np.ndarray],
+) -> list[Feature]:
+    """Features of the regions (H, W) numbered from 1; chosen: (N,) bool points of their kind; outlines: m;
+    heights: (R,) of the top above the ground and z of the ground, m.
     """
-    placed, table = cloud
-    unit = placed.placement.unit
-    objects = []
-    for number, rows in enumerate(cells_by_number(members, len(heights)), start=1):
-        polygon = outlines[number]
-        labels = np.bincount(placed.labels.label[rows], minlength=1)
-        label = int(np.argmax(labels))
-        confidence = float(placed.labels.confidence[rows].astype(np.float64).mean()) if len(rows) else 0.0
-        objects.append(
-            MapObject(
-                polygon if unit == 1 else shapely.transform(polygon, lambda corners: corners / unit),
-                number,
-                table.name(label),
-                label,
-                polygon.area,
-                float(heights[number - 1]),
-                float(ground[number - 1]),
-                confidence,
-                len(rows),
-            )
+    cloud, unit = site.projected, site.projected.projection.unit
+    members = np.where(chosen & site.above, regions.ravel()[site.grid.flat_cells(site.points)], 0)
+    features = []
+    for number, rows in enumerate(cells_by_number(members, int(regions.max())), start=1):
+        outline, label = outlines[number], int(np.argmax(np.bincount(cloud.labels.label[rows], minlength=1)))
+        polygon = outline if unit == 1 else shapely.transform(outline, lambda corners: corners / unit)
+        height, ground = (float(values[number - 1]) for values in heights)
+        confidence = float(cloud.labels.confidence[rows].astype(np.float64).mean()) if len(rows) else 0.0
+        name = site.table.name(label)
+        features.append(
+            Feature(polygon, number, name, label, outline.area, height, ground, confidence, len(rows))
         )
-    return objects
+    return features

@@ -4,19 +4,26 @@ fits (shapely, rasterio).
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from sc3d.exporters.packages import load
 from sc3d.geometry.raster import Raster
 
-features, transforms, shapely = load("rasterio.features"), load("rasterio.transform"), load("shapely")
+if TYPE_CHECKING:
+    import shapely
+else:
+    shapely = load("shapely")
 
-AGREEMENT = 0.9  # IoU that a rectangular outline must have with the traced one, or it is not used
+features, transforms = load("rasterio.features"), load("rasterio.transform")
+
+MIN_IOU = 0.9  # IoU that a rectangular outline must have with the traced one, or it is not used
 
 Side = tuple[int, float, float]  # axis that is constant along it (0 = x), its value there, its length
 
 
-def trace(regions: np.ndarray, grid: Raster) -> dict[int, shapely.Polygon]:
+def polygonize(regions: np.ndarray, grid: Raster) -> dict[int, shapely.Polygon]:
     """The outline of each region, in the coordinates of the grid; of regions in several pieces that touch at
     corners at most, the largest piece.
 
@@ -45,7 +52,7 @@ def simplified(polygon: shapely.Polygon, tolerance: float) -> shapely.Polygon:
     return result if isinstance(result, shapely.Polygon) and result.is_valid and result.area > 0 else polygon
 
 
-def squared(polygon: shapely.Polygon, tolerance: float) -> shapely.Polygon:
+def orthogonalized(polygon: shapely.Polygon, tolerance: float) -> shapely.Polygon:
     """The outline with right angles only, along its main directions; the simplified one where that would
     change it too much.
 
@@ -72,7 +79,7 @@ def squared(polygon: shapely.Polygon, tolerance: float) -> shapely.Polygon:
     if rings[0] is None:
         return rough
     result = shapely.Polygon(rings[0], [ring for ring in rings[1:] if ring is not None])
-    if not result.is_valid or result.intersection(polygon).area < AGREEMENT * result.union(polygon).area:
+    if not result.is_valid or result.intersection(polygon).area < MIN_IOU * result.union(polygon).area:
         return rough
     return result
 

@@ -15,7 +15,12 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.georeferencing.georeference import Georeference, projected_crs, read_georeference
+from sc3d.georeferencing.georeference import (
+    Georeference,
+    projected_crs,
+    read_georeference,
+    write_georeference,
+)
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import read_labelled, take_labels
@@ -34,7 +39,7 @@ BYTES = 250  # of a point while a cloud is exported as a whole
 
 
 @dataclass(frozen=True)
-class Placement:
+class MapProjection:
     """How world coordinates become exported ones. georeference, epsg: None = they stay as they are, one unit
     = 1 m, z up.
     """
@@ -51,7 +56,7 @@ class Placement:
         """Meters per unit of the exported coordinates, all three of them."""
         return float(self.crs.axis_info[0].unit_conversion_factor) if self.crs else 1.0
 
-    def points(self, points: np.ndarray) -> np.ndarray:
+    def to_crs(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) world to (N, 3) float64 easting, northing, height in the CRS."""
         points = np.asarray(points, np.float64)
         if self.georeference is None:
@@ -69,13 +74,13 @@ class Placement:
             )
         return np.stack([east, north, points[:, 2] * self.georeference.unit / self.unit], axis=1)
 
-    def directions(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    def directions_to_crs(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Unit vectors (N, 3) at world points (N, 3), turned as the CRS is (grid north is not true north);
         float32.
         """
         if self.georeference is None:
             return directions
-        turned = self.points(points + directions) - self.points(points)
+        turned = self.to_crs(points + directions) - self.to_crs(points)
         length = np.linalg.norm(turned, axis=1, keepdims=True)
         return np.divide(turned, length, out=np.zeros_like(turned), where=length > 0).astype(np.float32)
 
@@ -88,20 +93,20 @@ class Placement:
         }
 
 
-def find_placement(scene: Scene, settings: Export) -> Placement:
+def find_projection(scene: Scene, settings: Export) -> MapProjection:
     """The scene's georeference with the CRS of `--epsg`; without a georeference, `--epsg` says which CRS the
     world coordinates are in.
     """
     georeference = read_georeference(scene)
     if georeference is not None:
-        placement = Placement(georeference, settings.epsg or georeference.epsg)
+        projection = MapProjection(georeference, settings.epsg or georeference.epsg)
     elif settings.epsg:
-        placement = Placement(Georeference(settings.epsg, (0.0, 0.0, 0.0)), settings.epsg)
+        projection = MapProjection(Georeference(settings.epsg, (0.0, 0.0, 0.0)), settings.epsg)
     else:
         _warn(scene)
-        return Placement()
-    _ = placement.crs  # an unknown code is an error before any work
-    return placement
+        return MapProjection()
+    _ = projection.crs  # an unknown code is an error before any work
+    return projection
 
 
 @lru_cache(maxsize=8)
@@ -114,7 +119,7 @@ def _warn(scene: Scene) -> None:
 
 
 @dataclass(frozen=True)
-class PlacedCloud:
+class ProjectedCloud:
     """The labelled cloud with its positions in the CRS.
 
     cloud: N points with attributes, positions in the world; points: (N, 3) float64 CRS
@@ -123,7 +128,7 @@ class PlacedCloud:
     cloud: o3d.t.geometry.PointCloud
     labels: Labels
     points: np.ndarray
-    placement: Placement
+    projection: MapProjection
 
     @property
     def colors(self) -> np.ndarray | None:
@@ -134,12 +139,12 @@ class PlacedCloud:
         return colors if colors.dtype == np.uint8 else np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8)
 
 
-def read_placed_cloud(scene: Scene, settings: Export) -> PlacedCloud:
+def read_projected_cloud(scene: Scene, settings: Export) -> ProjectedCloud:
     """Read the labelled cloud, check its labels against the class table and move it into the CRS."""
     cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
     _require_known(scene.class_table(), labels, settings.labelled or scene.labelled, scene)
-    placement = find_placement(scene, settings)
-    return PlacedCloud(cloud, labels, placement.points(cloud.point.positions.numpy()), placement)
+    projection = find_projection(scene, settings)
+    return ProjectedCloud(cloud, labels, projection.to_crs(cloud.point.positions.numpy()), projection)
 
 
 def _require_known(table: ClassTable, labels: Labels, path: Path, scene: Scene) -> None:
@@ -148,25 +153,25 @@ def _require_known(table: ClassTable, labels: Labels, path: Path, scene: Scene) 
         raise InputError(f"{path} has class id {unknown[0]}, which is not in {scene.classes}: add it there")
 
 
-def placed_chunks(scene: Scene, settings: Export) -> Iterator[PlacedCloud]:
+def projected_chunks(scene: Scene, settings: Export) -> Iterator[ProjectedCloud]:
     """The same in parts, in order; as a whole if that fits into half of the machine's memory."""
     path = settings.labelled or scene.labelled
     count = num_points(path) if path.exists() else None
     if count is None or fits(count * BYTES, Resources()):
-        yield read_placed_cloud(scene, settings)
+        yield read_projected_cloud(scene, settings)
         return
-    placement, table = find_placement(scene, settings), scene.class_table()
+    projection, table = find_projection(scene, settings), scene.class_table()
     for _, records in CloudFile.open(path).chunks():
         cloud = o3d.t.geometry.PointCloud(positions(records))
         for name in ("label", "confidence", "state", "num_views"):
-            if name in records.dtype.names:
+            if name in (records.dtype.names or ()):
                 cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(records[name])[:, None])
         colors = columns(records, ("red", "green", "blue"))
         if colors is not None:
             cloud.point.colors = o3d.core.Tensor(colors)
         labels = take_labels(cloud, path, "propagate")
         _require_known(table, labels, path, scene)
-        yield PlacedCloud(cloud, labels, placement.points(positions(records)), placement)
+        yield ProjectedCloud(cloud, labels, projection.to_crs(positions(records)), projection)
 
 
 def chosen_classes(scene: Scene, settings: Export) -> set[int]:
@@ -183,3 +188,12 @@ def chosen_classes(scene: Scene, settings: Export) -> set[int]:
                 f"there is no class {name!r} in {scene.classes}: its classes are {', '.join(ids)}"
             )
     return {ids[name] for name in settings.classes}
+
+
+def copy_georeference(scene: Scene, folder: Path) -> None:
+    """Put the scene's georeference beside an export, as the formats have no place for it; `sc3d import` finds
+    it there.
+    """
+    found = read_georeference(scene)
+    if found is not None:
+        write_georeference(Scene(folder), found)

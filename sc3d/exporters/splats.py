@@ -8,11 +8,10 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.exporters.masks import render_mask
-from sc3d.exporters.projected_cloud import Placement, chosen_classes, find_placement
+from sc3d.exporters.projected_cloud import MapProjection, chosen_classes, find_projection
 from sc3d.geometry.cameras import undistorted
 from sc3d.geometry.neighbors import NeighborIndex
-from sc3d.io.atomic import atomic_path
-from sc3d.io.ply import read_records, write_records
+from sc3d.io.splats import origin_comment, write_splat_ply
 from sc3d.scene.labelled_cloud import REACH, LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
@@ -35,10 +34,10 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/splats.ply`: gaussians.ply with `label` (uchar) and `confidence` (float) per splat; of the
     chosen classes only.
     """
-    chosen, placement = chosen_classes(scene, settings), find_placement(scene, settings)
+    chosen, projection = chosen_classes(scene, settings), find_projection(scene, settings)
     splats = label_splats(scene, settings).only(chosen)
-    write_splats(outputs(scene, settings)[0], splats, placement)
-    return figures(splats, placement)
+    write_splats(outputs(scene, settings)[0], splats, projection)
+    return figures(splats, projection)
 
 
 def label_splats(scene: Scene, settings: Export) -> DisplaySplats:
@@ -89,49 +88,34 @@ def distance_to_class(
     return distance
 
 
-def write_splats(path: Path, splats: DisplaySplats, placement: Placement) -> None:
+def write_splats(path: Path, splats: DisplaySplats, projection: MapProjection) -> None:
     """3DGS PLY with two more properties, which viewers ignore; positions stay in the local frame, comments
     say where it lies.
     """
-    comments = ["sc3d origin " + " ".join(f"{value:.3f}" for value in splats.origin)]
-    if placement.crs is not None:
+    comments = [origin_comment(splats.origin)]
+    if projection.crs is not None:
         comments.append(
-            f"sc3d EPSG:{placement.epsg} origin "
-            + " ".join(f"{value:.3f}" for value in origin_in_crs(splats, placement))
+            f"sc3d EPSG:{projection.epsg} origin "
+            + " ".join(f"{value:.3f}" for value in origin_in_crs(splats, projection))
         )
     comments += [f"sc3d label {entry.id} {entry.name}" for entry in splats.table]
-    with atomic_path(path) as temporary:
-        splats.gaussians.save(temporary, comments)
-        append_properties(
-            temporary, {"label": splats.label.astype(np.uint8), "confidence": splats.confidence.astype("<f4")}
-        )
+    extra = {"label": splats.label.astype(np.uint8), "confidence": splats.confidence.astype(np.float32)}
+    write_splat_ply(path, splats.gaussians.arrays(), comments, extra)
 
 
-def append_properties(path: Path, columns: dict[str, np.ndarray]) -> None:
-    """Add properties, (N,) each, to the vertices of a binary PLY that has nothing else."""
-    records, comments = read_records(path)
-    added = [(name, column.dtype) for name, column in columns.items()]
-    joined = np.empty(len(records), records.dtype.descr + added)
-    for name in records.dtype.names:
-        joined[name] = records[name]
-    for name, column in columns.items():
-        joined[name] = column
-    write_records(path, joined, comments=comments)
-
-
-def origin_in_crs(splats: DisplaySplats, placement: Placement) -> np.ndarray:
+def origin_in_crs(splats: DisplaySplats, projection: MapProjection) -> np.ndarray:
     """(3,) easting, northing and height of the splats' origin in the CRS; the world without one."""
-    return placement.points(splats.origin[None])[0]
+    return projection.to_crs(splats.origin[None])[0]
 
 
-def figures(splats: DisplaySplats, placement: Placement) -> dict[str, object]:
+def figures(splats: DisplaySplats, projection: MapProjection) -> dict[str, object]:
     """What the summary and the sidecar say."""
     labelled, counts = splats.label > 0, np.bincount(splats.label, minlength=256)
     return {
         "splats": len(splats.label),
         "labelled": f"{labelled.mean():.1%}",
         "mean_confidence": round(float(splats.confidence[labelled].mean()), 3),
-        "origin": np.round(origin_in_crs(splats, placement) + 0.0, 3).tolist(),
-        **placement.figures(),
+        "origin": np.round(origin_in_crs(splats, projection) + 0.0, 3).tolist(),
+        **projection.figures(),
         "splats_by_class": {splats.table.name(int(row)): int(counts[row]) for row in np.flatnonzero(counts)},
     }

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from sc3d.exporters.packages import load
 from sc3d.exporters.regions import disk, renumbered
 from sc3d.geometry.raster import Raster, close_gaps, highest_points
+
+segmentation = load("skimage.segmentation")
 
 GAP = 0.5  # gaps of the canopy narrower than about twice this are filled, m
 SMOOTHING = 0.4  # standard deviation of the Gaussian that joins the lobes of a crown, m
@@ -26,14 +29,14 @@ def canopy_height(points: np.ndarray, is_tree: np.ndarray, ground: np.ndarray, g
 
 
 def split_crowns(canopy: np.ndarray, grid: Raster, min_height: float) -> np.ndarray:
-    """(H, W) int32 number of the tree in each cell, 0 = none: the watershed of the smoothed canopy around its
-    tops.
+    """(H, W) int32 number of the tree in each cell, 0 = none.
 
     canopy: (H, W) m, NaN = none; min_height: lower plants are not trees, m
     """
     tall = canopy >= min_height
-    heights = smoothed(np.where(tall, canopy, 0.0), tall, SMOOTHING / grid.pixel)
-    crowns = climb(heights, tall, grid.pixel)
+    crowns = grow_crowns(
+        smoothed(np.where(tall, canopy, 0.0), tall, SMOOTHING / grid.pixel), tall, grid.pixel
+    )
     kept = np.bincount(crowns.ravel())[crowns] * grid.pixel**2 >= MIN_CROWN
     return renumbered(np.where(kept, crowns, 0))
 
@@ -45,31 +48,32 @@ def smoothed(heights: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray
     return np.where(known, mean / np.maximum(weight, 1e-9), 0.0)
 
 
-def climb(heights: np.ndarray, tall: np.ndarray, pixel: float) -> np.ndarray:
-    """(H, W) int32 number from 1 of the top that each tall cell climbs to, 0 = not tall.
+def grow_crowns(heights: np.ndarray, tall: np.ndarray, pixel: float) -> np.ndarray:
+    """(H, W) int32 number from 1 of the tree of each tall cell, by the watershed of the canopy around its tops;
+    0 = not tall, or a speck beside a crown that is higher.
 
-    A cell steps to the highest of its neighbors; from a local maximum on to the highest cell within half the
-    usual width of a crown of that height;
-    where there is none, it is a top. heights: (H, W) m; equal heights are decided by place.
+    heights: (H, W) m; pixel: side of the cells, m
+    """
+    return segmentation.watershed(-heights, tree_tops(heights, tall, pixel), connectivity=2, mask=tall)
+
+
+def tree_tops(heights: np.ndarray, tall: np.ndarray, pixel: float) -> np.ndarray:
+    """(H, W) int32 1, 2, ... at the tall cells that are the highest within half the usual width of a crown of
+    their height, 0 elsewhere; equal heights are decided by place.
     """
     order = np.lexsort((np.arange(heights.size), np.where(tall, heights, -np.inf).ravel()))
-    rank = np.empty(heights.size, np.int64)
-    rank[order] = np.arange(heights.size)
-    rank = rank.reshape(heights.shape)
-    target = ndimage.maximum_filter(rank, 3, mode="nearest")
-    lobes = tall & (target == rank)
-    rows, columns = np.nonzero(tall & (target == rank))  # local maxima
+    rank = np.empty(heights.shape, np.int64)
+    rank.ravel()[order] = np.arange(heights.size)
+    rows, columns = np.nonzero(tall & (ndimage.maximum_filter(rank, 3, mode="nearest") == rank))
     radius = np.rint(0.5 * crown_width(heights[rows, columns]) / pixel).astype(np.int64)
+    is_top = np.zeros(len(rows), bool)
     for reach in np.unique(radius):
         here = radius == reach
-        target[rows[here], columns[here]] = _highest_around(rank, rows[here], columns[here], int(reach))
-    target = order[target.ravel()]
-    while True:
-        further = target[target]
-        if (further == target).all():
-            break
-        target = further
-    return renumbered(np.where(tall, target.reshape(heights.shape) + 1, 0))
+        cells = rows[here], columns[here]
+        is_top[here] = _highest_around(rank, *cells, int(reach)) == rank[cells]
+    tops = np.zeros(heights.shape, np.int32)
+    tops[rows[is_top], columns[is_top]] = np.arange(1, is_top.sum() + 1)
+    return tops
 
 
 def crown_width(heights: np.ndarray) -> np.ndarray:

@@ -9,20 +9,30 @@ import json
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sc3d.exporters.packages import load
-from sc3d.exporters.projected_cloud import Placement
+from sc3d.exporters.projected_cloud import MapProjection
 from sc3d.io.atomic import atomic_path
 
-shapely = load("shapely")
+if TYPE_CHECKING:
+    import shapely
+else:
+    shapely = load("shapely")
 
 DEGREES, METERS = 9, 3  # decimals of coordinates: 0.1 mm and 1 mm
+# fmt: off
+FIELDS: dict[str, type] = {  # what the map shows of a feature
+    "id": np.int32, "class": object, "label": np.int32, "area_m2": np.float64, "height_m": np.float64,
+    "ground_m": np.float64, "confidence": np.float64, "points": np.int32,
+}
+# fmt: on
 
 
 @dataclass(frozen=True)
-class MapObject:
+class Feature:
     """A building or a tree.
 
     polygon: shapely polygon in the CRS; number: from 1, per layer; name, label: its class; area: m2 of the
@@ -31,7 +41,7 @@ class MapObject:
         points, 0 to 1; num_points: of its class
     """
 
-    polygon: object
+    polygon: shapely.Polygon
     number: int
     name: str
     label: int
@@ -42,17 +52,10 @@ class MapObject:
     num_points: int
 
     def properties(self) -> dict[str, object]:
-        """What the map shows, by name."""
-        return {
-            "id": self.number,
-            "class": self.name,
-            "label": self.label,
-            "area_m2": round(self.area, 2),
-            "height_m": round(self.height, 2),
-            "ground_m": round(self.ground, 2),
-            "confidence": round(self.confidence, 3),
-            "points": self.num_points,
-        }
+        """What the map shows, by name of the field."""
+        lengths = round(self.area, 2), round(self.height, 2), round(self.ground, 2)
+        values = self.number, self.name, self.label, *lengths, round(self.confidence, 3), self.num_points
+        return dict(zip(FIELDS, values))
 
 
 def has_geopackage() -> bool:
@@ -60,64 +63,48 @@ def has_geopackage() -> bool:
     return importlib.util.find_spec("pyogrio") is not None
 
 
-def write_geojson(path: Path, objects: list[MapObject], placement: Placement) -> None:
+def write_geojson(path: Path, features: list[Feature], projection: MapProjection) -> None:
     """RFC 7946: longitude and latitude, WGS 84, outer rings counter-clockwise; without a CRS the scene's
     meters, which a member of the file says.
     """
     collection: dict[str, object] = {"type": "FeatureCollection", "name": path.stem}
-    if placement.crs is None:
+    if projection.crs is None:
         collection["coordinates"] = "meters in the scene's own frame, not on Earth"
     collection["features"] = [
         {
             "type": "Feature",
-            "id": item.number,
-            "properties": item.properties(),
-            "geometry": {"type": "Polygon", "coordinates": _rings(item, placement)},
+            "id": feature.number,
+            "properties": feature.properties(),
+            "geometry": {"type": "Polygon", "coordinates": _rings(feature, projection)},
         }
-        for item in objects
+        for feature in features
     ]
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(collection, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def write_geopackage(path: Path, layers: dict[str, list[MapObject]], placement: Placement) -> None:
+def write_geopackage(path: Path, layers: dict[str, list[Feature]], projection: MapProjection) -> None:
     """One layer per kind of object, in the CRS."""
     raw = load("pyogrio.raw")
     logging.getLogger("pyogrio").setLevel(logging.WARNING)  # it reports every layer
-    types = {"id": np.int32, "class": object, "label": np.int32, "points": np.int32}
+    crs = projection.crs.to_wkt() if projection.crs else None
     with atomic_path(path) as temporary:
-        for name, objects in layers.items():
-            rows = [item.properties() for item in objects]
-            fields = list(MapObject(None, 0, "", 0, 0.0, 0.0, 0.0, 0.0, 0).properties())
-            columns = [
-                np.array([row[field] for row in rows], types.get(field, np.float64)) for field in fields
+        for name, features in layers.items():
+            rows = [feature.properties() for feature in features]
+            columns: list[np.ndarray] = [
+                np.array([row[field] for row in rows], dtype) for field, dtype in FIELDS.items()
             ]
-            geometry = np.array([shapely.to_wkb(item.polygon) for item in objects], object)
-            raw.write(
-                str(temporary),
-                geometry,
-                columns,
-                fields,
-                layer=name,
-                driver="GPKG",
-                geometry_type="Polygon",
-                crs=placement.crs.to_wkt(),
-                append=temporary.exists(),
-            )
+            geometry = np.array([shapely.to_wkb(feature.polygon) for feature in features], object)
+            options = {"driver": "GPKG", "geometry_type": "Polygon", "crs": crs, "append": temporary.exists()}
+            raw.write(str(temporary), geometry, columns, list(FIELDS), layer=name, **options)
 
 
-def _rings(item: MapObject, placement: Placement) -> list[list[list[float]]]:
-    polygon = shapely.geometry.polygon.orient(item.polygon)
-    decimals, forward = METERS, None
-    if placement.crs is not None:
-        import pyproj
-
-        decimals, forward = (
-            DEGREES,
-            pyproj.Transformer.from_crs(placement.crs, "EPSG:4326", always_xy=True).transform,
-        )
+def _rings(feature: Feature, projection: MapProjection) -> list[list[list[float]]]:
+    polygon = shapely.geometry.polygon.orient(feature.polygon)
     rings = [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
-    return [
-        np.round(ring if forward is None else np.stack(forward(*ring.T), axis=1), decimals).tolist()
-        for ring in rings
-    ]
+    if projection.crs is None:
+        return [np.round(ring, METERS).tolist() for ring in rings]
+    import pyproj
+
+    forward = pyproj.Transformer.from_crs(projection.crs, "EPSG:4326", always_xy=True).transform
+    return [np.round(np.stack(forward(*ring.T), axis=1), DEGREES).tolist() for ring in rings]

@@ -2,9 +2,8 @@
 tolerance or not at all.
 
 All models here share one form: normalized image coordinates (perspective x / z, or the angle from the axis
-for fisheyes) times a radial polynomial,
-plus tangential terms, then focal lengths, skew and principal point. Pixel coordinates are COLMAP's: the
-center of the first pixel is (0.5, 0.5).
+for fisheyes) times a radial polynomial, plus tangential terms, then focal lengths, skew and principal point.
+Pixel coordinates are COLMAP's: the center of the first pixel is (0.5, 0.5).
 """
 
 from __future__ import annotations

@@ -93,3 +93,12 @@ def _median_angle(
         np.linalg.norm(to_view, axis=1) * np.linalg.norm(to_other, axis=1), 1e-12
     )
     return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1)))))
+
+
+def scene_extent(centers: np.ndarray, points: np.ndarray) -> float:
+    """E, world units: 1.1 x the largest distance of a camera from their mean, but at least half the median
+    distance to the points. centers: (V, 3) of the cameras
+    """
+    middle = centers.mean(0)
+    spread = np.linalg.norm(centers - middle, axis=1).max()
+    return float(max(1.1 * spread, 0.5 * np.median(np.linalg.norm(points - middle, axis=1))))

@@ -37,9 +37,9 @@ class Similarity:
         return float(np.arccos(np.clip((np.trace(self.rotation) - 1) / 2, -1, 1)))
 
 
-# pycolmap 4.2 has `estimate_sim3d` and `estimate_sim3d_robust`. The former gives the same to 1e-15 and takes 2 us
-# for 20 points instead of 26; the robust one takes 1 ms for 60 photos instead of 24, once per model. Both
-# refuse points that lie exactly on a plane or a line, as the cameras of a flight at one height do.
+# pycolmap 4.2 has `estimate_sim3d`, which gives the same to 1e-15 in 2 us for 20 points instead of 26, and
+# `estimate_sim3d_robust`, 1 ms for 60 photos instead of 24, once per model. But both refuse points that lie
+# exactly on a plane or a line, as the cameras of a flight at one height may.
 def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     """Least-squares similarity from (N, 3) to (N, 3), N >= 3 (Umeyama 1991)."""
     share = np.full(len(source), 1 / len(source))

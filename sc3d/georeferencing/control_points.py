@@ -71,7 +71,7 @@ def read_control_points(path: Path, photos: list[str]) -> ControlPoints:
     known = {Path(name).name: name for name in photos} | {name: name for name in photos}
     positions: dict[str, tuple[float, ...]] = {}
     observations: dict[str, dict[str, np.ndarray]] = {}
-    unknown = set[str]()
+    unknown = set()
     for number, line in lines[1:]:
         position, pixel, photo, name = _parse(line, f"{path}, line {number}")
         if photo not in known:

@@ -66,12 +66,12 @@ def anchor_focal(model: pycolmap.Reconstruction, photos: Path, flight: Flight | 
 
     returns: estimated and stated focal length (px) of the first camera; empty if EXIF states none
     """
-    first = dict[int, str]()
+    first: dict[int, str] = {}
     for image in registered_images(model):
         first.setdefault(image.camera_id, image.name)
     found = {camera_id: exif_focal(photos / name) for camera_id, name in first.items()}
     stated = {camera_id: focal for camera_id, focal in found.items() if focal is not None}
-    if not stated or len(stated) < len(found):
+    if not stated or len(stated) < len(first):
         logger.warning(
             "EXIF states no focal length to keep: where all photos look the same way from one height, heights may be wrong by a constant factor"
         )
@@ -150,7 +150,6 @@ def _depth_below(model: pycolmap.Reconstruction, direction: np.ndarray) -> np.nd
 
 
 def _number(value: Any) -> float:
-    """What EXIF has for a number; 0 if it is none."""
     try:
         return float(value)
     except (TypeError, ValueError, ZeroDivisionError):

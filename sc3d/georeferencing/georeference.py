@@ -19,7 +19,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -62,11 +62,6 @@ class Georeference:
     @cached_property
     def crs(self) -> pyproj.CRS:
         return projected_crs(self.epsg)
-
-    @property
-    def wkt(self) -> str:
-        """OGC WKT 1, as LAS 1.4 wants it."""
-        return self.crs.to_wkt("WKT1_GDAL")
 
     @cached_property
     def unit(self) -> float:
@@ -115,12 +110,6 @@ class Georeference:
         return _transformer("EPSG:4326", self.crs)
 
 
-def triple(values: Iterable[float]) -> tuple[float, float, float]:
-    """Three numbers; ValueError for more or fewer."""
-    first, second, third = (float(value) for value in values)
-    return first, second, third
-
-
 def from_origin(
     origin: tuple[float, float, float],
     epsg: int | None = None,
@@ -147,6 +136,12 @@ def from_origin(
             *origin[:2],
         )
     return Georeference(zone, offset, origin, altitude_offset=altitude_offset, figures=figures or {})
+
+
+def triple(values: Iterable[float]) -> tuple[float, float, float]:
+    """Three numbers as Python floats; ValueError for another count."""
+    first, second, third = values
+    return float(first), float(second), float(third)
 
 
 def with_epsg(georeference: Georeference, epsg: int | None) -> Georeference:
@@ -177,8 +172,10 @@ def read_georeference(scene: Scene) -> Georeference | None:
     content = read_json(path)
     try:
         if not isinstance(content, dict):
-            raise TypeError("no JSON object")
-        known = {name: content[name] for name in Georeference.__dataclass_fields__ if name in content}
+            raise ValueError("it holds no object")
+        known: dict[str, Any] = {
+            name: content[name] for name in Georeference.__dataclass_fields__ if name in content
+        }
         for name in ("offset", "origin"):
             if known.get(name) is not None:
                 known[name] = _numbers(known[name], (3,))
@@ -269,7 +266,7 @@ def crs_to_geodetic(points: np.ndarray, crs: pyproj.CRS) -> np.ndarray:
 def _topocentric(origin: tuple[float, float, float]) -> pyproj.Transformer:
     import pyproj
 
-    latitude, longitude, height = (float(value) for value in origin)
+    latitude, longitude, height = triple(origin)
     return pyproj.Transformer.from_pipeline(
         f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0={height!r} "
         "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sc3d.georeferencing.georeference import geodetic_to_enu
+from sc3d.georeferencing.georeference import geodetic_to_enu, triple
 from sc3d.io.images import open_image
 
 # m, of GPS that states none: what positions of one flight are worth against one another
@@ -113,9 +113,9 @@ def enu_positions(tags: dict[str, Geotag], origin: tuple[float, float, float]) -
 
 
 def _deviation(xmp: dict[str, float], horizontal_error: float) -> tuple[float, float, float] | None:
-    east, north, up = (xmp.get(name, 0.0) for name in ("RtkStdLon", "RtkStdLat", "RtkStdHgt"))
-    if east > 0 and north > 0 and up > 0:
-        return east, north, up
+    stated = triple(xmp.get(name, 0.0) for name in ("RtkStdLon", "RtkStdLat", "RtkStdHgt"))
+    if all(value > 0 for value in stated):
+        return stated
     if horizontal_error > 0:  # EXIF says nothing of the height, which GPS knows about half as well
         return (horizontal_error, horizontal_error, 2 * horizontal_error)
     return None
@@ -132,7 +132,6 @@ def _angle(parts: Any, reference: object, negative: str) -> float:
 
 
 def _number(value: Any) -> float:
-    """What EXIF or XMP has for a number; NaN if it is none."""
     try:
         return float(value)
     except (TypeError, ValueError, ZeroDivisionError):

@@ -143,8 +143,8 @@ def residuals(flight: Flight, centers: dict[str, np.ndarray]) -> dict[str, float
 
 
 def georeference_photos(scene: Scene, epsg: int | None) -> Georeference:
-    """Georeference of a scene by the GPS of its photos; InputError if they are not there, or have none that fits
-    the cameras. epsg: None = the UTM zone
+    """Georeference of a scene by the GPS of its photos; InputError if they are not there, or have none that
+    fits the cameras. epsg: None = the UTM zone
     """
     views = [view for view in scene.model.views if scene.photo(view.name).is_file()]
     if not views:

@@ -4,6 +4,7 @@ classes and whatever else they hold.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.las import check_las
+from sc3d.io.ply import read_header
 
 if TYPE_CHECKING:
     import laspy
@@ -245,10 +247,10 @@ def is_mesh(path: Path) -> bool:
 
 def has_faces(path: Path) -> bool:
     """Whether a PLY announces faces."""
-    with path.open("rb") as file:
-        header = file.read(1 << 16).split(b"end_header")[0]
-    counts = [line.split()[2] for line in header.splitlines() if line.startswith(b"element face")]
-    return any(count.isdigit() and int(count) > 0 for count in counts)
+    face = None
+    with suppress(InputError):  # is told when it is read
+        face = read_header(path).element("face")
+    return face is not None and face.rows > 0
 
 
 def _classified(attributes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.geometry.cameras import View
-from sc3d.importers.project import Project, require
+from sc3d.importers.project import Project, require_found
 from sc3d.io.colmap import (
     cam_from_world,
     copy_cameras,
@@ -28,11 +28,11 @@ def matches(path: Path) -> bool:
 
 
 def files(path: Path) -> list[Path]:
-    return [require(_folder(path), path, EXPECTED)]
+    return [require_found(_folder(path), path, EXPECTED)]
 
 
 def read(path: Path, settings: Import) -> Project:
-    folder = require(_folder(path), path, EXPECTED)
+    folder = require_found(_folder(path), path, EXPECTED)
     model = load_model(folder)
     cameras = copy_cameras(model)
     point_ids, xyz, colors = point_arrays(model)

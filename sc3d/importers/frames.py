@@ -54,8 +54,8 @@ def whole_offset(points: np.ndarray) -> np.ndarray:
 def frame_of_scene(
     scene: Scene, geometry: Geometry, epsg: int | None
 ) -> tuple[list[View], Georeference | None]:
-    """Cameras and place of a scene that is there; for one without cameras, a place near a geometry that states
-    a CRS, or whose CRS is `epsg`.
+    """Cameras and place of a scene that is there; for one without cameras, a place near a geometry whose CRS
+    is stated or `epsg`.
     """
     has_cameras = any((scene.sparse / f"cameras{suffix}").exists() for suffix in (".bin", ".txt"))
     views, georeference = scene.model.views if has_cameras else [], read_georeference(scene)
@@ -68,8 +68,9 @@ def frame_of_scene(
 def place_geometries(
     geometries: dict[Path, Geometry], georeference: Georeference | None, views: list[View], epsg: int | None
 ) -> dict[Path, tuple[Geometry, str]]:
-    """The geometries in the scene's world, each with what its coordinates were taken for. epsg: the CRS of those
-    that state none
+    """The geometries in the scene's world, each with what its coordinates were taken for.
+
+    epsg: the CRS of those that state none
     """
     placed = {}
     for path, geometry in geometries.items():

@@ -1,11 +1,10 @@
 """Agisoft Metashape and PhotoScan: cameras exported as XML (File > Export > Export Cameras > Agisoft XML).
 
 A camera's `transform` is chunk from camera, axes as in COLMAP; the transform of its component (or of the
-chunk) is a similarity from there to
-geocentric coordinates, or to local ones without a CRS. Distortion (manual, appendix "Camera models"):
-    x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 xy        u = w/2 + cx + x' f + x' b1 +
-    y' b2
-    y' = y (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p2 (r2 + 2 y2) + 2 p1 xy        v = h/2 + cy + y' f
+chunk) is a similarity from there to geocentric coordinates, or to
+local ones without a CRS. Distortion (manual, appendix "Camera models"):
+    x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 xy    u = w/2 + cx + x' f + x' b1 + y' b2
+    y' = y (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p2 (r2 + 2 y2) + 2 p1 xy    v = h/2 + cy + y' f
 so p1 and p2 are OpenCV's p2 and p1. A fisheye has the angle from the axis in place of the radius.
 """
 
@@ -16,14 +15,19 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-import pycolmap
 import pyproj
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.georeferencing.alignment import Similarity, fit_similarity
-from sc3d.georeferencing.georeference import Georeference, crs_to_geodetic, from_origin, geodetic_to_enu
+from sc3d.georeferencing.georeference import (
+    Georeference,
+    crs_to_geodetic,
+    from_origin,
+    geodetic_to_enu,
+    triple,
+)
 from sc3d.importers.project import Project, rigid
 from sc3d.settings.reconstruction import Import
 
@@ -65,9 +69,11 @@ def files(path: Path) -> list[Path]:
 def read(path: Path, settings: Import) -> Project:
     chunk = _chunk(path)
     cameras = {
-        sensor.get("id"): _camera(sensor, calibration, settings.tolerance, path)
+        sensor.get("id"): to_camera(
+            _distortion_model(sensor, path), settings.tolerance, f"{path}, sensor {sensor.get('label')!r}"
+        )
         for sensor in chunk.iterfind("./sensors/sensor")
-        if (calibration := _calibration(sensor)) is not None
+        if _calibration(sensor) is not None
     }
     enabled = [
         camera
@@ -117,16 +123,10 @@ def _calibration(sensor: ElementTree.Element) -> ElementTree.Element | None:
     )
 
 
-def _camera(
-    sensor: ElementTree.Element, calibration: ElementTree.Element, tolerance: float, path: Path
-) -> pycolmap.Camera:
-    where = f"{path}, sensor {sensor.get('label')!r}"
-    return to_camera(_distortion_model(sensor, calibration, where), tolerance, where)
-
-
-def _distortion_model(
-    sensor: ElementTree.Element, calibration: ElementTree.Element, where: str
-) -> DistortionModel:
+def _distortion_model(sensor: ElementTree.Element, path: Path) -> DistortionModel:
+    where, calibration = f"{path}, sensor {sensor.get('label')!r}", _calibration(sensor)
+    if calibration is None:
+        raise InputError(f"{where} has no calibration")
     kind = calibration.get("type") or sensor.get("type", "frame")
     if kind != "frame" and kind not in FISHEYE:
         raise InputError(
@@ -134,8 +134,8 @@ def _distortion_model(
         )
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
-    size = {} if resolution is None else resolution.attrib
     try:
+        size = {} if resolution is None else resolution.attrib
         width, height = int(size["width"]), int(size["height"])
         values = {child.tag: float(child.text or "") for child in calibration if child.tag in PARAMETERS}
         focal = values["f"] if "f" in values else values["fy"]
@@ -187,14 +187,14 @@ def _transforms(
 
 
 def _similarity(transform: ElementTree.Element, path: Path) -> Similarity:
-    rotation, translation, scale = (transform.find(tag) for tag in ("rotation", "translation", "scale"))
     # a 4x4 matrix, as PhotoScan 1.0 writes it
-    if rotation is None and transform.text and transform.text.strip():
+    if transform.find("rotation") is None and transform.text and transform.text.strip():
         matrix = _numbers(transform, 16, path).reshape(4, 4)
-        factor = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-        return Similarity(factor, matrix[:3, :3] / factor, matrix[:3, 3])
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        return Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
+    rotation, translation, factor = (transform.find(name) for name in ("rotation", "translation", "scale"))
     return Similarity(
-        1.0 if scale is None else float(_numbers(scale, 1, path)[0]),
+        1.0 if factor is None else float(_numbers(factor, 1, path)[0]),
         np.eye(3) if rotation is None else _numbers(rotation, 9, path).reshape(3, 3),
         np.zeros(3) if translation is None else _numbers(translation, 3, path),
     )
@@ -213,7 +213,7 @@ def _pose(camera: ElementTree.Element, world_from_chunk: Similarity, path: Path)
 
 def _numbers(element: ElementTree.Element | None, count: int, path: Path) -> np.ndarray:
     if element is None:
-        raise InputError(f"{path}: an element with {count} finite numbers is missing")
+        raise InputError(f"{path}: {count} finite numbers are expected and missing")
     try:
         values = np.array((element.text or "").replace(",", " ").split(), np.float64)
     except ValueError:
@@ -228,7 +228,7 @@ def _to_local(
 ) -> tuple[list[View], Georeference | None]:
     """Views in local ENU and the georeference, if the chunk has a CRS on Earth; unchanged views otherwise."""
     crs = _crs(chunk, path)
-    if not views or crs is None or crs.ellipsoid is None or crs.geodetic_crs is None:
+    if not views or crs is None or crs.ellipsoid is None:
         return views, None
     middle = np.median([view.center for view in views], axis=0)
     if np.linalg.norm(middle) < GEOCENTRIC:
@@ -238,9 +238,9 @@ def _to_local(
         return views, None
     # points that show how one frame lies in the other
     frame = middle + 1000 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
-    geodetic = _geodetic(frame, crs.ellipsoid, crs.geodetic_crs)
-    latitude, longitude, height = geodetic[0].tolist()
-    origin = (round(latitude, 6), round(longitude, 6), round(height, 0))
+    axes = crs.ellipsoid.semi_major_metre, crs.ellipsoid.semi_minor_metre
+    geodetic = _geodetic(frame, axes, crs.geodetic_crs)
+    origin = triple(round(float(value), digits) for value, digits in zip(geodetic[0], (6, 6, 0)))
     enu = fit_similarity(frame - middle, geodetic_to_enu(geodetic, origin))
     centers = enu.apply(np.array([view.center for view in views]) - middle)
     moved = [
@@ -260,18 +260,20 @@ def _crs(chunk: ElementTree.Element, path: Path) -> pyproj.CRS | None:
     except pyproj.exceptions.CRSError:
         raise InputError(f"{path}: its CRS cannot be understood: {text[:80]}") from None
     crs = crs.sub_crs_list[0] if crs.is_compound else crs
-    base = crs.source_crs if crs.is_bound else None
-    crs = crs if base is None else base
+    crs = crs.source_crs or crs if crs.is_bound else crs
     epsg = crs.to_epsg()
     return pyproj.CRS.from_epsg(epsg) if epsg else crs
 
 
-def _geodetic(points: np.ndarray, ellipsoid: pyproj.crs.Ellipsoid, geographic: pyproj.CRS) -> np.ndarray:
-    """(N, 3) latitude, longitude, height on WGS 84 of geocentric coordinates on the datum of a CRS."""
+def _geodetic(points: np.ndarray, axes: tuple[float, float], geographic: pyproj.CRS | None) -> np.ndarray:
+    """(N, 3) latitude, longitude, height on WGS 84 of geocentric coordinates on the datum of a CRS.
+
+    axes: major and minor of its ellipsoid, m; geographic: the CRS of its datum, None = WGS 84
+    """
     cart = pyproj.Transformer.from_pipeline(
-        f"+proj=pipeline +step +inv +proj=cart +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r} +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+        f"+proj=pipeline +step +inv +proj=cart +a={axes[0]!r} +b={axes[1]!r} +step +proj=unitconvert +xy_in=rad +xy_out=deg"
     )
     return crs_to_geodetic(
         np.stack(cart.transform(*points.T), axis=1),
-        geographic if geographic.is_geographic else pyproj.CRS.from_epsg(4326),
+        geographic if geographic is not None and geographic.is_geographic else pyproj.CRS.from_epsg(4326),
     )

@@ -1,8 +1,8 @@
 """nerfstudio and instant-ngp: `transforms.json`.
 
 `transform_matrix` is world from camera with OpenGL axes (x right, y up, z backwards). `applied_transform`
-(and `applied_scale`) lead from the original
-frame to that of the file; they are undone, so that clouds and meshes in the original frame fit.
+(and `applied_scale`) lead from the original frame to that of the file; they are undone, so that clouds and
+meshes in the original frame fit.
 """
 
 from __future__ import annotations
@@ -95,9 +95,7 @@ def _distortion_model(content: dict, frame: dict, photo: Path, where: str) -> Di
         raise InputError(f"{where}: neither fl_x nor camera_angle_x is given")
     listed = content.get("distortion_params", frame.get("distortion_params"))
     k1, k2, k3, k4, p1, p2 = (
-        [number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
-        if listed is None
-        else [float(value) for value in listed]
+        listed if listed is not None else [number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
     )
     fisheye = model == "OPENCV_FISHEYE"
     return DistortionModel(

@@ -2,11 +2,10 @@
 ODM's `coords.txt` for the place.
 
 Focal lengths and principal points are in units of the longer side of the photo, the latter from its middle;
-`rotation` is the axis-angle vector of
-cam from world. The world is local ENU at `reference_lla`. ODM keeps that as `reconstruction.topocentric.json`
-and writes `reconstruction.json` anew in
-UTM minus the offset of `odm_georeferencing/coords.txt`, with rotations that are then rounded to the nearest:
-the topocentric file is read if it is there.
+`rotation` is the axis-angle vector of cam from world. The world is local ENU at `reference_lla`. ODM keeps
+that as `reconstruction.topocentric.json` and writes `reconstruction.json` anew in UTM minus the offset of
+`odm_georeferencing/coords.txt`, with rotations that are then rounded to the nearest: the topocentric file is
+read if it is there.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.georeferencing.control_points import parse_crs
 from sc3d.georeferencing.georeference import Georeference, from_origin, triple
-from sc3d.importers.project import Project, require, rigid
+from sc3d.importers.project import Project, require_found, rigid
 from sc3d.io.json_files import read_json
 from sc3d.settings.reconstruction import Import
 
@@ -50,7 +49,7 @@ def matches(path: Path) -> bool:
 
 
 def files(path: Path) -> list[Path]:
-    folder = require(_folder(path), path, EXPECTED)
+    folder = require_found(_folder(path), path, EXPECTED)
     return [
         folder / FILE,
         folder / TOPOCENTRIC,
@@ -60,7 +59,7 @@ def files(path: Path) -> list[Path]:
 
 
 def read(path: Path, settings: Import) -> Project:
-    folder = require(_folder(path), path, EXPECTED)
+    folder = require_found(_folder(path), path, EXPECTED)
     file = next(
         file
         for file in (path if path.is_file() else folder / TOPOCENTRIC, folder / TOPOCENTRIC, folder / FILE)
@@ -125,20 +124,18 @@ def _distortion_model(camera: dict, where: str) -> DistortionModel:
     try:
         width, height = int(camera["width"]), int(camera["height"])
         size = max(width, height)
+        focal = [float(camera.get(key, camera.get("focal", "nan"))) * size for key in ("focal_x", "focal_y")]
         if kind in ("perspective", "fisheye"):
-            fx = fy = float(camera["focal"]) * size
-        else:
-            fx, fy = (
-                float(camera.get(key, camera.get("focal", "nan"))) * size for key in ("focal_x", "focal_y")
-            )
+            focal = [float(camera["focal"]) * size] * 2
         principal = (
             float(camera.get("c_x", 0)) * size + width / 2,
             float(camera.get("c_y", 0)) * size + height / 2,
         )
         radial = tuple(float(camera.get(name, 0)) for name in (PERSPECTIVE | FISHEYE)[kind])
-        p1, p2 = (
-            float(camera.get(name, 0)) if kind in ("brown", "fisheye62", "fisheye624") else 0.0
-            for name in ("p1", "p2")
+        tangential = (
+            (float(camera.get("p1", 0)), float(camera.get("p2", 0)))
+            if kind in ("brown", "fisheye62", "fisheye624")
+            else (0.0, 0.0)
         )
         prism = [float(camera.get(f"s{number}", 0)) for number in range(4)]
     except (KeyError, TypeError, ValueError) as error:
@@ -150,10 +147,10 @@ def _distortion_model(camera: dict, where: str) -> DistortionModel:
     return DistortionModel(
         width,
         height,
-        (fx, fy),
+        (focal[0], focal[1]),
         principal,
         radial,
-        (p1, p2),
+        tangential,
         kind in FISHEYE,
         prism=(prism[0], prism[2]) if kind == "fisheye624" else (0.0, 0.0),
     )
@@ -185,14 +182,19 @@ def _points(points: dict, file: Path) -> tuple[np.ndarray, np.ndarray, dict[str,
         colors = np.array(
             [point.get("color", (128, 128, 128)) for point in points.values()], np.float64
         ).reshape(-1, 3)
+        if not len(positions) == len(colors) == len(points):
+            raise ValueError("three numbers each are expected")
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file} has points that cannot be used ({error!r})") from None
-    kept, colors = np.isfinite(positions).all(axis=1), np.nan_to_num(colors)
-    names = list(points)
+    kept, colors, names = (
+        np.flatnonzero(np.isfinite(positions).all(axis=1)),
+        np.nan_to_num(colors),
+        list(points),
+    )
     return (
         positions[kept],
         np.clip(np.rint(colors[kept]), 0, 255).astype(np.uint8),
-        {str(names[old]): row for row, old in enumerate(np.flatnonzero(kept))},
+        {str(names[place]): row for row, place in enumerate(kept)},
     )
 
 

@@ -18,7 +18,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.georeferencing.georeference import Georeference, triple
-from sc3d.importers.project import Project, require, rigid
+from sc3d.importers.project import Project, require_found, rigid
 from sc3d.settings.reconstruction import Import
 
 logger = logging.getLogger(__name__)
@@ -35,12 +35,12 @@ def matches(path: Path) -> bool:
 
 
 def files(path: Path) -> list[Path]:
-    file = require(_file(path), path, EXPECTED)
+    file = require_found(_file(path), path, EXPECTED)
     return [file, *_place_files(file)]
 
 
 def read(path: Path, settings: Import) -> Project:
-    file = require(_file(path), path, EXPECTED)
+    file = require_found(_file(path), path, EXPECTED)
     try:
         lines = [
             (number, line.strip())

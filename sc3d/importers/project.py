@@ -99,10 +99,10 @@ def find_importer(path: Path, source: str) -> ModuleType:
     raise InputError(f"{path} is no {source} project: {modules[0].EXPECTED}")
 
 
-def require(found: Path | None, path: Path, expected: str) -> Path:
-    """What an importer found at a path; InputError if that is nothing, with what is `expected` there."""
+def require_found(found: Path | None, path: Path, expected: str) -> Path:
+    """What an importer looks for in a path; InputError that says what is `expected` if it is not there."""
     if found is None:
-        raise InputError(f"{path}: {expected}")
+        raise InputError(f"{path} is another project: {expected}")
     return found
 
 

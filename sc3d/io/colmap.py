@@ -1,8 +1,8 @@
 """COLMAP models, read by pycolmap after a look at them, taken apart, put together and written.
 
 pycolmap believes the counts in binary files: one that is too large makes it fill the memory, or read on
-behind the end for ever. In text files a
-count never leads beyond its line. Cameras and poses are not checked by pycolmap at all.
+behind the end for ever. In text files a count never leads beyond its line. Cameras and poses are not checked
+by pycolmap at all.
 Layout: https://colmap.github.io/format.html; rigs.bin and frames.bin as COLMAP 3.12 and later write them.
     Little endian throughout.
 """
@@ -30,8 +30,7 @@ POINT = np.array([[0, 43, 0, 0, 0], [8, 8, 0, LARGEST, 0]])
 # id, rig, rotation, translation; sensor and photo
 FRAME = np.array([[0, 64, 0, 0, 0], [4, 16, 0, LARGEST, 0]])
 MAX_NAME = 4096  # bytes of a photo name
-NO_POINTS = np.zeros((0, 3))
-NO_OBSERVATIONS = (np.zeros(0, np.int64), np.zeros((0, 2)))
+NO_POINTS, NO_ROWS, NO_PIXELS = np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2))
 NOT_RIGID = 0.01  # largest error of R R^T: text models are rounded
 
 
@@ -63,15 +62,13 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
     return model
 
 
-class Photo(Protocol):
+class PosedCamera(Protocol):
     """A photo's camera; cam_from_world: (4, 4) rigid transform. `geometry.cameras.View` is one."""
 
     @property
     def name(self) -> str: ...
-
     @property
     def camera(self) -> pycolmap.Camera: ...
-
     @property
     def cam_from_world(self) -> np.ndarray: ...
 
@@ -112,18 +109,19 @@ def observed_rows(image: pycolmap.Image, point_ids: np.ndarray) -> np.ndarray:
 
 
 def build_model(
-    views: Sequence[Photo],
+    views: Sequence[PosedCamera],
     points: np.ndarray = NO_POINTS,
     colors: np.ndarray = NO_POINTS,
     observations: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> pycolmap.Reconstruction:
-    """A model of views, of which those with equal cameras share one; photos are numbered from 1 in their order.
+    """A model of views, of which those with equal cameras share one; photos are numbered from 1 on.
 
     points, colors: (P, 3) float64 world and uint8 RGB
     observations: per view the rows (K,) of points that it sees and their pixels (K, 2); None = nothing
     """
     model, cameras = pycolmap.Reconstruction(), {}
-    observations = [NO_OBSERVATIONS] * len(views) if observations is None else observations
+    if observations is None:
+        observations = [(NO_ROWS, NO_PIXELS)] * len(views)
     for number, (view, (_, pixels)) in enumerate(zip(views, observations, strict=True), start=1):
         key = (view.camera.model_name, view.camera.width, view.camera.height, *view.camera.params)
         if key not in cameras:
@@ -232,7 +230,8 @@ def _read(form: str, data: mmap.mmap, position: int) -> tuple:
 
 
 def _walk_cameras(data: mmap.mmap, count: int) -> int:
-    position, ids = 8, set[int]()
+    position: int = 8
+    ids: set[int] = set()
     for _ in range(count):
         number, model = _read("<Ii", data, position)
         _once(number, ids, "camera")
@@ -249,7 +248,8 @@ def _num_params(model: int) -> int:
 
 
 def _walk_rigs(data: mmap.mmap, count: int) -> int:
-    position, ids = 8, set[int]()
+    position: int = 8
+    ids: set[int] = set()
     for _ in range(count):
         number, sensors = _read("<II", data, position)
         _once(number, ids, "rig")
@@ -282,7 +282,8 @@ def _walk_records(data: mmap.mmap, count: int, fields: np.ndarray) -> int:
 
 
 def _walk_images(data: mmap.mmap, count: int) -> int:
-    position, ids = 8, set[int]()
+    position: int = 8
+    ids: set[int] = set()
     for _ in range(count):
         _once(_read("<I", data, position)[0], ids, "photo")
         end = data.find(b"\0", position + 64, position + 64 + MAX_NAME)

@@ -50,13 +50,13 @@ PADDING = 64  # bytes of blanks that may follow
 
 
 class Property(NamedTuple):
-    """A column of an element. dtype: numpy code without byte order, of the items of a list; length_dtype: that
-    of the list's length, "" for no list.
+    """A column of an element. dtype: numpy code without byte order, of the items of a list; length: that of
+    the list's length, "" for no list.
     """
 
     name: str
     dtype: str
-    length_dtype: str = ""
+    length: str = ""
 
 
 class Element(NamedTuple):
@@ -68,7 +68,7 @@ class Element(NamedTuple):
 
     @property
     def has_lists(self) -> bool:
-        return any(entry.length_dtype for entry in self.properties)
+        return any(entry.length for entry in self.properties)
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ def read_header(path: Path) -> Header:
         raise InputError(f"{path} is missing")
     with path.open("rb") as file:
         head = file.read(MAX_HEADER)
-    ending = next((ending for ending in (b"\r\n", b"\n", b"\r") if head.startswith(b"ply" + ending)), None)
-    end = -1 if ending is None else head.find(ending + b"end_header" + ending)
-    if ending is None or end < 0:
+    ending = next((ending for ending in (b"\r\n", b"\n", b"\r") if head.startswith(b"ply" + ending)), b"")
+    end = -1 if not ending else head.find(ending + b"end_header" + ending)
+    if end < 0:
         raise InputError(f"{path} is not a PLY file: its header is missing or cut off")
     lines = [line.decode("utf-8", "replace") for line in head[:end].split(ending)[1:]]
     size = end + len(ending + b"end_header" + ending)
@@ -118,7 +118,7 @@ class _LineError(ValueError):
 
 
 def _parse(lines: list[str], size: int) -> Header:
-    orders, comments = list[str](), list[str]()
+    orders, comments = [], []
     elements: list[tuple[str, int, list[Property]]] = []
     for line in lines:
         words = line.split()
@@ -172,11 +172,7 @@ def _check_names(tables: tuple[Element, ...]) -> None:
         if element.rows and not names:
             raise _LineError(f"the element {element.name!r} has {element.rows} rows and no properties")
     vertex = next((element for element in tables if element.name == "vertex"), None)
-    types = (
-        {}
-        if vertex is None
-        else {entry.name: entry.dtype + entry.length_dtype for entry in vertex.properties}
-    )
+    types = {} if vertex is None else {entry.name: entry.dtype + entry.length for entry in vertex.properties}
     for group in TOGETHER:
         found = [types[name] for name in group if name in types]
         if found and (len(found) < 3 or len(set(found)) > 1):
@@ -193,7 +189,7 @@ def _check_faces(tables: tuple[Element, ...], vertex: Element | None) -> None:
     if face is not None and (vertex is None or not vertex.rows):
         raise _LineError(f"{face.rows} faces have no vertices")
     for entry in face.properties if face is not None else ():
-        if entry.name in CORNERS and (not entry.length_dtype or entry.dtype.startswith("f")):
+        if entry.name in CORNERS and (not entry.length or entry.dtype.startswith("f")):
             raise _LineError(f"{entry.name} must be a list of whole numbers")
 
 
@@ -263,7 +259,7 @@ def read_positions(path: Path, header: Header) -> np.ndarray | None:
 
 def _least(entry: Property, order: str) -> int:
     """Smallest number of bytes in the file."""
-    return 2 if not order else np.dtype(entry.length_dtype or entry.dtype).itemsize
+    return 2 if not order else np.dtype(entry.length or entry.dtype).itemsize
 
 
 def _skip(path: Path, header: Header, element: Element, data: np.ndarray, start: int) -> int:
@@ -299,12 +295,9 @@ def _skip(path: Path, header: Header, element: Element, data: np.ndarray, start:
 def _field(entry: Property, element: str, num_vertices: int) -> tuple[int, int, int, int, int]:
     """As the kernels want it; what is signed must not be negative."""
     width = np.dtype(entry.dtype).itemsize
-    if not entry.length_dtype:
+    if not entry.length:
         return 0, width, 0, 0, 0
-    length, longest = (
-        np.dtype(entry.length_dtype).itemsize,
-        min(MAX_CORNERS, np.iinfo(entry.length_dtype).max),
-    )
+    length, longest = np.dtype(entry.length).itemsize, min(MAX_CORNERS, np.iinfo(entry.length).max)
     if element == "face" and entry.name in CORNERS:
         return (
             length,
@@ -427,11 +420,7 @@ def format_header(elements: Iterable[Element], comments: Sequence[str] = (), siz
     for element in elements:
         lines.append(f"element {element.name} {element.rows}")
         for entry in element.properties:
-            kind = (
-                f"list {NAMES[entry.length_dtype]} {NAMES[entry.dtype]}"
-                if entry.length_dtype
-                else NAMES[entry.dtype]
-            )
+            kind = f"list {NAMES[entry.length]} {NAMES[entry.dtype]}" if entry.length else NAMES[entry.dtype]
             lines.append(f"property {kind} {entry.name}")
     lines[last] += "." * (size - len("\n".join(["ply", *lines, "end_header", ""]).encode())) if last else ""
     header = "\n".join(["ply", *lines, "end_header", ""]).encode()

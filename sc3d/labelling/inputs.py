@@ -18,6 +18,7 @@ from sc3d.labelling.density import GaussianField, gaussian_density, kernel_densi
 from sc3d.labelling.observation import Mask
 from sc3d.scene.labelled_cloud import spacing_of
 from sc3d.scene.scene import Scene
+from sc3d.scene.splats import read_scene_splats
 
 FOOTPRINT_SAMPLE = 1000
 
@@ -97,14 +98,4 @@ def point_density(
     """
     if not scene.gaussians.exists():
         return kernel_density(points, voxel_size, origin)
-    from sc3d.splatting.dataset import load_gaussians  # loads torch
-
-    gaussians, origin = load_gaussians(scene)
-    rotations, scales, opacities = (
-        values.numpy() for values in (gaussians.rotations, gaussians.scales, gaussians.opacities)
-    )
-    return gaussian_density(
-        points,
-        GaussianField(gaussians.means.numpy().astype(np.float64) + origin, rotations, scales, opacities),
-        voxel_size,
-    )
+    return gaussian_density(points, GaussianField.from_arrays(*read_scene_splats(scene)), voxel_size)

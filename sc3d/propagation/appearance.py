@@ -1,4 +1,4 @@
-"""Color and relief as two more raters (METHOD section 6): what agreed points of each class look like, as
+"""Color and relief of the classes as two more voters (METHOD section 6): what agreed points of each class look like, as
 joint histograms.
 
 The masks' errors are shared between views, so no voting removes them. Color and relief (height above the
@@ -36,7 +36,7 @@ IMPLAUSIBLE = np.log(0.5)  # a seed whose class the model gives less is a confli
 
 logger = logging.getLogger(__name__)
 
-# per group of features, (cells, C) int64 examples of each class; lessons of parts add up
+# per group of features, (cells, C) int64 examples of each class; statistics of parts add up
 AppearanceStatistics = tuple[np.ndarray, ...]
 
 
@@ -120,8 +120,8 @@ class AppearanceModel:
         """(N, C) float32 log-probability of the classes as color and relief see them; None where there is
         too little to learn from.
 
-        label: (N,) uint8. Points of a class without enough examples get zeros: the raters do not contradict
-            what they do not know.
+        label: (N,) uint8. Points of a class without enough examples get zeros: the model does not contradict
+            what it does not know.
         """
         counts = statistics[0].sum(axis=0)
         known = counts >= MIN_EXAMPLES
@@ -142,7 +142,7 @@ class AppearanceModel:
         return np.maximum(result, np.float32(np.log(1e-4)), out=result)
 
     def errors(self, statistics: AppearanceStatistics, label: np.ndarray, asked: np.ndarray) -> int | None:
-        """How many of the points asked (N,) bool, whose label is taken for true, the lesson rates wrong; None
+        """How many of the points asked (N,) bool, whose label is taken for true, the statistics get wrong; None
         if it is too short.
         """
         rating = self.log_likelihood(statistics, label)
@@ -166,7 +166,7 @@ def folds_of(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarra
 
 
 def skill_score(wrong: list[int | None], counts: np.ndarray) -> float:
-    """Share of the errors of the best constant answer that the raters avoid on blocks held out; 0 where they
+    """Share of the errors of the best constant answer that the model avoids on blocks held out; 0 where it
     cannot learn.
 
     wrong: errors of each fold, asked about points that it has not seen; counts: (C,) examples of each class
@@ -177,13 +177,13 @@ def skill_score(wrong: list[int | None], counts: np.ndarray) -> float:
     return 1 - sum(errors) / max(int(counts.sum() - counts.max()), 1)
 
 
-def sum_statistics(lessons: list[AppearanceStatistics]) -> AppearanceStatistics:
-    """The lesson of all parts."""
-    return tuple(sum(parts) for parts in zip(*lessons, strict=True))
+def sum_statistics(parts: list[AppearanceStatistics]) -> AppearanceStatistics:
+    """The statistics of all parts."""
+    return tuple(np.sum(group, axis=0) for group in zip(*parts, strict=True))
 
 
 def is_skillful(wrong: list[int | None], statistics: AppearanceStatistics) -> bool:
-    """Whether the raters do well enough; wrong: their errors on each fold held out."""
+    """Whether the model does well enough; wrong: its errors on each fold held out."""
     skill = skill_score(wrong, statistics[0].sum(axis=0))
     logger.info(
         "color and relief avoid %.0f%% of errors on held-out agreed points%s",

@@ -78,7 +78,7 @@ class LabelledPoints:
 
 def views_to_agree(agreement: np.ndarray) -> int:
     """How many views must have seen an example: AGREED_VIEWS, or fewer, where some class would have too few
-    examples, as to the raters it would not exist.
+    examples: to the appearance model it would not exist.
 
     agreement: (AGREED_VIEWS, 256) of the whole cloud
     """

@@ -47,7 +47,7 @@ def minimize_energy(
 def vote_marginals(
     graph: Graph, known: LabelledPoints, offered: np.ndarray, settings: Propagate
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Log-evidence and belief (N, C) from the votes alone; offered: (C,) bool, a class without a single seed
+    """Log-evidence and marginals (N, C) from the votes alone; offered: (C,) bool, a class without a single seed
     is not.
     """
     likelihood = vote_likelihood(known.known_votes)
@@ -63,10 +63,10 @@ def vote_marginals(
 def appearance_marginals(
     graph: Graph, known: LabelledPoints, offered: np.ndarray, rating: np.ndarray, settings: Propagate
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same from votes and raters; rating: (N, C), overwritten."""
+    """The same from votes and appearance; rating: (N, C) of the appearance, overwritten."""
     rating += np.float32(TRUST) * vote_likelihood(known.known_votes)
     rating[:, ~offered] = -np.inf
-    return rating, mean_field(graph, rating, settings.smoothness)  # afresh: a sure belief would not move
+    return rating, mean_field(graph, rating, settings.smoothness)  # afresh: sure marginals would not move
 
 
 def sure_examples(marginals: np.ndarray, known: LabelledPoints) -> np.ndarray:
@@ -75,7 +75,7 @@ def sure_examples(marginals: np.ndarray, known: LabelledPoints) -> np.ndarray:
 
 
 def decided(graph: Graph, evidence: np.ndarray, marginals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) uint8 labels and (N,) float32 confidences of a belief (N, C); evidence (N, C) is overwritten."""
+    """(N,) uint8 labels and (N,) float32 confidences of marginals (N, C); evidence (N, C) is overwritten."""
     label = marginals.argmax(axis=1) + 1
     evidence *= np.float32(CAUTION)
     cautious = mean_field(graph, evidence, SUPPORT, marginals, steps=1)
@@ -105,8 +105,8 @@ def mean_field(
     """Minimize sum_i -log p_i(l_i) + smoothness sum_(i,j) w_ij [l_i != l_j], all points at once in each step.
 
     log_likelihood: (N, C) float32, column c = class id c + 1; -inf = class not offered
-    start: (N, C) first belief; None = as the likelihood says
-    returns: (N, C) float32 belief, rows sum to 1. Each row is summed in a fixed order: the same for any
+    start: (N, C) first marginals; None = as the likelihood says
+    returns: (N, C) float32 marginals, rows sum to 1. Each row is summed in a fixed order: the same for any
         number of threads.
     """
     marginals = softmax(log_likelihood) if start is None else np.ascontiguousarray(start, np.float32)
@@ -146,7 +146,7 @@ def potts_energy(graph: Graph, log_likelihood: np.ndarray, label: np.ndarray, sm
 
 
 def free_energy(graph: Graph, log_likelihood: np.ndarray, marginals: np.ndarray, smoothness: float) -> float:
-    """Expected energy minus entropy of independent beliefs (N, C): what mean field minimizes."""
+    """Expected energy minus entropy of independent marginals (N, C): what mean field minimizes."""
     marginals = marginals.astype(np.float64)
     cost = -(np.where(marginals > 0, log_likelihood, 0) * marginals).sum()
     entropy = -(marginals * np.log(np.maximum(marginals, 1e-300))).sum()

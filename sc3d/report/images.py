@@ -15,7 +15,7 @@ from sc3d.geometry.cameras import View
 from sc3d.io.images import data_uri, read_image, read_index_image
 from sc3d.report.data import ReportData
 from sc3d.scene.labelled_cloud import LabelledSurface
-from sc3d.view.colors import COLORINGS, Coloring, color_points
+from sc3d.view.colors import COLORINGS, color_points
 from sc3d.view.screenshot import Style, draw_points, screenshot
 
 logger = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ def cloud_pictures(data: ReportData) -> dict[tuple[str, str], tuple[str, float]]
     """Data URIs and width/height by (coloring or "mesh", "oblique" or "above"), of what the cloud has; empty
     where no renderer works.
     """
-    pictures: dict[tuple[str, str], tuple[str, float]] = {}
+    pictures = {}
     try:
         for direction, size in _SIZES.items():
             style = Style(
@@ -48,9 +48,9 @@ def cloud_pictures(data: ReportData) -> dict[tuple[str, str], tuple[str, float]]
     return pictures
 
 
-def _colorings(data: ReportData) -> dict[Coloring, np.ndarray]:
+def _colorings(data: ReportData) -> dict[str, np.ndarray]:
     """(N, 3) uint8 RGB by coloring, for the attributes that the cloud has."""
-    found = {}
+    found: dict[str, np.ndarray] = {}
     for by in COLORINGS:
         with suppress(InputError):
             found[by] = color_points(data.cloud, by, data.class_table)

@@ -10,7 +10,6 @@ from typing import Literal
 
 import numpy as np
 
-from sc3d.geometry.cameras import View
 from sc3d.io.images import data_uri, read_image
 from sc3d.report.charts import (
     css_color,
@@ -153,7 +152,8 @@ def quality_section(data: ReportData) -> str:
 
 def photo_section(data: ReportData) -> str:
     """A handful of photos with mask, fused labels and truth."""
-    chosen, rows, labelled = _choose_views(data), list[str](), None
+    chosen, rows = _choose_views(data), []
+    labelled = None
     if chosen and data.label_counts is not None:
         labelled = LabelledSurface.build(data.cloud, data.views, data.scene.mesh)
     for view in chosen:
@@ -194,17 +194,17 @@ def training_section(data: ReportData) -> str:
     )
 
 
-def _choose_views(data: ReportData) -> list[View]:
+def _choose_views(data: ReportData) -> list:
     """Photos spread evenly over the flight; those with truth first, then those with a mask."""
 
-    def with_file(folder: Path) -> list[View]:
+    def with_file(folder: Path) -> list:
         return [view for view in data.views if (folder / f"{Path(view.name).stem}.png").exists()]
 
     views = with_file(data.truth) or with_file(data.scene.masks) or data.views
     if not views:
         return []
-    chosen = np.linspace(0, len(views) - 1, min(_NUM_PHOTOS, len(views))).round().astype(int)
-    return [views[position] for position in np.unique(chosen)]
+    spread = np.linspace(0, len(views) - 1, min(_NUM_PHOTOS, len(views))).round().astype(int)
+    return [views[position] for position in np.unique(spread)]
 
 
 def _photo_figures(data: ReportData, name: str) -> str:
@@ -224,11 +224,11 @@ def _photo_figures(data: ReportData, name: str) -> str:
 
 def _legend(data: ReportData, by: Coloring | Literal["mesh"], everything: bool = False) -> str:
     """What the colors mean; of classes and states only those that the cloud has, unless `everything`."""
-    if by == "mesh":
-        return ""
     if by == "confidence":
         stops = ", ".join(css_color(color) for color in confidence_colors(np.linspace(0, 1, 9)))
         return f'<p class="legend">confidence 0 <i class="ramp" style="background:linear-gradient(90deg, {stops})"></i> 1</p>'
+    if by == "mesh":
+        return ""
     values = data.values(by) if by in ("label", "state") else None
     present = None if values is None or everything else set(np.unique(values).tolist())
     entries = legend_entries(by, data.class_table, present)
@@ -296,10 +296,10 @@ def iou_of(data: ReportData, source: str) -> dict[str, float | None]:
 
 
 def _class_table(data: ReportData) -> str:
-    counts, labels = data.label_counts, data.values("label")
+    counts, labels, confidence = data.label_counts, data.values("label"), data.values("confidence")
     if counts is None or labels is None or data.class_table is None or not len(data.points):
         return ""
-    confidence, iou = data.values("confidence"), iou_of(data, "labels")
+    iou = iou_of(data, "labels")
     areas = class_areas(data.points, labels.astype(np.uint8))
     sums, rows = (
         None if confidence is None else np.bincount(labels, np.nan_to_num(confidence), minlength=256),
@@ -402,11 +402,14 @@ def _reliability(data: ReportData) -> list[str]:
         or not all(row is None or isinstance(row, list) and len(row) == 3 for row in rows)
     ):
         return []
-    found = [[None] * 3 if row is None else [number(value) for value in row] for row in rows]
-    if any(None in row and any(value is not None for value in row) for row in found):
-        return []
-    pixels = sum(count or 0 for _, _, count in found)
-    bins = [(confidence, accuracy, count and count / max(pixels, 1)) for confidence, accuracy, count in found]
+    bins = []
+    for row in rows:
+        confidence, accuracy, count = (None, None, None) if row is None else map(number, row)
+        if None in (confidence, accuracy, count) and (confidence, accuracy, count) != (None, None, None):
+            return []
+        bins.append((confidence, accuracy, count))
+    pixels = sum(count or 0 for _, _, count in bins)
+    bins = [(confidence, accuracy, count and count / max(pixels, 1)) for confidence, accuracy, count in bins]
     error = number(figures.get("ece"))
     note = "Share of right pixels (dots) against the confidence of their label; on the line, confidence is exactly that share. Bars: share of the pixels."
     if error is not None:
@@ -421,9 +424,9 @@ def processing_section(data: ReportData) -> str:
     rows, details = [], []
     for record in data.records:
         summary = record.get("summary")
-        figures = summary if isinstance(summary, dict) else {}
+        summary = summary if isinstance(summary, dict) else {}
         text = "; ".join(
-            f"{key} {_plain(value)}" for key, value in figures.items() if not isinstance(value, dict | list)
+            f"{key} {_plain(value)}" for key, value in summary.items() if not isinstance(value, dict | list)
         )
         rows.append(
             f"<tr><th>{escape(record['stage'])}</th><td>{formatted(number(record.get('seconds')), ',.1f')}</td>"

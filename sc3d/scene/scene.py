@@ -219,7 +219,7 @@ def match_masks(
     return matched
 
 
-def check_mask_aspect(file: Path, mask_size: tuple[int, int], photo_size: tuple[int, int]) -> None:
+def check_mask_aspect(file: Path | str, mask_size: tuple[int, int], photo_size: tuple[int, int]) -> None:
     """Raise InputError unless a mask has the aspect of its photo within 1 px of the smaller of the two."""
     (width, height), (photo_width, photo_height) = mask_size, photo_size
     if width * height > max(MAX_MASK_PIXELS, photo_width * photo_height):

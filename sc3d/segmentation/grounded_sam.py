@@ -4,29 +4,24 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sc3d.errors import InputError
 from sc3d.io.json_files import read_json
 from sc3d.scene.class_table import ClassTable
 from sc3d.segmentation.instances import Instance
 from sc3d.segmentation.models import (
     IMAGENET,
-    check_packages,
-    check_settings,
-    choose_device,
-    inference,
+    PromptedSegmenter,
     load_model,
     load_tokenizer,
+    model_type,
     outline,
     to_pixels,
 )
-from sc3d.segmentation.segment import Segmentation
-from sc3d.segmentation.text_prompts import Caption, Prompt, build_captions, list_prompts, match_prompts
-from sc3d.segmentation.tiled_inference import Findings, segment_tiled
-from sc3d.segmentation.weights import find_weights, model_type
+from sc3d.segmentation.text_prompts import Caption, Prompt, build_captions, match_prompts
+from sc3d.segmentation.tiled_inference import Findings
 from sc3d.settings.labels import Segment
 
 if TYPE_CHECKING:
@@ -54,31 +49,15 @@ class Detections(NamedTuple):
     scores: np.ndarray
 
 
-class GroundedSam:
-    """Segmenter for the classes of a table, by their prompts; models are loaded for the first photo."""
+class GroundedSam(PromptedSegmenter):
+    """Grounding DINO and SAM; the confidence of an instance is box score x mask score."""
 
     def __init__(self, settings: Segment, class_table: ClassTable) -> None:
-        """Find packages and weights; raises MissingPackageError or InputError at once if something is
-        missing.
-        """
-        check_packages("grounded-sam")
-        check_settings(settings)
-        self._settings = settings
-        self._prompts = list_prompts(class_table)
-        self._device = choose_device(settings)
-        self.detector_path = find_weights(settings.detector, settings.model_dir, settings.download)
-        self.segmenter_path = find_weights(settings.segmenter, settings.model_dir, settings.download)
+        super().__init__("grounded-sam", settings, class_table)
+        self.detector_path = self._find_model(settings.detector, _DETECTORS)
+        self.segmenter_path = self._find_model(settings.segmenter, _SEGMENTERS)
         self._segmenter_type = model_type(self.segmenter_path)
-        for path, known in ((self.detector_path, _DETECTORS), (self.segmenter_path, _SEGMENTERS)):
-            if model_type(path) not in known:
-                raise InputError(
-                    f"{path} holds a model of type {model_type(path)!r}; possible here: {', '.join(known)}"
-                )
         self._sides = _detector_sides(self.detector_path)
-
-    def segment(self, image: np.ndarray) -> Segmentation:
-        """Segment a photo, (H, W, 3) uint8 RGB; the confidence is box score x mask score."""
-        return segment_tiled(image, self.find, self._settings.tile, self._settings.overlap)
 
     def find(self, image: np.ndarray) -> Findings:
         """Instances of all classes in an (H, W, 3) uint8 RGB image, in one look."""
@@ -103,11 +82,11 @@ class GroundedSam:
         )
 
     @cached_property
-    def _detector(self) -> torch.nn.Module:
+    def _detector(self) -> Any:
         return load_model(self.detector_path, _DETECTORS, self._device)
 
     @cached_property
-    def _segmenter(self) -> torch.nn.Module:
+    def _segmenter(self) -> Any:
         return load_model(self.segmenter_path, _SEGMENTERS, self._device)
 
     @cached_property
@@ -142,7 +121,7 @@ class GroundedSam:
         import torch
 
         ids = torch.tensor([caption.token_ids], device=self._device)
-        with inference(self._device, self._settings.half):
+        with self._inference():
             output = self._detector(
                 pixel_values=pixels,
                 input_ids=ids,
@@ -172,7 +151,7 @@ class GroundedSam:
             to_pixels(image, inner, IMAGENET, self._device), (0, side - inner[0], 0, side - inner[1])
         )
         instances = []
-        with inference(self._device, self._settings.half):
+        with self._inference():
             embeddings = self._segmenter.get_image_embeddings(pixels)
             for start in range(0, len(scaled), _BOXES_AT_ONCE):
                 part = slice(start, start + _BOXES_AT_ONCE)
@@ -204,7 +183,7 @@ def _detector_sides(path: Path) -> tuple[int, int]:
     return _SIDES
 
 
-def _image_side(segmenter: torch.nn.Module) -> int:
+def _image_side(segmenter: Any) -> int:
     """Side of the square image that a SAM model takes, px."""
     size = segmenter.config.prompt_encoder_config.image_size
     return int(size if isinstance(size, int) else size[0])

@@ -1,16 +1,18 @@
-"""Objects that a segmenter found in a photo, and their file: COCO JSON with run-length encoded masks."""
+"""Objects that a segmenter found in a photo: duplicates, one label per pixel, and their file (COCO JSON)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from sc3d.errors import InputError
 from sc3d.io.json_files import write_json
 from sc3d.scene.class_table import ClassTable
-from sc3d.segmentation.rle import Window, area, bounds, encode_runs, find_runs, iou, move_runs
+from sc3d.segmentation.rle import Window, area, bounds, encode_runs, fill_runs, iou, move_runs
 
 SAME_OBJECT = 0.5  # two masks of one class with a larger intersection over union are one object
 
@@ -33,13 +35,6 @@ class Instance:
     mask_score: float
     prompt: str = ""
 
-    @classmethod
-    def from_mask(
-        cls, mask: np.ndarray, class_id: int, box_score: float, mask_score: float, prompt: str = ""
-    ) -> Instance:
-        """From an (H, W) bool mask of the whole photo."""
-        return cls(find_runs(mask, mask.shape[0]), mask.shape, class_id, box_score, mask_score, prompt)
-
     @cached_property
     def score(self) -> float:
         """Box score x mask score; mask scores are regressed and may leave 0 to 1 a little, so both are
@@ -61,6 +56,15 @@ class Instance:
     def rank(self) -> tuple[float, int, int]:
         """Larger is better: higher score, then smaller mask, then lower class id."""
         return self.score, -self.area, -self.class_id
+
+
+class Areas(NamedTuple):
+    """What a model says of every pixel, without telling objects apart: (H, W) uint8 class id; (H, W) uint8
+    confidence; both 0 where it says nothing.
+    """
+
+    labels: np.ndarray
+    confidence: np.ndarray
 
 
 def useful(instances: list[Instance]) -> list[Instance]:
@@ -109,6 +113,53 @@ def move(instance: Instance, window: Window, size: tuple[int, int]) -> Instance:
     )
 
 
+def merge_instances(
+    instances: list[Instance] | tuple[Instance, ...], shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give every pixel the class of its best instance, whatever the order of the instances.
+
+    instances: those with a score of 0 or NaN are ignored
+    shape: (H, W) px
+    returns: (H, W) uint8 class id, 0 where there is no instance; (H, W) uint8 confidence, 1 to 255 = score 1,
+        0 where unlabelled
+    source: highest box score x mask score wins; ties go to the smaller mask, then to the lower class id
+    """
+    labels, confidence = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+    for instance in reversed(useful(list(instances))):  # painted over by better ones
+        if tuple(instance.size) != tuple(shape):
+            raise InputError(
+                f"a mask is {tuple(instance.size)} (rows, columns), but its photo is {tuple(shape)}"
+            )
+        mask, window = fill_runs(instance.runs, shape[0])
+        place = slice(window.top, window.bottom), slice(window.left, window.right)
+        labels[place][mask] = instance.class_id
+        # at least 1, so that 0 always means unlabelled
+        confidence[place][mask] = max(1, round(255 * instance.score))
+    return labels, confidence
+
+
+def fill_gaps(labels: np.ndarray, confidence: np.ndarray, areas: Areas) -> None:
+    """Label the pixels that no instance claims by what the model says of every pixel; labels and confidence
+    are changed in place.
+    """
+    empty = labels == 0
+    labels[empty], confidence[empty] = areas.labels[empty], areas.confidence[empty]
+
+
+def paint_areas(areas: Areas, others: Areas, place: Window) -> None:
+    """Give pixels of a window what `others` say of them where that is surer; at equal confidence the lower id
+    stays. Changes `areas`.
+
+    others: of the window
+    """
+    window = slice(place.top, place.bottom), slice(place.left, place.right)
+    labels, confidence = areas.labels[window], areas.confidence[window]
+    better = (others.confidence > confidence) | (
+        (others.confidence == confidence) & (confidence > 0) & (others.labels < labels)
+    )
+    labels[better], confidence[better] = others.labels[better], others.confidence[better]
+
+
 def write_instances(
     path: Path, photo: str, size: tuple[int, int], instances: tuple[Instance, ...], class_table: ClassTable
 ) -> None:
@@ -116,9 +167,9 @@ def write_instances(
     FiftyOne and others.
 
     photo: name of the photo; size: (height, width) px
-    Each annotation holds category_id (class id), segmentation (compressed RLE), bbox (left, top, width,
-    height of the mask, px), area (px),
-    score = box_score x mask_score, and the class name and prompt, which COCO does not ask for.
+    Each annotation holds category_id (class id), segmentation (compressed RLE), bbox (left, top, width, height
+    of the mask, px), area (px), score = box_score x mask_score, and the class name and prompt, which COCO does
+    not ask for.
     """
     annotations = [
         _annotation(number, instance, class_table) for number, instance in enumerate(instances, start=1)

@@ -7,12 +7,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex
+from sc3d.io.atomic import atomic_path, discard
+from sc3d.io.images import write_image
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.fusion import fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size, read_given_cloud
@@ -23,7 +27,7 @@ from sc3d.propagation.propagate import propagate
 from sc3d.scene.labelled_cloud import REACH, LabelledSurface, point_arrays, read_surface, spacing_of
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
-from sc3d.settings.labels import Label, Propagate
+from sc3d.settings.labels import Label, Propagate, Segment
 
 logger = logging.getLogger(__name__)
 
@@ -102,9 +106,37 @@ class Refinement:
     def helps(self) -> bool:
         return self.after > self.before
 
+    def figures(self) -> dict[str, object]:
+        """What the summary and the sidecar say."""
+        return {
+            "agreement_before": f"{self.before:.2%}",
+            "agreement_after": f"{self.after:.2%}",
+            "kept": self.helps,
+        }
+
     def confidence(self, view: View, read: ReadMask) -> np.ndarray:
         """(H, W) uint8 new confidence of a mask."""
-        return _doubted(self.inputs, self.labels, view, read)[1]
+        mask, confidence = read(view)
+        seen = self.inputs.render(self.labels, view, mask.shape[::-1])
+        return downweight_conflicts(mask, confidence, *seen)
+
+
+def refine_scene(scene: Scene, settings: Segment) -> Refinement:
+    """Lower the confidence of doubted masks, if that helps: writes `confidence_refined`, or removes it."""
+    if settings.backend != "files" or settings.masks is not None:
+        raise InputError(
+            "--refine works on the masks that are in the scene: make them first, then run `sc3d segment SCENE --refine`"
+        )
+    masks = Masks.load(scene, scene.confidence)
+    refinement = refine(load_refinement_inputs(scene, masks), masks.views, masks.read)
+    if refinement.helps:
+        with atomic_path(scene.confidence_refined) as folder:
+            folder.mkdir()
+            for view in tqdm(masks.views, desc="writing confidence", unit="photo", disable=None):
+                write_image(folder / f"{Path(view.name).stem}.png", refinement.confidence(view, masks.read))
+    else:
+        discard(scene.confidence_refined)
+    return refinement
 
 
 def refine(inputs: RefinementInputs, views: list[View], read: ReadMask) -> Refinement:

@@ -1,17 +1,26 @@
-"""What the text-prompted backends share: packages, device, loading models, pixels in, outlines out."""
+"""What the text-prompted backends share: packages, weights, device, loading models, pixels in, outlines out.
+
+Weights are looked for on this machine; nothing is downloaded unless that is allowed.
+"""
 
 from __future__ import annotations
 
+import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sc3d.errors import InputError, MissingPackageError
+from sc3d.io.json_files import read_json
+from sc3d.scene.class_table import ClassTable
 from sc3d.segmentation.rle import find_runs
-from sc3d.segmentation.weights import model_type
+from sc3d.segmentation.segment import Segmentation
+from sc3d.segmentation.text_prompts import list_prompts
+from sc3d.segmentation.tiled_inference import Findings, segment_tiled
 from sc3d.settings.labels import Segment
 
 if TYPE_CHECKING:
@@ -20,6 +29,135 @@ if TYPE_CHECKING:
 # mean and standard deviation of RGB that Grounding DINO, SAM 1 and SAM 2 were trained with
 IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 HALVES = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)  # the same of SAM 3
+# Only data: no pickles (*.bin, *.pt), no code (*.py).
+_FILES = ["*.json", "*.txt", "*.safetensors"]
+_FREE, _GATED = (
+    "Apache-2.0",
+    "SAM license, gated: accept it on the model's page on the hub and log in with `hf auth login`",
+)
+_KNOWN = {  # download size in MB, license
+    "IDEA-Research/grounding-dino-tiny": (690, _FREE),
+    "IDEA-Research/grounding-dino-base": (930, _FREE),
+    "facebook/sam2.1-hiera-tiny": (160, _FREE),
+    "facebook/sam2.1-hiera-small": (185, _FREE),
+    "facebook/sam2.1-hiera-base-plus": (325, _FREE),
+    "facebook/sam2.1-hiera-large": (900, _FREE),
+    "facebook/sam-vit-base": (375, _FREE),
+    "facebook/sam-vit-large": (1250, _FREE),
+    "facebook/sam-vit-huge": (2570, _FREE),
+    "facebook/sam3": (3440, _GATED),
+}
+
+
+class PromptedSegmenter(ABC):
+    """What finds the classes of a table by their prompts; models are loaded for the first photo."""
+
+    def __init__(self, backend: str, settings: Segment, class_table: ClassTable) -> None:
+        """Find packages and a device; raises MissingPackageError or InputError at once if something is
+        missing.
+        """
+        check_packages(backend)
+        check_settings(settings)
+        self._settings = settings
+        self._prompts = list_prompts(class_table)
+        self._device = choose_device(settings)
+
+    @abstractmethod
+    def find(self, image: np.ndarray) -> Findings:
+        """What the models find in an (H, W, 3) uint8 RGB image, in one look."""
+
+    def segment(self, image: np.ndarray) -> Segmentation:
+        """Segment a photo, (H, W, 3) uint8 RGB, as a whole and in tiles."""
+        return segment_tiled(image, self.find, self._settings.tile, self._settings.overlap)
+
+    def _find_model(self, name: str, classes: dict[str, str]) -> Path:
+        """Folder of a model, whose type is one of `classes`."""
+        path = find_weights(name, self._settings.model_dir, self._settings.download)
+        if model_type(path) not in classes:
+            raise InputError(
+                f"{path} holds a model of type {model_type(path)!r}; possible here: {', '.join(classes)}"
+            )
+        return path
+
+    def _inference(self) -> AbstractContextManager[None]:
+        return inference(self._device, self._settings.half)
+
+
+def find_weights(name: str, model_dir: Path | None, download: bool) -> Path:
+    """Folder with the configuration and the safetensors weights of a hub model.
+
+    name: "owner/model", as on the Hugging Face hub
+    model_dir: looked at first, for `<model>` and `<owner>/<model>` in it
+    download: fetch the model from the hub if neither `model_dir` nor the hub's cache has it
+
+    Raises InputError that says where the model was looked for and how to get it.
+    """
+    if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", name, re.ASCII):
+        raise InputError(
+            f'{name!r} is not the name of a model: it should look like "facebook/sam2.1-hiera-small"'
+        )
+    folders = [] if model_dir is None else [model_dir / name.split("/")[1], model_dir / name]
+    found = next((folder for folder in folders if _is_model(folder)), None) or _find_cached(name)
+    if found is None and download:
+        found = _download(name)
+    if found is None:
+        raise InputError(_missing_message(name, model_dir))
+    return found
+
+
+def model_type(path: Path) -> str:
+    """`model_type` of a model folder's configuration, such as "sam2"; "" if it names none."""
+    config = read_json(path / "config.json")
+    return str(config.get("model_type", "")) if isinstance(config, dict) else ""
+
+
+def _is_model(folder: Path) -> bool:
+    return (folder / "config.json").is_file() and any(folder.glob("*.safetensors"))
+
+
+def _find_cached(name: str) -> Path | None:
+    from huggingface_hub import try_to_load_from_cache
+
+    config = try_to_load_from_cache(name, "config.json")
+    folder = Path(config).parent if isinstance(config, str) else None
+    return folder if folder is not None and _is_model(folder) else None
+
+
+def _download(name: str) -> Path:
+    from huggingface_hub import snapshot_download
+
+    try:
+        folder = Path(snapshot_download(name, allow_patterns=_FILES))
+    # no network, no such model, access not granted, disk full: the hub has an error class for each
+    except Exception as error:
+        raise InputError(f"cannot download {name}: {first_line(error)}; {_advice(name)}") from None
+    if not _is_model(folder):
+        raise InputError(
+            f"{name} has no safetensors weights on the hub; other formats can hold code and are not loaded: choose another model"
+        )
+    return folder
+
+
+def _missing_message(name: str, model_dir: Path | None) -> str:
+    from huggingface_hub.constants import HF_HUB_CACHE
+
+    own = (
+        "no model folder was given"
+        if model_dir is None
+        else f"looked for {model_dir / name.split('/')[1]} and {model_dir / name}"
+    )
+    size = (
+        "about {} MB, {}".format(*_KNOWN[name])
+        if name in _KNOWN
+        else "size and license: see its page on the hub"
+    )
+    return f"the weights of {name} ({size}) are not on this machine: {own}, and in the hub cache {HF_HUB_CACHE}; {_advice(name)}"
+
+
+def _advice(name: str) -> str:
+    includes = " ".join(f"--include '{pattern}'" for pattern in _FILES)
+    target = name.split("/")[1]
+    return f"allow the download (--download), or run `hf download {name} {includes} --local-dir MODELS/{target}` anywhere and pass --model-dir MODELS"
 
 
 def check_packages(backend: str) -> None:
@@ -90,7 +228,7 @@ def inference(device: str, half: bool) -> Iterator[None]:
         yield
 
 
-def load_model(path: Path, classes: dict[str, str], device: str) -> torch.nn.Module:
+def load_model(path: Path, classes: dict[str, str], device: str) -> Any:
     """Load a model for inference: safetensors only, from this machine only; InputError if the weights are
     damaged or incomplete.
 
@@ -197,7 +335,8 @@ def _sources(present: torch.Tensor, length: int) -> tuple[torch.Tensor, torch.Te
     high = (low + 1).clamp(max=number - 1)
     touched = torch.nonzero(there[low] | there[high])[:, 0]
     part = slice(int(touched[0]), int(touched[-1]) + 1) if len(touched) else slice(0, 0)
-    return *(values[part].to(present.device) for values in (low, high, (places - low).float())), part.start
+    low, high, weight = (values[part].to(present.device) for values in (low, high, (places - low).float()))
+    return low, high, weight, part.start
 
 
 def outline(values: torch.Tensor, threshold: float, shape: tuple[int, int]) -> np.ndarray:

@@ -2,9 +2,10 @@
 it.
 
 A mask of a photo of `height` rows is (K, 2) int64: for each vertical run of pixels its first pixel and its
-last + 1, counted as
-column * height + row. Runs are sorted, do not touch within a column and never cross from one column to the
-next; so a mask has one form only.
+last + 1, counted as column * height + row. Runs are sorted, do not touch within a column and never cross from
+one column to the next; so a mask has one form only. pycocotools writes it as COCO's string; it has no word for
+a window of a photo (cut out, moved, filled), which tiles need, and decodes whole photos only: 12.5 ms for an
+object of 300 px in 12 megapixels, where `fill_runs` takes 0.2 ms.
 """
 
 from __future__ import annotations
@@ -145,29 +146,12 @@ def iou(first: np.ndarray, second: np.ndarray, height: int) -> float:
 
 
 def encode_runs(runs: np.ndarray, size: tuple[int, int]) -> str:
-    """A mask of a photo of `size` (height, width) as the compressed run-length string of COCO.
+    """A mask of a photo of `size` (height, width) as the compressed run-length string of COCO, by pycocotools."""
+    from pycocotools.mask import frPyObjects
 
-    source: the COCO format: lengths of alternating runs of zeros and ones in column order, starting with
-        zeros; from the fourth on each as
-    the difference from the length two before; written in digits of 5 bits, lowest first, with a sixth bit
-    where more follow, plus 48 as ASCII
-    """
-    # COCO's runs go on from the foot of a column to the next head
-    crossing = runs[1:, 0] == runs[:-1, 1] if len(runs) else np.zeros(0, bool)
-    first = runs[np.concatenate([np.ones(min(len(runs), 1), bool), ~crossing]), 0]
-    last = runs[np.concatenate([~crossing, np.ones(min(len(runs), 1), bool)]), 1]
-    edges = np.stack([first, last], axis=1).ravel()
-    total = size[0] * size[1]
-    if not len(edges) or edges[-1] != total:
-        edges = np.append(edges, total)
-    lengths = np.diff(edges, prepend=0)
-    rest = lengths.copy()
-    rest[3:] -= lengths[1:-2]
-    digits, valid, going = [], [], np.ones(len(rest), bool)
-    while going.any():
-        digit, rest = rest & 31, rest >> 5
-        more = going & np.where(digit & 16, rest != -1, rest != 0)
-        digits.append(digit + 32 * more + 48)
-        valid.append(going)
-        going = more
-    return np.stack(digits, axis=1)[np.stack(valid, axis=1)].astype(np.uint8).tobytes().decode("ascii")
+    # COCO's runs go on from the foot of a column to the head of the next
+    goes_on = runs[:-1, 1] == runs[1:, 0]
+    edges = runs.ravel()[~np.pad(np.repeat(goes_on, 2), min(1, len(runs)))]
+    lengths = np.diff(edges, prepend=0, append=size[0] * size[1])
+    lengths = lengths if lengths[-1] else lengths[:-1]
+    return frPyObjects({"counts": lengths, "size": list(size)}, *size)["counts"].decode("ascii")

@@ -5,31 +5,25 @@ pass.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.scene.class_table import ClassTable
-from sc3d.segmentation.instances import Instance
-from sc3d.segmentation.merge import Areas, paint
+from sc3d.segmentation.instances import Areas, Instance, paint_areas
 from sc3d.segmentation.models import (
     HALVES,
-    check_packages,
-    check_settings,
-    choose_device,
+    PromptedSegmenter,
     enlarge,
-    inference,
     load_model,
     load_tokenizer,
     outline,
     to_pixels,
 )
 from sc3d.segmentation.rle import Window
-from sc3d.segmentation.segment import Segmentation
-from sc3d.segmentation.text_prompts import Prompt, list_prompts
-from sc3d.segmentation.tiled_inference import Findings, segment_tiled
-from sc3d.segmentation.weights import find_weights, model_type
+from sc3d.segmentation.text_prompts import Prompt
+from sc3d.segmentation.tiled_inference import Findings
 from sc3d.settings.labels import Segment
 
 if TYPE_CHECKING:
@@ -44,36 +38,20 @@ class _Concept(NamedTuple):
     """A prompt as the model reads it: its text features, and which of its (1, T) tokens are no padding."""
 
     prompt: Prompt
-    features: object
+    features: Any
     attention_mask: torch.Tensor
 
 
-class Sam3:
-    """Segmenter for the classes of a table, by their prompts; the model is loaded for the first photo."""
+class Sam3(PromptedSegmenter):
+    """SAM 3. The confidence of an instance is its detection score x the mean probability of its pixels.
+
+    Pixels without an instance take the class whose concept the model sees there (its semantic output), with
+    presence x probability as confidence.
+    """
 
     def __init__(self, settings: Segment, class_table: ClassTable) -> None:
-        """Find packages and weights; raises MissingPackageError or InputError at once if something is
-        missing.
-        """
-        check_packages("sam3")
-        check_settings(settings)
-        self._settings = settings
-        self._prompts = list_prompts(class_table)
-        self._device = choose_device(settings)
-        self.path = find_weights(settings.concept_model, settings.model_dir, settings.download)
-        if model_type(self.path) not in _MODELS:
-            raise InputError(
-                f"{self.path} holds a model of type {model_type(self.path)!r}; possible here: {', '.join(_MODELS)}"
-            )
-
-    def segment(self, image: np.ndarray) -> Segmentation:
-        """Segment a photo, (H, W, 3) uint8 RGB.
-
-        The confidence of an instance is its detection score x the mean probability of its pixels. Pixels
-        without an instance take the class
-        whose concept the model sees there (its semantic output), with presence x probability as confidence.
-        """
-        return segment_tiled(image, self.find, self._settings.tile, self._settings.overlap)
+        super().__init__("sam3", settings, class_table)
+        self.path = self._find_model(settings.concept_model, _MODELS)
 
     def find(self, image: np.ndarray) -> Findings:
         """Instances and areas of all classes in an (H, W, 3) uint8 RGB image, in one look: image features are
@@ -82,7 +60,7 @@ class Sam3:
         shape = image.shape[:2]
         side = int(self._model.config.image_size)
         instances, areas = [], Areas(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8))
-        with inference(self._device, self._settings.half):
+        with self._inference():
             features = self._model.get_vision_features(to_pixels(image, (side, side), HALVES, self._device))
             for concept in self._concepts:
                 output = self._model(
@@ -99,7 +77,7 @@ class Sam3:
         return Findings(instances, areas)
 
     @cached_property
-    def _model(self) -> torch.nn.Module:
+    def _model(self) -> Any:
         return load_model(self.path, _MODELS, self._device)
 
     @cached_property
@@ -118,7 +96,7 @@ class Sam3:
                 raise InputError(
                     f"the prompt {prompt.text[:40]!r} is longer than the {length} tokens that SAM 3 reads: shorten it"
                 )
-            with inference(self._device, self._settings.half):
+            with self._inference():
                 features = self._model.get_text_features(
                     tokens["input_ids"], tokens["attention_mask"], return_dict=True
                 )
@@ -126,7 +104,7 @@ class Sam3:
         return concepts
 
     def _instances(
-        self, output: object, presence: float, prompt: Prompt, shape: tuple[int, int]
+        self, output: Any, presence: float, prompt: Prompt, shape: tuple[int, int]
     ) -> list[Instance]:
         """Instances of one concept whose score, query probability x presence, exceeds the box threshold."""
         scores = output.pred_logits[0].float().sigmoid().cpu().numpy() * presence
@@ -151,6 +129,7 @@ def _paint_concept(areas: Areas, probabilities: torch.Tensor, presence: float, c
     patch = enlarge(probabilities, _MASK_THRESHOLD, areas.labels.shape)
     height, width = patch.values.shape
     values = patch.values.cpu().numpy()
-    confidence = np.where(values > _MASK_THRESHOLD, np.rint(255 * presence * values), 0).astype(np.uint8)
-    confidence[values > _MASK_THRESHOLD] = np.maximum(confidence[values > _MASK_THRESHOLD], 1)
-    paint(areas, class_id, confidence, Window(patch.left, patch.top, patch.left + width, patch.top + height))
+    confidence = np.maximum(np.rint(255 * presence * values).astype(np.uint8), 1)
+    confidence[values <= _MASK_THRESHOLD] = 0
+    window = Window(patch.left, patch.top, patch.left + width, patch.top + height)
+    paint_areas(areas, Areas(np.full_like(confidence, class_id), confidence), window)

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+import json
+import logging
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import image_size, read_image, write_image
+from sc3d.io.atomic import discard, remove_leftovers
+from sc3d.io.images import find_photos, image_size, read_image, write_image
+from sc3d.io.json_files import read_json, write_json
+from sc3d.io.provenance import digest
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.scene import check_mask_aspect
+from sc3d.scene.scene import Scene, check_mask_aspect
 from sc3d.segmentation.instances import Instance, write_instances
+from sc3d.settings.labels import Segment
+
+logger = logging.getLogger(__name__)
 
 
 class Segmentation(NamedTuple):
@@ -47,14 +56,73 @@ class SegmentSummary:
     num_pixels: np.ndarray
     num_instances: int
 
+    def figures(self, class_table: ClassTable) -> dict[str, object]:
+        """What the summary and the sidecar say."""
+        return {
+            "segmented": len(self.segmented),
+            "already_there": len(self.skipped),
+            "instances": self.num_instances,
+            **{
+                f"pixels_{class_table.name(label)}": int(count)
+                for label, count in enumerate(self.num_pixels)
+                if count
+            },
+        }
 
-@dataclass(frozen=True)
-class Folders:
+
+class Folders(NamedTuple):
     """Where the results of each photo go, as `<photo stem>.png`, `.png` and `.json`."""
 
     masks: Path
     confidence: Path
     instances: Path
+
+
+def segment_scene(
+    scene: Scene, settings: Segment, class_table: ClassTable, segmenter: Segmenter
+) -> SegmentSummary:
+    """Write masks, confidence maps and instances of a scene's photos.
+
+    Those of an interrupted run are gone on with if they were made with the same settings; others are set aside.
+    """
+    folders = Folders(scene.masks, scene.confidence, scene.instances)
+    marker, state = scene.path / "segment.unfinished.json", _state(scene, settings, class_table)
+    unfinished = marker.exists()
+    if unfinished and read_json(marker) == state:
+        for folder in folders:
+            remove_leftovers(folder)
+    else:
+        _set_aside(folders, "unfinished" if unfinished else "before")
+    write_json(marker, state)
+    summary = segment_photos(find_photos(scene.images), folders, segmenter, class_table)
+    marker.unlink()
+    return summary
+
+
+def _state(scene: Scene, settings: Segment, class_table: ClassTable) -> object:
+    """What decides the masks, as JSON: everything but where the models lie and run. Photos are told by size
+    and time, as they are read often.
+    """
+    decisive = replace(settings, device="auto", download=False, model_dir=None)
+    strokes = digest(settings.strokes or scene.strokes) if settings.backend == "strokes" else ""
+    photos = [
+        (str(photo.relative_to(scene.images)), photo.stat().st_size, photo.stat().st_mtime_ns)
+        for photo in find_photos(scene.images)
+    ]
+    seen = hashlib.blake2b(repr(photos).encode(), digest_size=16).hexdigest()
+    return json.loads(json.dumps([repr(decisive), class_table.as_json(), strokes, seen]))
+
+
+def _set_aside(folders: Folders, suffix: str) -> None:
+    """Older masks may hold somebody's work: they become `<folder>.<suffix>`, in place of still older ones.
+    Goes on where it was interrupted.
+    """
+    for folder in folders:
+        aside = folder.with_name(f"{folder.name}.{suffix}")
+        if folder.is_dir():
+            discard(aside)
+            folder.rename(aside)
+            logger.info("%s is now %s", folder, aside)
 
 
 def segment_photos(

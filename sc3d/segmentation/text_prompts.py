@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,21 @@ class Caption:
     token_ids: list[int]
     spans: list[tuple[int, int]]
     prompts: list[Prompt]
+
+
+def replace_prompts(class_table: ClassTable, prompts: tuple[str, ...]) -> ClassTable:
+    """The table with the prompts of some classes replaced; `prompts`: texts like "road=street,parking lot"."""
+    texts = {}
+    for prompt in prompts:
+        name, separator, values = prompt.partition("=")
+        if not separator or name not in {entry.name for entry in class_table} or not values.strip():
+            raise InputError(
+                f"--prompts {prompt!r} must be NAME=text,text with a class name of {[entry.name for entry in class_table]}"
+            )
+        texts[name] = tuple(value.strip() for value in values.split(",") if value.strip())
+    return ClassTable(
+        tuple(replace(entry, prompts=texts.get(entry.name, entry.prompts)) for entry in class_table)
+    )
 
 
 def list_prompts(class_table: ClassTable) -> list[Prompt]:
@@ -91,15 +106,13 @@ def match_prompts(
 
     token_scores: (N, >= T) probability 0 to 1 that the box shows what the token says
     box_threshold, text_threshold: a prompt is a candidate if the box matches one of its tokens better than
-        both;
-        tokens that match no better than text_threshold do not count
+        both; tokens that match no better than text_threshold do not count
     returns: (N,) int64 number of the prompt in the caption, -1 for a box without candidate; (N,) float64
         score: the best token of that prompt
 
     A box may match tokens of several prompts ("building. road."). It goes to the candidate with the highest
-    mean over all tokens of the prompt,
-    where tokens that do not count are 0: so "parking lot" with both words beats "parking garage" with one.
-    Ties go to the lower class id.
+    mean over all tokens of the prompt, where tokens that do not count are 0: so "parking lot" with both words
+    beats "parking garage" with one. Ties go to the lower class id.
     """
     scores = np.asarray(token_scores, np.float64)
     counted = np.where(scores > text_threshold, scores, 0.0)

@@ -2,19 +2,18 @@
 objects out of both.
 
 1. The photo is looked at as a whole (the model shrinks it), and in tiles of equal size that overlap and are
-    spread evenly.
+   spread evenly.
 2. In each look, of two instances of one class that are the same object (more than half of their union in
-    common) the better stays.
+   common) the better stays.
 3. Instances of one class in two tiles are parts of one object if, in the strip that both tiles see, they have
-    more than half of their union
-   in common. Parts are joined, over as many tiles as it takes; the object has the scores and the prompt of
-   its largest part.
+   more than half of their union in common. Parts are joined, over as many tiles as it takes; the object has
+   the scores and the prompt of its largest part.
 4. A part that ends at a tile's border (not the photo's), has no partner, and lies where another tile sees all
-    of it, is dropped: it is a
-   fragment that the tile with the better view did not confirm. One that no other tile sees in full is kept.
+   of it, is dropped: it is a fragment that the tile with the better view did not confirm. One that no other
+   tile sees in full is kept.
 5. An object found both in tiles and in the whole photo (again by half of the union) has the tiles' finer
-    outline inside the tiles in which
-   it was found, the whole photo's elsewhere, and the better of the two scores.
+   outline inside the tiles in which it was found, the whole photo's elsewhere, and the better of the two
+   scores.
 """
 
 from __future__ import annotations
@@ -27,8 +26,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sc3d.segmentation.instances import SAME_OBJECT, Instance, candidates, drop_duplicates, move, useful
-from sc3d.segmentation.merge import Areas, fill_gaps, merge_instances, paint_areas
+from sc3d.segmentation.instances import (
+    SAME_OBJECT,
+    Areas,
+    Instance,
+    candidates,
+    drop_duplicates,
+    fill_gaps,
+    merge_instances,
+    move,
+    paint_areas,
+    useful,
+)
 from sc3d.segmentation.rle import Window, clip_runs, cut_runs, iou, join_runs
 from sc3d.segmentation.segment import Segmentation
 
@@ -101,7 +110,7 @@ def join_tiles(found: list[list[Instance]], windows: list[Window]) -> list[Tiled
     """Objects from the instances of each tile, in pixels of the photo, by rules 3 and 4."""
     parts = [(tile, instance) for tile, instances in enumerate(found) for instance in instances]
     first = np.cumsum([0, *map(len, found)])
-    group, linked = list(range(len(parts))), set()
+    group, linked = list(range(len(parts))), set[int]()
 
     def root(number: int) -> int:
         while group[number] != number:

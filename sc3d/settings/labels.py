@@ -61,9 +61,9 @@ class Segment:
     """Share of a tile that it has in common with the next."""
     refine: bool = False
     """One more round on the masks that are in the scene (needs its cloud): what contradicts the fused labels
-    loses confidence, if that brings the
-    labels nearer to the masks of photos that were left out. Writes SCENE/confidence_refined, which label then
-    takes instead of SCENE/confidence."""
+    loses confidence, if that brings the labels nearer to the masks of photos that were left out. Writes
+    SCENE/confidence_refined, which label then takes instead of SCENE/confidence.
+    """
     half: bool = False
     """Compute in half precision (bfloat16; float16 on older GPUs); needs CUDA (grounded-sam, sam3)."""
     device: str = "auto"

@@ -24,11 +24,10 @@ class Export:
         ...,
     ] = ("laz",)
     """What to write. masks: the fused labels as each photo sees them; laz: LAZ 1.4 with ASPRS classes;
-    clouds: one PLY per class; splats, spz: Gaussians
-    with labels; orthophoto: GeoTIFFs of color, class and height; objects: footprints of buildings and crowns
-    of trees as GeoJSON;
-    transforms: cameras and sparse points as nerfstudio's transforms.json; colmap-text: the same as COLMAP's
-        text files."""
+    clouds: one PLY per class; splats, spz: Gaussians with labels; orthophoto: GeoTIFFs of color, class and
+    height; objects: footprints of buildings and crowns of trees as GeoJSON; transforms: cameras and sparse
+    points as nerfstudio's transforms.json; colmap-text: the same as COLMAP's text files.
+    """
     classes: tuple[str, ...] = ()
     """Names of the classes to write; all otherwise (laz, clouds, splats, spz)."""
     labelled: Path | None = None
@@ -37,8 +36,8 @@ class Export:
     """Longest side of the masks, px; 0 = as the photo (masks)."""
     epsg: int = 0
     """EPSG code of a projected CRS for the coordinates (laz, clouds, orthophoto, objects); 0 = that of the
-    scene. Without a georeference it says which
-    CRS the scene's coordinates are in."""
+    scene. Without a georeference it says which CRS the scene's coordinates are in.
+    """
     pixel_size: float = 0.0
     """Side of a pixel on the ground, m; 0 = the spacing of the points, twice that without a mesh, rounded to
     one digit (orthophoto).

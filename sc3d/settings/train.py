@@ -132,7 +132,7 @@ class TrainSettings:
             round(num_initial + max(self.max_gaussians - num_initial, 0) * min(max(progress, 0.0), 1.0)),
         )
 
-    def trims(self, iteration: int, num_views: int) -> bool:
+    def prunes_unseen(self, iteration: int, num_views: int) -> bool:
         """Whether to drop what fewer than two views saw, asked after each pass over the views: every 30th of
         the run while densifying.
         """

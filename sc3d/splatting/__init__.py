@@ -1,1 +1,1 @@
-"""Planar Gaussians: rendering, losses, densification, training. The only home of torch besides segmentation."""
+"""Planar Gaussians: rendering, losses, densification, training. The home of torch beside segmentation."""

@@ -1,82 +1,146 @@
 """Training by blocks: the ground plane is cut into boxes that share borders, each is trained on its own, and
-their cores become one model.
-
-Memory is that of a block, and blocks can be trained at the same time; see `sc3d.splatting.block_tasks` for
-where and how they run.
+their cores become one model. Memory is that of a block, and blocks can be trained at the same time.
 
 A photo of a block also shows ground outside. Those pixels are left out of the loss, rather than explained by
-coarse Gaussians that are dropped
-afterwards: such a context costs the memory and time that blocks are to save, and what it gets wrong the
-    block's own Gaussians would make up for.
-What a pixel shows is told by the nearest sparse points that its photo sees, so a roof before the block counts
-as what it is: outside.
+coarse Gaussians that are dropped afterwards: such a context costs the memory and time that blocks are to
+save, and what it gets wrong the block's own Gaussians would make up for. What a pixel shows is told by the
+nearest sparse points that its photo sees, so a roof before the block counts as what it is: outside.
+
+Each block is one task, here or on Dask workers. Beside the checkpoint of block 3, `3.checkpoint`, lie its
+Gaussians, `3.ply`, and, written last, `3.json` with the rest: with that it is finished and not begun again.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 import cv2
+import numba
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
 from sc3d.errors import InputError
+from sc3d.geometry.blocks import MIN_POINTS, Block
 from sc3d.geometry.cameras import View, in_image, project
+from sc3d.io.json_files import read_json, write_json
+from sc3d.io.provenance import peak_memory_mb
+from sc3d.io.splats import read_splat_ply, write_splat_ply
+from sc3d.scene.scene import Scene
 from sc3d.settings.train import TrainSettings
-from sc3d.splatting.dataset import TrainingData
+from sc3d.splatting.dataset import TrainingData, scene_data
+from sc3d.splatting.evaluation import held_out_scores
 from sc3d.splatting.gaussians import Gaussians
+from sc3d.splatting.trainer import TrainResult, train
+from sc3d.tiling.executor import Executor
 
-BORDER = 0.125  # of a block's side, on each side
 # of the sparse points that a photo sees, or of those in the block: fewer, and the photo is not worth its time
 SHARE = 0.05
-MIN_POINTS = 10
 NEAREST = 5  # sparse points that say what a pixel shows
 CELL = 4  # px, side of the cells of which that is asked
+GPU = {"GPU": 1}  # what a worker must offer to get a block, with --device cuda
 
 
 @dataclass(frozen=True)
-class Block:
-    """A box of the ground plane, endless where the scene ends.
-
-    axes: the two world axes of the ground plane; low, high: corners along them, low inclusive; border: width
-        of the border along them; world units
+class BlockJob:
+    """What every block's task needs to know. settings: of the whole run; blocks: all of them; folder: for
+    what the tasks write; progress: show a bar
     """
 
-    axes: tuple[int, int]
-    low: tuple[float, float]
-    high: tuple[float, float]
-    border: tuple[float, float]
+    scene: Path
+    settings: TrainSettings
+    blocks: tuple[Block, ...]
+    folder: Path
+    progress: bool = True
 
-    def holds(self, points: np.ndarray, border: bool = False) -> np.ndarray:
-        """(N,) bool: which of the (N, 3) points lie in the core, or in the core and its border. Every point
-        lies in the core of one block.
-        """
-        flat, width = np.asarray(points, np.float64)[:, self.axes], np.array(self.border) * border
-        return ((flat >= self.low - width) & (flat < self.high + width)).all(axis=1)
+    def file(self, index: int, suffix: str) -> Path:
+        """Of what a block's task writes."""
+        return self.folder / f"{index}.{suffix}"
+
+    def views(self, data: TrainingData, index: int) -> list[int]:
+        """Those that a block is trained on."""
+        held_out = set(self.settings.held_out(len(data.views)))  # of the whole run: no block may see them
+        return [view for view in views_of(data, self.blocks[index]) if view not in held_out]
 
 
-def split_blocks(points: np.ndarray, count: int) -> list[Block]:
-    """Blocks with about equal numbers of the (N, 3) sparse points, by median cuts across the longer side;
-    their cores fill the plane.
+def train_blocks(job: BlockJob, data: TrainingData, tasks: Executor) -> tuple[TrainResult, dict[str, object]]:
+    """Train all blocks and put them together.
 
-    Raises InputError if there are fewer than MIN_POINTS points for each.
+    returns: the result as `train` has it, with "block" in the rows of the log, the last of which is about
+        "all"; exposures are means over the blocks; figures for the summary
+    Raises InputError, before any work, for a block that fewer than two photos see.
     """
-    points = np.asarray(points, np.float64)
-    if len(points) < MIN_POINTS * count:
-        raise InputError(f"{len(points)} sparse points are too few for {count} blocks: lower --blocks")
-    axes = tuple(sorted(np.argsort(_sides(points), kind="stable")[1:].tolist()))
-    return _cut(points[:, axes], count, Block(axes, (-np.inf, -np.inf), (np.inf, np.inf), (0.0, 0.0)))
+    indices = range(len(job.blocks))
+    for index in indices:
+        if len(job.views(data, index)) < 2:
+            raise InputError(
+                f"block {index} of {len(indices)} is seen by fewer than 2 photos: lower --blocks"
+            )
+    job.folder.mkdir(exist_ok=True)
+    tasks.run("blocks", partial(train_block, job), indices, GPU if job.settings.device == "cuda" else None)
+    parts = [Gaussians.from_arrays(read_splat_ply(job.file(index, "ply"))[0]) for index in indices]
+    records = [read_json(job.file(index, "json")) for index in indices]
+    gaussians = merge(parts, list(job.blocks))
+    exposures, counts = np.zeros((len(data.views), 2)), np.zeros((len(data.views), 1))
+    for record in records:
+        exposures[record["views"]] += record["exposures"]
+        counts[record["views"]] += 1
+    exposures = (exposures / np.maximum(counts, 1)).astype(np.float32)
+    rows = [{"block": index, **row} for index, record in enumerate(records) for row in record["log"]]
+    rows.append(_total(records, len(gaussians)))
+    summary = {
+        "blocks": len(parts),
+        "block_photos": [len(record["views"]) for record in records],
+        "block_gaussians": [len(part) for part in parts],
+        "block_peak_memory_mb": [record["peak_memory_mb"] for record in records],
+    }
+    return TrainResult(gaussians, exposures, rows, held_out_scores(gaussians, data, job.settings)), summary
+
+
+def train_block(job: BlockJob, index: int) -> None:
+    """The task: train one block, unless it is finished."""
+    if job.file(index, "json").is_file():
+        return
+    data, _ = scene_data(Scene(job.scene), job.settings)
+    block, views = job.blocks[index], job.views(data, index)
+    settings, checkpoint = share_settings(job.settings, data, block, views), job.file(index, "checkpoint")
+    with one_thread():
+        part = restrict(data, block, views)
+        result = train(part, settings, checkpoint if settings.checkpoint_every else None, job.progress)
+    write_splat_ply(job.file(index, "ply"), result.gaussians.arrays())
+    record = {"views": views, "exposures": result.exposures.tolist(), "log": result.log}
+    # the peak is that of the process, so a worker's earlier blocks count
+    write_json(job.file(index, "json"), {**record, "peak_memory_mb": peak_memory_mb()})
+    checkpoint.unlink(missing_ok=True)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Blocks are what runs side by side, and the last digits of a training depend on the number of its
+    threads: with one, all workers agree.
+    """
+    before = torch.get_num_threads(), numba.get_num_threads()
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
 
 
 def views_of(data: TrainingData, block: Block) -> list[int]:
     """Indices of the views that see enough of a block's core."""
-    inside = block.holds(data.points)
-    needed = [
-        max(MIN_POINTS, SHARE * min(len(rows), int(inside.sum())))
-        for rows in map(data.seen, range(len(data.views)))
-    ]
-    return [index for index in range(len(data.views)) if inside[data.seen(index)].sum() >= needed[index]]
+    inside, chosen = block.holds(data.points), []
+    for index in range(len(data.views)):
+        rows = data.seen(index)
+        if inside[rows].sum() >= max(MIN_POINTS, SHARE * min(len(rows), int(inside.sum()))):
+            chosen.append(index)
+    return chosen
 
 
 def restrict(data: TrainingData, block: Block, views: list[int]) -> TrainingData:
@@ -93,18 +157,16 @@ def restrict(data: TrainingData, block: Block, views: list[int]) -> TrainingData
 
     def mask(row: int) -> np.ndarray:
         view, own = data.views[views[row]], data.mask(views[row])
-        found = cv2.resize(shown[row], (view.width, view.height), interpolation=cv2.INTER_NEAREST).astype(
-            bool
-        )
+        size = (view.width, view.height)
+        found = cv2.resize(shown[row], size, interpolation=cv2.INTER_NEAREST).astype(bool)
         return found if own is None else found & own
 
-    tracks = [position[rows[near[rows]]] for rows in seen]
     return TrainingData(
         [data.views[index] for index in views],
         lambda row: data.image(views[row]),
         data.points[near],
         data.colors[near],
-        tracks,
+        [position[rows[near[rows]]] for rows in seen],
         mask,
     )
 
@@ -119,44 +181,18 @@ def share_settings(
     """
     num_views = len(data.views) - len(settings.held_out(len(data.views)))
     iterations = max(1, round(settings.iterations * len(views) / num_views))
-    max_gaussians = max(
-        1, round(settings.max_gaussians * float(block.holds(data.points, border=True).mean()))
-    )
+    share = float(block.holds(data.points, border=True).mean())
+    max_gaussians = max(1, round(settings.max_gaussians * share))
     return replace(settings, iterations=iterations, max_gaussians=max_gaussians, test_every=0)
 
 
 def merge(parts: list[Gaussians], blocks: list[Block]) -> Gaussians:
     """The Gaussians of every part whose centers lie in the core of its block, in the order of the blocks."""
     cores = [
-        part[torch.from_numpy(block.holds(part.means.numpy()))]
+        part[torch.from_numpy(block.holds(part.means.numpy()))].parameters()
         for part, block in zip(parts, blocks, strict=True)
     ]
-    return Gaussians(
-        **{name: torch.cat([core.parameters()[name] for core in cores]) for name in cores[0].parameters()}
-    )
-
-
-def _sides(points: np.ndarray) -> np.ndarray:
-    """(D,) extent of (N, D) points without the 2 % farthest out."""
-    low, high = np.quantile(points, [0.01, 0.99], axis=0)
-    return high - low
-
-
-def _cut(flat: np.ndarray, count: int, block: Block) -> list[Block]:
-    sides = _sides(flat)
-    if count == 1:
-        return [replace(block, border=tuple((BORDER * sides).tolist()))]
-    axis, first = int(np.argmax(sides)), count // 2
-    place = float(np.quantile(flat[:, axis], first / count))
-    left = flat[:, axis] < place
-    # many points at one place
-    if min(left.sum() // first, (~left).sum() // (count - first)) < MIN_POINTS // 2:
-        raise InputError("the sparse points cannot be cut into so many blocks: lower --blocks")
-    low, high = list(block.low), list(block.high)
-    low[axis] = high[axis] = place
-    return _cut(flat[left], first, replace(block, high=tuple(high))) + _cut(
-        flat[~left], count - first, replace(block, low=tuple(low))
-    )
+    return Gaussians(**{name: torch.cat([core[name] for core in cores]) for name in cores[0]})
 
 
 def _shown(view: View, points: np.ndarray, near: np.ndarray) -> np.ndarray:
@@ -170,14 +206,18 @@ def _shown(view: View, points: np.ndarray, near: np.ndarray) -> np.ndarray:
     usable = in_image(view, pixels) & (depths > 0)
     if not usable.any():
         return np.zeros(shape, np.uint8)
-    columns, rows = np.meshgrid(
-        (np.arange(shape[1]) + 0.5) * view.width / shape[1],
-        (np.arange(shape[0]) + 0.5) * view.height / shape[0],
-    )
+    across = (np.arange(shape[1]) + 0.5) * view.width / shape[1]
+    down = (np.arange(shape[0]) + 0.5) * view.height / shape[0]
+    cells = np.stack([middle.ravel() for middle in np.meshgrid(across, down)], 1)
     count = min(NEAREST, int(usable.sum()))
-    nearest = (
-        cKDTree(pixels[usable])
-        .query(np.stack([columns.ravel(), rows.ravel()], 1), k=count)[1]
-        .reshape(-1, count)
-    )
+    nearest = cKDTree(pixels[usable]).query(cells, k=count)[1].reshape(-1, count)
     return (2 * near[usable][nearest].sum(axis=1) > count).astype(np.uint8).reshape(shape)
+
+
+def _total(records: list[dict], num_gaussians: int) -> dict[str, object]:
+    """The log's last row: means over the last rows of the blocks, sums of their steps and seconds."""
+    last = [record["log"][-1] for record in records]
+    means = {name: float(np.mean([row[name] for row in last])) for name in ("loss", "psnr")}
+    iterations, seconds = (sum(row[name] for row in last) for name in ("iteration", "seconds"))
+    row = {"block": "all", "iteration": iterations, **means}
+    return row | {"num_gaussians": num_gaussians, "seconds": seconds}

@@ -6,8 +6,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from sc3d.geometry.cameras import View
+
+OtherDepths = list[tuple[np.ndarray, View]]
+"""(h, w) float32 depth maps, 0 = none, of any sizes, with their views."""
 
 
 def pinhole(view: View) -> tuple[float, float, float, float]:
@@ -15,7 +19,16 @@ def pinhole(view: View) -> tuple[float, float, float, float]:
     return view.matrix[0, 0], view.matrix[1, 1], view.matrix[0, 2], view.matrix[1, 2]
 
 
-def pixel_rays(view: View, device: torch.device | str = "cpu") -> torch.Tensor:
+def ray_slopes(
+    width: int, height: int, calibration: tuple[float, float, float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(W,) and (H,) float32 x and y of the rays with z = 1 through the pixel centers, computed in float64."""
+    fx, fy, cx, cy = calibration
+    columns, rows = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
+    return columns.astype(np.float32), rows.astype(np.float32)
+
+
+def pixel_rays(view: View, device: torch.device | str = "cpu") -> Tensor:
     """(H, W, 3) rays ((u - cx) / fx, (v - cy) / fy, 1) of the pixel centers, camera frame: a pixel's point is
     depth * ray.
     """
@@ -26,18 +39,14 @@ def pixel_rays(view: View, device: torch.device | str = "cpu") -> torch.Tensor:
     return torch.stack([columns, rows, torch.ones_like(columns)], 2)
 
 
-def relative_pose(
-    view: View, other: View, device: torch.device | str = "cpu"
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(3, 3) and (3,) of other_from_view between the camera frames; composed in float64, returned as float32."""
+def relative_pose(view: View, other: View, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
+    """(3, 3) and (3,) float32 of other_from_view between the camera frames; composed in float64."""
     rotation = other.cam_from_world[:3, :3] @ view.cam_from_world[:3, :3].T
     translation = other.cam_from_world[:3, 3] - rotation @ view.cam_from_world[:3, 3]
-    return torch.from_numpy(rotation.astype(np.float32)).to(device), torch.from_numpy(
-        translation.astype(np.float32)
-    ).to(device)
+    return tuple(torch.from_numpy(part.astype(np.float32)).to(device) for part in (rotation, translation))
 
 
-def sample(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+def sample(image: Tensor, pixels: Tensor) -> Tensor:
     """(N,) bilinear values of an (H, W) image at (N, 2) pixel coordinates; differentiable in both; clamped to
     the border.
     """
@@ -49,8 +58,8 @@ def sample(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
 
 
 def reprojection_error(
-    points_cam: torch.Tensor, view: View, other_depth: torch.Tensor, other: View
-) -> tuple[torch.Tensor, torch.Tensor]:
+    points_cam: Tensor, view: View, other_depth: Tensor, other: View
+) -> tuple[Tensor, Tensor]:
     """phi: how far a pixel lands from itself after going to the other view's surface and back.
 
     points_cam: (N, 3) surface points of pixels of `view`, in its camera frame, depth > 0
@@ -62,73 +71,60 @@ def reprojection_error(
     points_other = points_cam @ rotation.T + translation
     in_front = points_other[:, 2] > 1e-6
     pixels = _project(points_other, other)
-    inside = (
-        (pixels >= 0.5).all(1) & (pixels[:, 0] <= other.width - 0.5) & (pixels[:, 1] <= other.height - 0.5)
-    )
-    pixels = torch.where((in_front & inside)[:, None], pixels, torch.full_like(pixels, 0.5))
+    column, row = pixels.unbind(1)
+    inside = (pixels >= 0.5).all(1) & (column <= other.width - 0.5) & (row <= other.height - 0.5)
+    pixels = torch.where((in_front & inside)[:, None], pixels, 0.5)
     has_depth = other_depth > 0
     # 1 / depth is linear in the pixel on a plane, depth is not: so a plane is interpolated exactly.
-    inverse = torch.where(
-        has_depth,
-        1 / torch.where(has_depth, other_depth, torch.ones_like(other_depth)),
-        torch.zeros_like(other_depth),
-    )
-    inverse = sample(inverse, pixels)
+    inverse = sample(torch.where(has_depth, 1 / torch.where(has_depth, other_depth, 1), 0), pixels)
     valid = in_front & inside & (sample(has_depth.float(), pixels.detach()) > 0.999)
     fx, fy, cx, cy = pinhole(other)
     ray = torch.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, torch.ones_like(inverse)], 1)
-    back = (ray / torch.where(valid, inverse, torch.ones_like(inverse))[:, None] - translation) @ rotation
+    back = (ray / torch.where(valid, inverse, 1)[:, None] - translation) @ rotation
     valid = valid & (back[:, 2] > 1e-6)
-    gap = torch.where(
-        valid[:, None], _project(back, view) - _project(points_cam, view), torch.zeros_like(pixels)
-    )
+    gap = torch.where(valid[:, None], _project(back, view) - _project(points_cam, view), 0)
     return (gap.square().sum(1) + 1e-12).sqrt(), valid
 
 
-def consistent(
-    depth: torch.Tensor, view: View, others: list[tuple[torch.Tensor, View]], tolerance: float = 1.0
-) -> torch.Tensor:
+def consistent(depth: np.ndarray, view: View, others: OtherDepths, tolerance: float = 1.0) -> np.ndarray:
     """(H, W) uint8: in how many other views a pixel's depth is confirmed, phi < `tolerance` px.
 
-    depth: (H, W), 0 = none; others: depth maps with their views, any sizes
+    depth: (H, W) float32, 0 = none
     """
-    count = torch.zeros(depth.shape, dtype=torch.uint8, device=depth.device)
-    present = depth > 0
-    points_cam = (pixel_rays(view, depth.device) * depth[..., None])[present]
+    count, points_cam = np.zeros(depth.shape, np.uint8), _surface_points(depth, view)
     for other_depth, other in others:
-        error, valid = reprojection_error(points_cam, view, other_depth, other)
-        count[present] += (valid & (error < tolerance)).to(torch.uint8)
+        error, valid = reprojection_error(points_cam, view, torch.from_numpy(other_depth), other)
+        count[depth > 0] += (valid & (error < tolerance)).numpy()
     return count
 
 
-def blocking(
-    depth: torch.Tensor, view: View, others: list[tuple[torch.Tensor, View]], margin: float
-) -> torch.Tensor:
+def blocking(depth: np.ndarray, view: View, others: OtherDepths, margin: float) -> np.ndarray:
     """(H, W) uint8: how many other views look through a pixel's point: they know a surface there that is
     farther by `margin` of its depth.
 
-    depth: (H, W), 0 = none; others: depth maps that can be trusted, 0 = unknown, with their views
+    depth: (H, W) float32, 0 = none; others: depth maps that can be trusted, 0 = unknown, with their views
     """
-    count = torch.zeros(depth.shape, dtype=torch.uint8, device=depth.device)
-    present = depth > 0
-    points_cam = (pixel_rays(view, depth.device) * depth[..., None])[present]
+    count, points_cam = np.zeros(depth.shape, np.uint8), _surface_points(depth, view)
     for other_depth, other in others:
-        rotation, translation = relative_pose(view, other, points_cam.device)
+        rotation, translation = relative_pose(view, other)
         points_other = points_cam @ rotation.T + translation
         pixels = _project(points_other, other)
-        inside = (
-            (points_other[:, 2] > 1e-6)
-            & (pixels >= 0).all(1)
-            & (pixels[:, 0] < other.width)
-            & (pixels[:, 1] < other.height)
-        )
-        columns, rows = torch.where(inside[:, None], pixels, torch.zeros_like(pixels)).long().unbind(1)
-        known = other_depth[rows, columns]
-        count[present] += (inside & (known > 0) & (points_other[:, 2] < (1 - margin) * known)).to(torch.uint8)
+        inside = (points_other[:, 2] > 1e-6) & (pixels >= 0).all(1)
+        inside &= (pixels[:, 0] < other.width) & (pixels[:, 1] < other.height)
+        columns, rows = torch.where(inside[:, None], pixels, 0).long().unbind(1)
+        known = torch.from_numpy(other_depth)[rows, columns]
+        through = inside & (known > 0) & (points_other[:, 2] < (1 - margin) * known)
+        count[depth > 0] += through.numpy()
     return count
 
 
-def _project(points_cam: torch.Tensor, view: View) -> torch.Tensor:
+def _surface_points(depth: np.ndarray, view: View) -> Tensor:
+    """(N, 3) points of the pixels that have a depth, camera frame."""
+    known = torch.from_numpy(depth)
+    return (pixel_rays(view) * known[..., None])[known > 0]
+
+
+def _project(points_cam: Tensor, view: View) -> Tensor:
     fx, fy, cx, cy = pinhole(view)
     depth = points_cam[:, 2].clamp_min(1e-6)
     return torch.stack([points_cam[:, 0] / depth * fx + cx, points_cam[:, 1] / depth * fy + cy], 1)

@@ -14,6 +14,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, local_origin, project, resample, undistorted
 from sc3d.io.images import read_image
 from sc3d.scene.scene import Scene
+from sc3d.scene.splats import read_scene_splats
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.gaussians import Gaussians
 
@@ -48,29 +49,29 @@ class TrainingData:
         mask = _item(self.masks, index)
         return None if mask is None else self._checked(mask, index, "mask").astype(bool)
 
-    def photo(self, index: int, halved: bool = False) -> tuple[View, torch.Tensor, torch.Tensor | None]:
+    def photo(
+        self, index: int, halved: bool = False, device: torch.device | str = "cpu"
+    ) -> tuple[View, torch.Tensor, torch.Tensor | None]:
         """View, (H, W, 3) image in [0, 1] and (H, W) bool mask or None, at full or half size."""
         view, image, mask = self.views[index], self.image(index), self.mask(index)
         if halved:
-            view = view.resized(max(1, view.width // 2), max(1, view.height // 2))
-            image = cv2.resize(image, (view.width, view.height), interpolation=cv2.INTER_AREA)
+            size = max(1, view.width // 2), max(1, view.height // 2)
+            view, image = view.resized(*size), cv2.resize(image, size, interpolation=cv2.INTER_AREA)
             if mask is not None:
-                mask = cv2.resize(
-                    mask.astype(np.uint8), (view.width, view.height), interpolation=cv2.INTER_NEAREST
-                ).astype(bool)
-        planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).float() / 255
+                mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
         # plane by plane, as `render` stores images
-        return view, planes.permute(1, 2, 0), None if mask is None else torch.from_numpy(mask)
+        planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).float() / 255
+        image = planes.permute(1, 2, 0).to(device)
+        return view, image, None if mask is None else torch.from_numpy(mask).to(device)
 
     def subset(self, indices: list[int]) -> TrainingData:
         """The same points with some of the views, renumbered from 0."""
-        tracks = None if self.tracks is None else [self.tracks[index] for index in indices]
         return TrainingData(
             [self.views[index] for index in indices],
             lambda row: _item(self.images, indices[row]),
             self.points,
             self.colors,
-            tracks,
+            None if self.tracks is None else [self.tracks[index] for index in indices],
             lambda row: _item(self.masks, indices[row]),
         )
 
@@ -82,31 +83,12 @@ class TrainingData:
         return np.nonzero(in_image(self.views[index], pixels) & (depths > 0))[0]
 
     def _checked(self, array: np.ndarray, index: int, what: str) -> np.ndarray:
-        view = self.views[index]
-        if array.shape[:2] != (view.height, view.width):
+        view, (height, width) = self.views[index], array.shape[:2]
+        if (height, width) != (view.height, view.width):
             raise InputError(
-                f"{what} of {view.name} is {array.shape[1]}x{array.shape[0]}, its view {view.width}x{view.height}"
+                f"{what} of {view.name} is {width}x{height}, its view {view.width}x{view.height}"
             )
         return array
-
-
-def scene_data(scene: Scene, settings: TrainSettings) -> tuple[TrainingData, np.ndarray]:
-    """A scene's photos, undistorted at training size when they are asked for, and sparse points; the (3,)
-    world position of the local origin.
-    """
-    model = scene.model
-    origin = local_origin(model.views)
-    views = [
-        undistorted(view.shifted(origin), settings.size(max(view.width, view.height))) for view in model.views
-    ]
-
-    @lru_cache(maxsize=max(2, CACHED_PIXELS // max(view.width * view.height for view in views)))
-    def image(index: int) -> np.ndarray:
-        return resample(
-            read_image(scene.photo(model.views[index].name)), model.views[index].shifted(origin), views[index]
-        )
-
-    return TrainingData(views, image, model.points - origin, model.colors, model.tracks), origin
 
 
 def _item(source: Sequence | Callable | None, index: int) -> np.ndarray | None:
@@ -115,20 +97,24 @@ def _item(source: Sequence | Callable | None, index: int) -> np.ndarray | None:
     return source(index) if callable(source) else source[index]
 
 
-def load_gaussians(scene: Scene) -> tuple[Gaussians, np.ndarray]:
-    """The trained Gaussians of a scene and the (3,) world position of their local origin.
-
-    Raises InputError that says what to run if there are none, or if they belong to other cameras than the
-    scene's.
+def scene_data(scene: Scene, settings: TrainSettings) -> tuple[TrainingData, np.ndarray]:
+    """A scene's photos, undistorted at training size when they are asked for, and sparse points; the (3,)
+    world position of the local origin.
     """
-    scene.require(scene.gaussians, hint=f"run `sc3d train {scene.path}` first")
-    gaussians, comments = Gaussians.load(scene.gaussians)
-    origin = local_origin(scene.model.views)
-    if (
-        any(line.startswith("sc3d origin") for line in comments)
-        and f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}" not in comments
-    ):
-        raise InputError(
-            f"{scene.gaussians} was trained with other cameras than those in {scene.sparse}: run `sc3d train {scene.path} --overwrite`"
-        )
-    return gaussians, origin
+    model = scene.model
+    origin = local_origin(model.views)
+    local = [view.shifted(origin) for view in model.views]
+    views = [undistorted(view, settings.size(max(view.width, view.height))) for view in local]
+
+    @lru_cache(maxsize=max(2, CACHED_PIXELS // max(view.width * view.height for view in views)))
+    def image(index: int) -> np.ndarray:
+        photo = read_image(scene.photo(model.views[index].name))
+        return resample(photo, local[index], views[index])
+
+    return TrainingData(views, image, model.points - origin, model.colors, model.tracks), origin
+
+
+def load_gaussians(scene: Scene) -> tuple[Gaussians, np.ndarray]:
+    """The trained Gaussians of a scene and the (3,) world position of their local origin, see `read_scene_splats`."""
+    arrays, origin = read_scene_splats(scene)
+    return Gaussians.from_arrays(arrays), origin

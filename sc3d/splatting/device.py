@@ -14,7 +14,7 @@ INSTALL = "the GPU renderer needs gsplat: pip install 'sc3d[cuda]' (or use --dev
 
 
 def has_kernels(tensor: torch.Tensor) -> bool:
-    """Whether the numba kernels can work on this tensor; if not, each of them has a twin in torch operations."""
+    """Whether the numba kernels can work on this tensor; if not, each has a twin in torch operations."""
     return tensor.device.type == "cpu"
 
 

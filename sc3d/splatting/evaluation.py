@@ -1,6 +1,9 @@
-"""What trained Gaussians show: scores against photos, depth maps."""
+"""What trained Gaussians show: pictures, scores against photos, depth maps."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -8,10 +11,63 @@ import torch
 from sc3d.geometry.cameras import View
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses
-from sc3d.splatting.cpu.ssim import ssim_loss
+from sc3d.splatting.consistency import pixel_rays
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.rendering import render, unbiased_depth
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A photo, and the Gaussians seen by its camera.
+
+    photo, rendered: (H, W, 3) uint8 RGB; the rendering has the photo's exposure
+    depth: (H, W) float32 z, world units; 0 = nothing there
+    normals: (H, W, 3) float32 unit, world, towards the camera; 0 = nothing there
+    psnr: of the rendering, dB; held_out: the photo was not trained on
+    """
+
+    name: str
+    photo: np.ndarray
+    rendered: np.ndarray
+    depth: np.ndarray
+    normals: np.ndarray
+    psnr: float
+    held_out: bool = False
+
+
+@torch.no_grad()
+def picture(gaussians: Gaussians, view: View, background: tuple[int, int, int] = (0, 0, 0)) -> np.ndarray:
+    """(H, W, 3) uint8 RGB of a pinhole view in the Gaussians' local frame; background: RGB uint8 where
+    nothing is.
+    """
+    shade = torch.tensor(background, dtype=torch.float32) / 255
+    return _as_uint8(render(gaussians, view, background=shade, geometry=False).color)
+
+
+@torch.no_grad()
+def compare(
+    gaussians: Gaussians,
+    view: View,
+    photo: np.ndarray,
+    mask: np.ndarray | None = None,
+    exposure: Sequence[float] | None = None,
+) -> Comparison:
+    """Render the view of a photo and put the two side by side.
+
+    view: pinhole, local frame; photo: (H, W, 3) uint8 RGB; mask: (H, W) bool, False does not count for the
+        PSNR
+    exposure: a, b of the photo (`losses.apply_exposure`); None = what fits it best
+    """
+    image = render(gaussians, view, geometry=False).color.cpu()
+    target = torch.from_numpy(np.ascontiguousarray(photo)).float() / 255
+    used = torch.ones(photo.shape[:2], dtype=torch.bool) if mask is None else torch.from_numpy(mask)
+    if exposure is None:
+        exposure = losses.fit_exposure(image[used], target[used])
+    image = losses.apply_exposure(image, torch.as_tensor(exposure, dtype=torch.float32))
+    depth, _, normals_cam = depth_map(gaussians, view)
+    normals = normals_cam @ view.cam_from_world[:3, :3].astype(np.float32)
+    return Comparison(view.name, photo, _as_uint8(image), depth, normals, psnr(image[used], target[used]))
 
 
 def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
@@ -21,54 +77,44 @@ def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
 
 
 @torch.no_grad()
-def score_view(
-    gaussians: Gaussians,
-    view: View,
-    target: torch.Tensor,
-    mask: torch.Tensor | None = None,
-    fit_exposure: bool = False,
-) -> tuple[float, float]:
-    """PSNR (dB) and SSIM of a rendered view against its (H, W, 3) photo; outside the (H, W) mask nothing
-    counts.
-
-    target, mask: on any device
-    fit_exposure: allow the photo its own gain and offset, as in training
-    """
-    image = render(gaussians, view).color
-    target = target.to(image.device)
-    used = torch.ones(target.shape[:2], dtype=torch.bool) if mask is None else mask
-    used = used.to(image.device)
-    if fit_exposure:
-        image = losses.apply_exposure(image, losses.fit_exposure(image[used], target[used]))
-    image = torch.where(used[..., None], image.clamp(0, 1), target)
-    return psnr(image[used], target[used]), 1 - float(ssim_loss(image.contiguous(), target))
-
-
 def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSettings) -> dict[str, float]:
-    """Mean "psnr" (dB) and "ssim" of the held-out views, whose exposure is fitted to the photo if exposures
-    are used; empty without any.
+    """Mean "psnr" (dB) and "ssim" of the held-out views inside their masks; empty without any. Their exposure
+    is fitted to the photo if exposures are used.
     """
-    scores = [
-        score_view(gaussians, *data.photo(index), settings.exposure)
-        for index in settings.held_out(len(data.views))
-    ]
-    if not scores:
-        return {}
-    means = np.mean(scores, axis=0)
-    return {"psnr": float(means[0]), "ssim": float(means[1])}
+    scores = []
+    for index in settings.held_out(len(data.views)):
+        view, target, mask = data.photo(index, device=gaussians.means.device)
+        used = torch.ones_like(target[..., 0], dtype=torch.bool) if mask is None else mask
+        image = render(gaussians, view).color
+        if settings.exposure:
+            image = losses.apply_exposure(image, losses.fit_exposure(image[used], target[used]))
+        image = torch.where(used[..., None], image.clamp(0, 1), target).contiguous()
+        similarity = 1 - float(losses.image_loss(image, target, 1.0))
+        scores.append((psnr(image[used], target[used]), similarity))
+    return dict(zip(("psnr", "ssim"), np.mean(scores, axis=0).tolist(), strict=True)) if scores else {}
 
 
 @torch.no_grad()
-def depth_map(
-    gaussians: Gaussians, view: View, min_alpha: float = 0.5
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def depth_map(gaussians: Gaussians, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The surface a view sees.
 
-    returns: (H, W) float32 depth z, world units, 0 where alpha < `min_alpha`; (H, W) alpha;
+    returns: (H, W) float32 depth z, world units, 0 where alpha < 0.5; (H, W) alpha;
         (H, W, 3) unit normals, camera frame, towards the camera, 0 where there is no depth
     """
     rendering = render(gaussians, view)
     depth = unbiased_depth(rendering, view)
-    present = (rendering.alpha >= min_alpha) & torch.isfinite(depth) & (depth > 0)
+    present = (rendering.alpha >= 0.5) & torch.isfinite(depth) & (depth > 0)
     normals = torch.nn.functional.normalize(rendering.normal, dim=2) * present[..., None]
     return torch.where(present, depth, 0).cpu().numpy(), rendering.alpha.cpu().numpy(), normals.cpu().numpy()
+
+
+def facing_depth(gaussians: Gaussians, view: View, max_angle: float) -> np.ndarray:
+    """(H, W) float32 depth of `depth_map`, 0 where ray and normal are more than `max_angle` degrees apart."""
+    depth, _, normals_cam = depth_map(gaussians, view)
+    rays_cam = torch.nn.functional.normalize(pixel_rays(view), dim=2).numpy()
+    facing = -(normals_cam * rays_cam).sum(axis=2) > np.cos(np.deg2rad(max_angle))
+    return np.where(facing, depth, 0).astype(np.float32)
+
+
+def _as_uint8(image: torch.Tensor) -> np.ndarray:
+    return np.ascontiguousarray((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())

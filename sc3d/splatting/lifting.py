@@ -1,10 +1,9 @@
 """Labels for the Gaussians themselves: each takes the class of the pixels that it shows, in closed form, A[i,
 c] += alpha T s.
 
-A fragment's weight w = alpha T is its share of a pixel; summed over the pixels of class c of all views (times
-the mask's confidence s) it is
-the evidence that Gaussian i belongs to c. It equals the gradient of sum(image * mask) with respect to the
-Gaussian's color.
+A fragment's weight w = alpha T is its share of a pixel; summed over the pixels of class c of all views
+(times the mask's confidence s) it is the evidence that Gaussian i belongs to c. It equals the gradient of
+sum(image * mask) with respect to the Gaussian's color.
 """
 
 from __future__ import annotations
@@ -17,11 +16,10 @@ import torch
 from tqdm import tqdm
 
 from sc3d.geometry.cameras import View
-from sc3d.splatting.cpu import label_lifting as kernels_lift
-from sc3d.splatting.cpu import projection as kernels_project
-from sc3d.splatting.device import has_kernels
+from sc3d.splatting import device
+from sc3d.splatting.cpu.label_lifting import add_evidence
 from sc3d.splatting.gaussians import SH_C0, Gaussians
-from sc3d.splatting.rendering import camera_array, interleaved, render, sort_into_tiles
+from sc3d.splatting.rendering import render
 
 SCALE = 1 << 30  # evidence of one whole pixel, in fixed point: 2^63 of it are 8 thousand million pixels
 ReadMask = Callable[[View], tuple[np.ndarray, np.ndarray | None]]
@@ -45,50 +43,14 @@ def lift(gaussians: Gaussians, views: Iterable[View], read: ReadMask, num_ids: i
             raise ValueError(
                 f"{view.name}: labels are lifted through pinhole views, from masks of the view's size"
             )
-        weights = (
-            np.ones(mask.shape, np.float32) if confidence is None else confidence.astype(np.float32) / 255
-        )
-        if has_kernels(gaussians.means):
-            _add_view(gaussians, view, mask, weights, evidence)
+        sure = np.full(mask.shape, 255, np.uint8) if confidence is None else confidence
+        weights = sure.astype(np.float32) / 255
+        if device.has_kernels(gaussians.means):
+            add_evidence(gaussians, view, mask, weights, float(SCALE), evidence)
         else:
-            evidence += np.rint(evidence_by_gradient(gaussians, view, mask, weights, num_ids) * SCALE).astype(
-                np.int64
-            )
+            part = evidence_by_gradient(gaussians, view, mask, weights, num_ids)
+            evidence += np.rint(part * SCALE).astype(np.int64)
     return evidence / SCALE
-
-
-def _add_view(
-    gaussians: Gaussians, view: View, mask: np.ndarray, weights: np.ndarray, evidence: np.ndarray
-) -> None:
-    """Add one view to evidence (N, num_ids) int64. mask: (H, W) uint8; weights: (H, W) float32."""
-    ids = np.flatnonzero(np.bincount(mask.ravel(), minlength=256)[1:]) + 1
-    if not len(ids) or not len(gaussians):
-        return
-    arrays = [tensor.detach().contiguous().numpy() for tensor in gaussians.parameters().values()]
-    count, camera = len(gaussians), camera_array(view)
-    records, depths, radii = (
-        np.empty((count, kernels_project.RECORD), np.float32),
-        np.zeros(count, np.float32),
-        np.zeros(count, np.float32),
-    )
-    kernels_project.project(
-        *arrays, 0, camera, interleaved(-(-count // kernels_project.CHUNK)), records, depths, radii
-    )
-    visible, records, offsets, ranks, instances, starts = sort_into_tiles(camera, records, depths)
-    columns = np.full(256, kernels_lift.NONE)
-    columns[ids] = np.arange(len(ids))
-    contributions = np.zeros((len(ranks), len(ids)), np.float32)
-    kernels_lift.lift(
-        records.reshape(-1),
-        ranks,
-        instances,
-        starts,
-        interleaved(len(starts) - 1),
-        columns[mask],
-        weights,
-        contributions,
-    )
-    kernels_lift.collect(visible, offsets, contributions, ids, float(SCALE), evidence)
 
 
 def evidence_by_gradient(
@@ -101,14 +63,14 @@ def evidence_by_gradient(
     """
     evidence = np.zeros((len(gaussians), num_ids))
     # away from 0, where colors are cut
-    gray = painted(gaussians.detached(), np.full((len(gaussians), 3), 0.5))
+    gray = gaussians.detached().painted(np.full((len(gaussians), 3), 0.5))
     target, weight = torch.from_numpy(mask.astype(np.int64)), torch.from_numpy(weights)
     for first in range(1, num_ids, 3):
-        dc = gray.sh.clone().requires_grad_()
-        image = render(replace(gray, sh=dc), view, 0, geometry=False).color
+        dc = gray.sh_dc.clone().requires_grad_()
+        image = render(replace(gray, sh_dc=dc), view, 0, geometry=False).color
         shown = torch.stack([(target == label) * weight for label in range(first, first + 3)], dim=2)
         (image * shown.to(image)).sum().backward()
-        part = dc.grad[:, 0].cpu().numpy().astype(np.float64) / SH_C0
+        part = dc.grad.cpu().numpy().astype(np.float64) / SH_C0
         evidence[:, first : first + 3] = part[:, : num_ids - first]
     return evidence
 
@@ -120,36 +82,7 @@ def winners(evidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     returns: (N,) uint8 ids, 0 = no evidence; (N,) float32 confidence, 0 to 1
     """
     label = evidence[:, 1:].argmax(axis=1) + 1 if evidence.shape[1] > 1 else np.zeros(len(evidence), int)
-    total = evidence[:, 1:].sum(axis=1)
-    best = np.take_along_axis(evidence, label[:, None], axis=1)[:, 0]
+    total, best = evidence[:, 1:].sum(axis=1), np.take_along_axis(evidence, label[:, None], axis=1)[:, 0]
     seen = total > 0
-    return np.where(seen, label, 0).astype(np.uint8), np.where(
-        seen, best / np.where(seen, total, 1), 0
-    ).astype(np.float32)
-
-
-def painted(gaussians: Gaussians, colors: np.ndarray) -> Gaussians:
-    """The same Gaussians in one color each from everywhere. colors: (N, 3) RGB, 0 to 1; float32"""
-    values = torch.from_numpy(np.ascontiguousarray(colors, np.float32)).to(gaussians.means)
-    return Gaussians(
-        gaussians.means,
-        gaussians.log_scales,
-        gaussians.quats,
-        gaussians.opacity_logits,
-        ((values - 0.5) / SH_C0)[:, None],
-    )
-
-
-@torch.no_grad()
-def class_images(gaussians: Gaussians, view: View, shares: np.ndarray) -> np.ndarray:
-    """Alpha-weighted images of per-Gaussian values, three at a time.
-
-    shares: (N, C) not negative; returns: (H, W, C) float32 sum of w * share
-    """
-    count = shares.shape[1]
-    padded = np.pad(shares, ((0, 0), (0, -count % 3)))
-    images = [
-        render(painted(gaussians, padded[:, first : first + 3]), view, 0, geometry=False).color.cpu().numpy()
-        for first in range(0, count, 3)
-    ]
-    return np.concatenate(images, axis=2)[..., :count]
+    share = np.where(seen, best / np.where(seen, total, 1), 0)
+    return np.where(seen, label, 0).astype(np.uint8), share.astype(np.float32)

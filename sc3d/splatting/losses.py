@@ -1,23 +1,36 @@
-"""The terms of the training loss (METHOD section 1): pure functions on tensors, each a scalar.
+"""The terms of the training loss (METHOD section 1): functions on tensors, each a scalar.
 
 Rendered maps are sums over a pixel's Gaussians: N = sum w n (camera frame, towards the camera), D = sum w d,
-A = sum w.
-The plane of a pixel is N . x + D = 0, whose scale cancels.
+A = sum w. The plane of a pixel is N . x + D = 0, whose scale cancels. Where tensors are on the CPU, kernels
+compute the expensive terms; elsewhere their twins in `gpu.losses`.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from sc3d.geometry.cameras import View
 from sc3d.splatting import device
-from sc3d.splatting.consistency import pinhole, pixel_rays, relative_pose, sample
-from sc3d.splatting.cpu import normal_loss as kernels_normals
-from sc3d.splatting.cpu import patch_ncc as kernels_patches
+from sc3d.splatting.consistency import pinhole, pixel_rays, relative_pose, reprojection_error
+from sc3d.splatting.cpu import normal_loss, patch_ncc, ssim
+from sc3d.splatting.gpu import losses as gpu_losses
+from sc3d.splatting.rendered_view import Rendering
 
-PATCH_RADIUS = 3
 GRAY = (0.299, 0.587, 0.114)
+PIXELS_PER_PATCH = 4
+"""the geometric term looks at this many times more pixels than the photometric one"""
+
+
+@dataclass(frozen=True)
+class Neighbor:
+    """The other view of a pair. gray: (h, w) in [0, 1]; depth: (h, w), 0 = none, not differentiated."""
+
+    view: View
+    gray: torch.Tensor
+    depth: torch.Tensor
 
 
 def apply_exposure(image: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
@@ -33,11 +46,20 @@ def fit_exposure(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     trained on.
     """
     mean_image, mean_target = image.mean(), target.mean()
-    gain = ((image - mean_image) * (target - mean_target)).mean() / (
-        image - mean_image
-    ).square().mean().clamp_min(1e-12)
+    covariance = ((image - mean_image) * (target - mean_target)).mean()
+    gain = covariance / (image - mean_image).square().mean().clamp_min(1e-12)
     gain = gain.clamp(0.25, 4.0)
     return torch.stack([gain.log(), mean_target - gain * mean_image])
+
+
+def image_loss(image: torch.Tensor, target: torch.Tensor, ssim_weight: float = 0.2) -> torch.Tensor:
+    """(1 - ssim_weight) mean |image - target| + ssim_weight (1 - mean SSIM) of (H, W, 3) images in [0, 1];
+    differentiable in `image` only.
+
+    Fastest for float32 images stored plane by plane, as `render` and `TrainingData.photo` return them.
+    """
+    kernels = ssim if device.has_kernels(image) else gpu_losses
+    return kernels.image_loss(image, target, ssim_weight)
 
 
 def flatten_loss(log_scales: torch.Tensor, visible: torch.Tensor, extent: float) -> torch.Tensor:
@@ -50,56 +72,46 @@ def flatten_loss(log_scales: torch.Tensor, visible: torch.Tensor, extent: float)
     return chosen.min(1).values.exp().mean() / extent if len(chosen) else log_scales.sum() * 0
 
 
-def image_edges(image: torch.Tensor) -> torch.Tensor:
-    """(H, W) gradient magnitude of an (H, W, 3) image, divided by its maximum: 1 at the strongest edge."""
-    gray = to_gray(image)
-    padded = torch.nn.functional.pad(gray[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    gradient = (
-        (padded[1:-1, 2:] - padded[1:-1, :-2]).square() + (padded[2:, 1:-1] - padded[:-2, 1:-1]).square()
-    ).sqrt()
-    return gradient / gradient.max().clamp_min(1e-12)
-
-
-def normals_from_depth(depth: torch.Tensor, view: View) -> torch.Tensor:
-    """(H, W, 3) unit normals, camera frame, towards the camera: cross product of the differences between the
-    4 neighbors' points.
-
-    depth: (H, W), 0 = none. Zero at the image border and where one of the four has no depth.
-    """
-    points = pixel_rays(view, depth.device) * depth[..., None]
-    across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
-    known = (depth[1:-1, 2:] > 0) & (depth[1:-1, :-2] > 0) & (depth[2:, 1:-1] > 0) & (depth[:-2, 1:-1] > 0)
-    normals = torch.linalg.cross(down, across)
-    length = normals.norm(dim=2, keepdim=True)
-    known = known[..., None] & (length > 0)
-    normals = torch.where(
-        known, normals / torch.where(known, length, torch.ones_like(length)), torch.zeros_like(normals)
-    )
-    return torch.nn.functional.pad(normals, (0, 0, 1, 1, 1, 1))
-
-
-def depth_normal_loss(
-    normal: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, edges: torch.Tensor, view: View
+def single_view_normal_loss(
+    rendering: Rendering, depth: torch.Tensor, view: View, target: torch.Tensor
 ) -> torch.Tensor:
-    """`normal_loss` against `normals_from_depth` of a depth map, (H, W), 0 = none; differentiable in `normal`
-    and `depth`.
+    """Rendered normals against those of the rendered depth, (H, W), away from the edges of the photo `target`
+    (H, W, 3).
     """
-    if device.has_kernels(normal):
-        return kernels_normals.depth_normal_loss(normal, depth, alpha, edges, pinhole(view))
-    return normal_loss(normal, normals_from_depth(depth, view), alpha, edges)
+    depth, edges = torch.where(rendering.alpha > 0.5, depth, 0), image_edges(target)
+    kernels = normal_loss if device.has_kernels(depth) else gpu_losses
+    return kernels.depth_normal_loss(rendering.normal, depth, rendering.alpha, edges, pinhole(view))
 
 
-def normal_loss(
-    normal: torch.Tensor, depth_normals: torch.Tensor, alpha: torch.Tensor, edges: torch.Tensor
-) -> torch.Tensor:
-    """(1 - g)^2 |A N_depth - N|_1, mean over the pixels where N_depth is known.
+def multi_view_losses(
+    rendering: Rendering,
+    depth: torch.Tensor,
+    source: tuple[torch.Tensor, View],
+    neighbor: Neighbor,
+    draw: tuple[int, torch.Generator],
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Geometric and photometric loss of random pixels.
 
-    normal: (H, W, 3) N; depth_normals: (H, W, 3) `normals_from_depth`; alpha: (H, W) A; edges: (H, W) g,
-        `image_edges`
+    depth: (H, W) unbiased depth of `rendering`; source: its (H, W) gray photo and view
+    draw: number of patches, random generator
     """
-    known = depth_normals.detach().abs().sum(2) > 0
-    gap = (alpha.detach()[..., None] * depth_normals - normal).abs().sum(2)
-    return ((1 - edges).square() * gap * known).sum() / known.sum().clamp_min(1)
+    num_patches, generator = draw
+    present = torch.nonzero(((rendering.alpha > 0.5) & (depth > 0)).reshape(-1))[:, 0]
+    count = min(PIXELS_PER_PATCH * num_patches, len(present))
+    chosen = torch.randint(max(len(present), 1), (count,), generator=generator)
+    chosen = present[chosen.to(present.device)]
+    view = source[1]
+    points_cam = pixel_rays(view, depth.device).reshape(-1, 3)[chosen] * depth.reshape(-1)[chosen, None]
+    error, valid = reprojection_error(points_cam, view, neighbor.depth, neighbor.view)
+    near = torch.nonzero(valid & (error.detach() < 1))[:num_patches, 0]
+    if not len(near):
+        return depth.sum() * 0, depth.sum() * 0
+    picked = chosen[near]
+    planes = rendering.normal.reshape(-1, 3)[picked], rendering.plane_distance.reshape(-1)[picked]
+    pixels = torch.stack([picked % view.width, picked // view.width], 1)
+    weights = torch.exp(-error[near].detach())
+    photometric = photometric_loss(planes, pixels, weights, source, (neighbor.gray, neighbor.view))
+    return geometric_loss(error, valid), photometric
 
 
 def geometric_loss(error: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
@@ -145,72 +157,20 @@ def patch_dissimilarity(
     returns: (M,) in [0, 2], about 1 where there is no texture; (M,) bool: both patches lie inside their
         images
     """
-    if not device.has_kernels(planes[0]):
-        return patch_dissimilarity_reference(planes, pixels, source, other)
-    rotation, translation = relative_pose(source[1], other[1])
-    cameras = np.concatenate(
-        [pinhole(source[1]), pinhole(other[1]), rotation.numpy().ravel(), translation.numpy()]
-    )
-    return kernels_patches.patch_dissimilarity(*planes, pixels, (source[0], other[0]), cameras)
+    kernels = patch_ncc if device.has_kernels(planes[0]) else gpu_losses
+    pose = [part.numpy().ravel() for part in relative_pose(source[1], other[1])]
+    cameras = np.concatenate([pinhole(source[1]), pinhole(other[1]), *pose])
+    return kernels.patch_dissimilarity(*planes, pixels, (source[0], other[0]), cameras)
 
 
-def patch_dissimilarity_reference(
-    planes: tuple[torch.Tensor, torch.Tensor],
-    pixels: torch.Tensor,
-    source: tuple[torch.Tensor, View],
-    other: tuple[torch.Tensor, View],
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """`patch_dissimilarity` in plain torch: for GPUs, and for tests of the kernel."""
-    (gray, view), (other_gray, other_view) = source, other
-    steps = torch.arange(-PATCH_RADIUS, PATCH_RADIUS + 1, device=pixels.device)
-    offsets = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), 2).reshape(-1, 2)
-    patch = pixels[:, None] + offsets
-    limits = pixels.new_tensor([view.width - 1, view.height - 1])
-    inside = ((patch >= 0) & (patch <= limits)).all(2).all(1)
-    patch = patch.clamp_min(0).minimum(limits)
-    values = gray[patch[..., 1], patch[..., 0]]
-    warped = _warp(patch.float() + 0.5, planes, view, other_view)
-    border = warped.new_tensor([other_view.width, other_view.height]) - 0.5
-    inside = inside & ((warped >= 0.5) & (warped <= border)).all(2).all(1)
-    other_values = sample(other_gray, warped.reshape(-1, 2)).reshape(values.shape)
-    return 1 - normalized_correlation(values, other_values), inside
-
-
-def normalized_correlation(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """(M,) NCC of rows of two (M, P) arrays in [0, 1]. Variances below (1/255)^2 count as noise: they pull it
-    to 0.
-    """
-    first, second = first - first.mean(1, keepdim=True), second - second.mean(1, keepdim=True)
-    noise = 1 / 255**2
-    return (first * second).mean(1) / (
-        (first.square().mean(1) + noise) * (second.square().mean(1) + noise)
-    ).sqrt()
+def image_edges(image: torch.Tensor) -> torch.Tensor:
+    """(H, W) gradient magnitude of an (H, W, 3) image, divided by its maximum: 1 at the strongest edge."""
+    padded = torch.nn.functional.pad(to_gray(image)[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    across, down = padded[1:-1, 2:] - padded[1:-1, :-2], padded[2:, 1:-1] - padded[:-2, 1:-1]
+    gradient = (across.square() + down.square()).sqrt()
+    return gradient / gradient.max().clamp_min(1e-12)
 
 
 def to_gray(image: torch.Tensor) -> torch.Tensor:
     """(H, W) luma of an (H, W, 3) image."""
     return image @ image.new_tensor(GRAY)
-
-
-def _warp(
-    pixels: torch.Tensor, planes: tuple[torch.Tensor, torch.Tensor], view: View, other: View
-) -> torch.Tensor:
-    """(M, P, 2) pixels of `view`, each row on its own plane, in `other`; far outside where the plane is
-    behind.
-    """
-    normal, distance = planes
-    rotation, translation = relative_pose(view, other, pixels.device)
-    fx, fy, cx, cy = pinhole(view)
-    rays = torch.stack(
-        [(pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy, torch.ones_like(pixels[..., 0])], 2
-    )
-    # x' = R x - t (n . x) / d, per pixel up to scale; multiplied by d > 0, which also cancels the scale of N
-    # and D.
-    along = (rays * normal[:, None]).sum(2, keepdim=True)
-    moved = (rays @ rotation.T) * distance[:, None, None] - translation * along
-    depth = moved[..., 2]
-    ahead = depth > 1e-9
-    safe = torch.where(ahead, depth, torch.ones_like(depth))
-    fx, fy, cx, cy = pinhole(other)
-    warped = torch.stack([moved[..., 0] / safe * fx + cx, moved[..., 1] / safe * fy + cy], 2)
-    return torch.where(ahead[..., None], warped, torch.full_like(warped, -1e6))

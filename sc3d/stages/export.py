@@ -41,7 +41,7 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 def run(scene: Scene, settings: Export) -> dict[str, object]:
     if set(settings.format) - CAMERAS_ONLY:
         scene.require(scene.classes, hint="copy the class table of the labels there")
-    figures = dict[str, object]()
+    figures: dict[str, object] = {}
     for name in dict.fromkeys(settings.format):
         figures |= {f"{name}_{key}": value for key, value in _module(name).write(scene, settings).items()}
     return figures

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 from pathlib import Path
 
 from sc3d.errors import InputError
-from sc3d.io.atomic import remove
+from sc3d.geometry.blocks import split_blocks
+from sc3d.io.atomic import atomic_path, remove
 from sc3d.io.provenance import digest
+from sc3d.io.splats import origin_comment, write_splat_ply
 from sc3d.scene.scene import Scene, check_photos
 from sc3d.settings.train import Train
-from sc3d.splatting.block_tasks import BlockJob, train_blocks
-from sc3d.splatting.blocks import split_blocks
+from sc3d.splatting.blocks import BlockJob, train_blocks
 from sc3d.splatting.dataset import TrainingData, scene_data
 from sc3d.splatting.device import pick_device
-from sc3d.splatting.train import TrainResult, train, write_log
+from sc3d.splatting.trainer import TrainResult, train
 from sc3d.tiling.executor import open_executor
-from sc3d.view.contact_sheet import write_training_sheet
+from sc3d.view.training_sheet import write_training_sheet
 
 
 def inputs(scene: Scene, settings: Train) -> list[Path]:
@@ -41,26 +43,30 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
     if in_blocks:
         result, summary = _train_blocks(scene, settings, data, unfinished)
     else:
-        result, summary = (
-            train(data, settings.training, unfinished if settings.checkpoint_every else None),
-            {},
-        )
-    result.gaussians.save(scene.gaussians, [f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}"])
+        checkpoint = unfinished if settings.checkpoint_every else None
+        result, summary = train(data, settings.training, checkpoint), {}
+    write_splat_ply(scene.gaussians, result.gaussians.arrays(), [origin_comment(origin)])
     write_log(result.log, scene.path / "train.csv")
     write_training_sheet(scene.path / "train.jpg", result, data, settings.training)
     remove(unfinished)
     last = result.log[-1] if result.log else {}
-    held_out = {f"held_out_{name}": round(value, 3) for name, value in result.metrics.items()}
-    return (
-        {
-            "photos": len(data.views),
-            "size": f"{data.views[0].width}x{data.views[0].height}",
-            "gaussians": len(result.gaussians),
-        }
-        | {"psnr": round(last.get("psnr", float("nan")), 2)}
-        | held_out
-        | summary
-    )
+    return {
+        "photos": len(data.views),
+        "size": f"{data.views[0].width}x{data.views[0].height}",
+        "gaussians": len(result.gaussians),
+        "psnr": round(last.get("psnr", float("nan")), 2),
+        **{f"held_out_{name}": round(value, 3) for name, value in result.metrics.items()},
+        **summary,
+    }
+
+
+def write_log(rows: list[dict[str, float]], path: Path) -> None:
+    """Write the rows of `TrainResult.log` as CSV; those of `train_blocks` have a first column more."""
+    names = ["block"] if rows and "block" in rows[0] else []
+    with atomic_path(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*names, "iteration", "loss", "psnr", "num_gaussians", "seconds"])
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def _train_blocks(

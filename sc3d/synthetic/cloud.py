@@ -87,15 +87,8 @@ def _seen_from_above(world: World, points: np.ndarray, triangles: np.ndarray) ->
     directions = [np.array([0.0, 0.0, 1.0])]
     for turn, elevation in enumerate(np.radians([60, 40, 20])):
         for azimuth in 2 * np.pi * (np.arange(8) + turn / 3) / 8:
-            directions.append(
-                np.array(
-                    [
-                        np.cos(azimuth) * np.cos(elevation),
-                        np.sin(azimuth) * np.cos(elevation),
-                        np.sin(elevation),
-                    ]
-                )
-            )
+            level, up = np.cos(elevation), np.sin(elevation)
+            directions.append(np.array([np.cos(azimuth) * level, np.sin(azimuth) * level, up]))
     for direction in directions:
         facing = leaf | (normals @ direction > 0.02)
         rest = np.flatnonzero(~visible & facing)

@@ -31,24 +31,14 @@ from sc3d.synthetic.world import World, build_world
 
 logger = logging.getLogger(__name__)
 
+# fmt: off
 CLASSES = [
-    {
-        "id": 1,
-        "name": "building",
-        "color": [214, 60, 60],
-        "prompts": ["building", "house", "roof"],
-        "asprs": 6,
-    },
+    {"id": 1, "name": "building", "color": [214, 60, 60], "prompts": ["building", "house", "roof"], "asprs": 6},
     {"id": 2, "name": "tree", "color": [40, 150, 60], "prompts": ["tree", "bush"], "asprs": 5},
-    {
-        "id": 3,
-        "name": "road",
-        "color": [150, 150, 160],
-        "prompts": ["road", "street", "parking lot"],
-        "asprs": 11,
-    },
+    {"id": 3, "name": "road", "color": [150, 150, 160], "prompts": ["road", "street", "parking lot"], "asprs": 11},
     {"id": 4, "name": "grass", "color": [170, 220, 110], "prompts": ["grass", "lawn"], "asprs": 3},
 ]
+# fmt: on
 FOLDERS = ("images", "depth", "truth", "masks", "confidence")
 NUM_SPARSE = 16_000  # candidates for sparse points; those seen by three views are kept
 

@@ -113,15 +113,10 @@ def plan_ground(extent: float, rng: np.random.Generator, level_edges: bool = Fal
     straight = np.stack([cross - np.sin(turn) * x, np.cos(turn) * x], 1)
     angles = rng.uniform(0, 2 * np.pi, 6)
     wave_lengths = np.geomspace(160.0, 28.0, 6)
-    hills = np.stack(
-        [
-            np.cos(angles) * 2 * np.pi / wave_lengths,
-            np.sin(angles) * 2 * np.pi / wave_lengths,
-            rng.uniform(0, 2 * np.pi, 6),
-            0.009 * wave_lengths,
-        ],
-        1,
-    )
+    # fmt: off
+    hills = np.stack([np.cos(angles) * 2 * np.pi / wave_lengths, np.sin(angles) * 2 * np.pi / wave_lengths,
+                      rng.uniform(0, 2 * np.pi, 6), 0.009 * wave_lengths], 1)
+    # fmt: on
     half = extent
     lines = [curved, straight]
     ticks = np.arange(-half, half + RASTER_STEP / 2, RASTER_STEP)

@@ -24,16 +24,12 @@ def place_buildings(ground: Ground, rng: np.random.Generator) -> list[Building]:
             break
         # first, while there is room; small sites may have none
         hall = not buildings and attempt < 20 * wanted
-        half = (
-            (rng.uniform(8.0, 10.0), rng.uniform(5.5, 6.5))
-            if hall
-            else (rng.uniform(4.5, 7.5), rng.uniform(3.6, 4.8))
-        )
+        long, short = ((8.0, 10.0), (5.5, 6.5)) if hall else ((4.5, 7.5), (3.6, 4.8))
+        half = rng.uniform(*long), rng.uniform(*short)
         # late comers fill the second row
         gap = 17.0 if hall else rng.uniform(4.0, 8.0) + (14.0 if attempt > 30 * wanted else 0.0)
-        x, y, yaw = _beside_road(
-            ground, int(rng.integers(len(ground.center_lines))), HALF_PAVED + gap + half[1], rng
-        )
+        road = int(rng.integers(len(ground.center_lines)))
+        x, y, yaw = _beside_road(ground, road, HALF_PAVED + gap + half[1], rng)
         wing = None
         if not hall and rng.random() < 0.5:
             side = rng.choice([-1.0, 1.0])
@@ -59,9 +55,8 @@ def plant(builder: MeshBuilder, ground: Ground, buildings: list[Building], rng: 
         for _ in range(int(rng.integers(1, 4))):
             spots.append((*_beside_wall(building, rng.uniform(1.0, 2.2), rng), rng.uniform(2.2, 3.6)))
     for _ in range(round(26 * share)):
-        x, y, _ = _beside_road(
-            ground, int(rng.integers(len(ground.center_lines))), HALF_PAVED + rng.uniform(0.6, 1.4), rng
-        )
+        road = int(rng.integers(len(ground.center_lines)))
+        x, y, _ = _beside_road(ground, road, HALF_PAVED + rng.uniform(0.6, 1.4), rng)
         spots.append((x, y, rng.uniform(2.2, 3.4)))
     for _ in range(round(7 * share)):
         middle = rng.uniform(-0.47, 0.47, 2) * ground.extent
@@ -97,15 +92,12 @@ def park_cars(builder: MeshBuilder, ground: Ground, rng: np.random.Generator) ->
         yaw = np.arctan2(sin, cos)
         if kind == PARKING:
             bays = np.arange(-np.floor(half_width / 2.5) * 2.5 + 1.25, half_width - 1.0, 2.5)
-            local = [
-                (side * (half_length - 2.7), bay) for side in (-1, 1) for bay in bays if rng.random() < 0.55
-            ]
+            reach = half_length - 2.7
+            local = [(side * reach, bay) for side in (-1, 1) for bay in bays if rng.random() < 0.55]
+        elif rng.random() < 0.6 and half_length > 2.8:
+            local = [(rng.uniform(-0.4, 0.0) * half_length, 0.0)]
         else:
-            local = (
-                [(rng.uniform(-0.4, 0.0) * half_length, 0.0)]
-                if rng.random() < 0.6 and half_length > 2.8
-                else []
-            )
+            local = []
         spots += [(x + cos * u - sin * v, y + sin * u + cos * v, yaw) for u, v in local]
     for x, y, yaw in spots:
         if max(abs(x), abs(y)) < 0.52 * ground.extent and not (np.hypot(*(taken - [x, y]).T) < 2.4).any():
@@ -119,12 +111,8 @@ def build_fences(
 ) -> None:
     """Low walls on some garden borders."""
     for building in buildings[1::3]:
-        local = np.array(
-            [
-                [-building.half[0] - 2.2, y, 0.0]
-                for y in np.linspace(-building.half[1] - 1.0, building.half[1] + 4.0, 6)
-            ]
-        )
+        x, y = -building.half[0] - 2.2, np.linspace(-building.half[1] - 1.0, building.half[1] + 4.0, 6)
+        local = np.column_stack([np.full(6, x), y, np.zeros(6)])
         ends = local @ building.pose[:3, :3].T + building.pose[:3, 3]
         if _on_lawn(ends[:, :2], ground, buildings, 0.5).all():
             ends[:, 2] = ground.height(ends[:, :2])
@@ -200,12 +188,8 @@ def _pave(ground: Ground, building: Building, gap: float, kind: int, rng: np.ran
 def _beside_wall(building: Building, distance: float, rng: np.random.Generator) -> tuple[float, float]:
     a, b = building.half
     along = rng.uniform(-1, 1)
-    local = [
-        (along * a, b + distance),
-        (along * a, -b - distance),
-        (a + distance, along * b),
-        (-a - distance, along * b),
-    ][int(rng.integers(4))]
+    x, y, far_x, far_y = along * a, along * b, a + distance, b + distance
+    local = [(x, far_y), (x, -far_y), (far_x, y), (-far_x, y)][int(rng.integers(4))]
     x, y, _ = (building.pose @ [*local, 0.0, 1.0])[:3]
     return float(x), float(y)
 
@@ -225,14 +209,8 @@ def _plant_bushes(
         for _ in range(4):  # single bushes at the walls
             x, y = _beside_wall(building, rng.uniform(0.9, 1.6), rng)
             if _on_lawn(np.array([[x, y]]), ground, buildings, 0.6)[0]:
-                size = rng.uniform(0.5, 1.1)
-                add_bush(
-                    builder,
-                    np.array([x, y, ground.height(np.array([[x, y]]))[0]]),
-                    (size, size, 0.8 * size),
-                    0.0,
-                    rng,
-                )
+                size, position = rng.uniform(0.5, 1.1), np.array([x, y, ground.height(np.array([[x, y]]))[0]])
+                add_bush(builder, position, (size, size, 0.8 * size), 0.0, rng)
         if rng.random() < 0.5:  # a hedge behind the house, in pieces that follow the ground
             for x in np.arange(-building.half[0] - 2, building.half[0] + 2.1, 1.7):
                 px, py, _ = (building.pose @ [x, building.half[1] + 6.0, 0.0, 1.0])[:3]

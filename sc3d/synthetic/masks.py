@@ -33,12 +33,8 @@ def noisy_mask(label: np.ndarray, strength: float, rng: np.random.Generator) -> 
     """
     field = _displacement(label.shape, rng)
     segments, num_segments = _segments(label, rng)
-    fate, choice, quality, hope = (
-        rng.random(num_segments),
-        rng.random(num_segments),
-        rng.normal(size=num_segments),
-        rng.random(num_segments),
-    )
+    fate, choice = rng.random(num_segments), rng.random(num_segments)
+    quality, hope = rng.normal(size=num_segments), rng.random(num_segments)
     grain = rng.normal(size=label.shape).astype(np.float32)
     if strength <= 0:
         return label.copy(), np.full(label.shape, 255, np.uint8)
@@ -47,10 +43,8 @@ def noisy_mask(label: np.ndarray, strength: float, rng: np.random.Generator) -> 
     wrong = np.minimum(strength * (MISSED + CONFUSED), 0.95)
     missed = fate < wrong * MISSED / (MISSED + CONFUSED)
     confused = (fate < wrong) & ~missed
-    segments, whole = (
-        _warp(segments, BLEED * strength * scale * field),
-        _warp(whole, BLEED * strength * scale * field),
-    )
+    shift = BLEED * strength * scale * field
+    segments, whole = _warp(segments, shift), _warp(whole, shift)
     table = np.tile(np.arange(NUM_LABELS, dtype=np.uint8), (num_segments, 1))
     table[missed] = OTHER
     for source, targets in CONFUSIONS.items():

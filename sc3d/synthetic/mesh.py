@@ -8,14 +8,8 @@ GROUND, WALL, TILES, FLAT_ROOF, LEAF, BARK, PAINT, GLASS, PLAIN, BRICK = range(1
 OTHER, BUILDING, TREE, ROAD, GRASS = range(5)  # labels
 
 # columns of the per-triangle float table
-ORIGIN, AXIS_U, AXIS_V, NORMAL, TINT, SIZE = (
-    slice(0, 3),
-    slice(3, 6),
-    slice(6, 9),
-    slice(9, 12),
-    slice(12, 15),
-    slice(15, 17),
-)
+# texture frame (origin, u axis, v axis), normal, tint, size of the textured face
+FRAME, NORMAL, TINT, SIZE = slice(0, 9), slice(9, 12), slice(12, 15), slice(15, 17)
 NUM_COLUMNS = 17
 
 
@@ -58,9 +52,8 @@ class MeshBuilder:
         """
         corners = np.asarray(corners, np.float64)
         floats = np.zeros((len(corners), NUM_COLUMNS))
-        floats[:, 0:9] = (
-            np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) if frame is None else np.asarray(frame)
-        ).reshape(-1)
+        frame = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) if frame is None else np.asarray(frame)
+        floats[:, FRAME] = frame.reshape(-1)
         floats[:, NORMAL] = face_normals(corners) if normals is None else normals
         floats[:, TINT] = tint
         floats[:, SIZE] = size

@@ -28,11 +28,8 @@ def add_tree(builder: MeshBuilder, position: np.ndarray, radius: float, rng: np.
     num_leaves = int(330 * radius**2)
     lobe = rng.choice(num_lobes, num_leaves, p=sizes**2 / (sizes**2).sum())
     outward = _sphere(num_leaves, rng)
-    centers = lobes[lobe] + outward * (sizes[lobe] * rng.uniform(0.75, 1.08, num_leaves))[:, None] * [
-        1,
-        1,
-        0.8,
-    ]
+    reach = sizes[lobe] * rng.uniform(0.75, 1.08, num_leaves)
+    centers = lobes[lobe] + outward * reach[:, None] * [1, 1, 0.8]
     depth = np.linalg.norm((centers - crown) / [radius, radius, height], axis=1)
     tint = linear(LEAF_TINTS[rng.integers(len(LEAF_TINTS))]) * rng.uniform(0.88, 1.12, 3)
     shade = (0.45 + 0.6 * np.clip(depth, 0, 1.1)) * rng.uniform(0.8, 1.2, num_lobes)[lobe]

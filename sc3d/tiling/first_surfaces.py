@@ -88,9 +88,7 @@ def read_triangles(path: Path) -> Iterator[np.ndarray]:
     """
     header = check_ply(path)
     vertex, face = header.element("vertex"), header.element("face")
-    corners = (
-        next((entry for entry in face.properties if entry.length_dtype), None) if face is not None else None
-    )
+    corners = next((entry for entry in face.properties if entry.length), None) if face is not None else None
     if (
         not header.order
         or vertex is None
@@ -120,8 +118,8 @@ def read_triangles(path: Path) -> Iterator[np.ndarray]:
 
 def _fields(entry: Property, corners: Property, order: str) -> list[tuple]:
     if entry is corners:
-        return [("count", order + entry.length_dtype), ("corners", order + entry.dtype, (3,))]
-    if entry.length_dtype:
+        return [("count", order + entry.length), ("corners", order + entry.dtype, (3,))]
+    if entry.length:
         raise InputError("the faces of the mesh have more than one list: write it anew with triangles only")
     return [(entry.name, order + entry.dtype)]
 

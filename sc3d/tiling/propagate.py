@@ -154,7 +154,7 @@ def _learn(
     halves = [
         sum_statistics(list(parts))
         for parts in zip(
-            *executor.run("examples", partial(_lesson_task, job, counts, least), tiles), strict=True
+            *executor.run("examples", partial(_statistics_task, job, counts, least), tiles), strict=True
         )
     ]
     errors = executor.run("held-out errors", partial(_error_task, job, halves, least), tiles)
@@ -178,7 +178,7 @@ def _relief_task(job: PropagateJob, terrain: GroundModel, tile: int) -> list[Qua
     )
 
 
-def _lesson_task(
+def _statistics_task(
     job: PropagateJob, counts: list[QuantileSketch], least: int, tile: int
 ) -> tuple[AppearanceStatistics, AppearanceStatistics]:
     part = TileGraph.load(job, tile)
@@ -241,7 +241,7 @@ def _turn_task(
 def _once_task(
     job: PropagateJob, offered: np.ndarray, statistics: AppearanceStatistics | None, tile: int
 ) -> None:
-    """map without raters, geometry or knn, within the margin."""
+    """map without appearance, geometry or knn, within the margin."""
     part = TileGraph.load(job, tile)
     if job.settings.method == "map":
         label, confidence = decided(

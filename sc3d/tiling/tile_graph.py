@@ -91,10 +91,10 @@ class TileGraph:
 
     def appearance(self, job: PropagateJob) -> AppearanceModel:
         """Histogram cells of all points of the part."""
-        return raters_of(self.around(job, "cells"))
+        return appearance_of(self.around(job, "cells"))
 
 
-def raters_of(cells: np.ndarray) -> AppearanceModel:
+def appearance_of(cells: np.ndarray) -> AppearanceModel:
     """Raters from the cells (N, G) int32 that `cells_of` gives."""
     relief = Histogram(cells[:, -1], (RELIEF_BINS,) * NUM_FEATURES, RELIEF_BLUR)
     return AppearanceModel(

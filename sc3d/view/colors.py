@@ -71,7 +71,7 @@ def color_points(
         raise InputError(_MAKERS[by])
     if by == "disagreement":
         votes = read_votes(cloud)
-        if votes is None:  # those of some classes are missing
+        if votes is None:  # those of some class are missing
             raise InputError(_MAKERS[by])
         return disagreement_colors(disagreement(votes))
     values = _attributes(cloud)[_ATTRIBUTES[by]].cpu().numpy()

@@ -1,4 +1,4 @@
-"""The contact sheet of a training: photo, rendering, depth and normals, row by row."""
+"""Contact sheets: photo, rendering, depth and normals, row by row; pictures beside one another."""
 
 from __future__ import annotations
 
@@ -8,39 +8,17 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from sc3d.io.images import write_image
 from sc3d.view.captions import INK, PAPER, caption_font
 from sc3d.view.colors import confidence_colors
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from PIL import Image, ImageDraw
 
-    from sc3d.settings.train import TrainSettings
-    from sc3d.splatting.dataset import TrainingData
-    from sc3d.splatting.train import TrainResult
-    from sc3d.view.splat_images import Comparison
+    from sc3d.splatting.evaluation import Comparison
 
 _MARGIN, _GAP = 16, 8  # px
 _SOFT, _WARNING = (100, 107, 117), (190, 70, 0)
 _EMPTY = (60, 62, 66)  # where nothing is
-
-
-def write_training_sheet(
-    path: Path, result: TrainResult, data: TrainingData, settings: TrainSettings
-) -> None:
-    """Write the contact sheet of a training, a picture of 1600 px width; its title says how long and how
-    well.
-    """
-    from sc3d.view.splat_images import training_rows
-
-    title = f"{settings.iterations:,} iterations, {len(result.gaussians):,} Gaussians"
-    if result.log:
-        title += f", PSNR {result.log[-1]['psnr']:.2f} dB over the last steps"
-    if result.metrics:
-        title += f"; held-out photos: PSNR {result.metrics['psnr']:.2f} dB, SSIM {result.metrics['ssim']:.3f}"
-    write_image(path, contact_sheet(training_rows(result.gaussians, data, settings, result.exposures), title))
 
 
 def contact_sheet(rows: Sequence[Comparison], title: str, width: int = 1600) -> np.ndarray:

@@ -194,10 +194,9 @@ def progressive_order(points: np.ndarray) -> np.ndarray:
     """Rows of the points so that the first K of them, for any K, thin the cloud evenly and keep its relative
     densities.
 
-    The points are sorted along a Z-order curve, which neighbors share, and then taken in the order of the
-    van der Corput sequence,
-    whose every beginning is spread evenly over the curve. Nothing is random, and copies of a cloud in another
-    order give the same points.
+    The points are sorted along a Z-order curve, which neighbors share, and then taken in the order of the van
+    der Corput sequence, whose every beginning is spread evenly over the curve. Nothing is random, and copies
+    of a cloud in another order give the same points.
 
     points: (N, 3) finite; returns: (N,) int64, a permutation
     """

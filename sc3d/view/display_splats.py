@@ -7,12 +7,14 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
+from sc3d.io.ply import read_records
+from sc3d.io.splats import read_splat_ply
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import Coloring, confidence_colors
@@ -26,14 +28,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 SPLAT_COLORINGS: tuple[Coloring, ...] = ("photo", "label", "confidence")
-
-
-class SplatLabels(NamedTuple):
-    """As in `DisplaySplats`."""
-
-    label: np.ndarray
-    confidence: np.ndarray
-    table: ClassTable
 
 
 @dataclass(frozen=True)
@@ -51,50 +45,41 @@ class DisplaySplats:
     confidence: np.ndarray | None = None
     table: ClassTable | None = None
 
-    @property
-    def labels(self) -> SplatLabels | None:
-        """What belongs together; None for gaussians.ply."""
-        if self.label is None or self.confidence is None or self.table is None:
-            return None
-        return SplatLabels(self.label, self.confidence, self.table)
-
     def painted(self, by: Coloring) -> Gaussians:
         """Class colors or confidences instead of the photos' colors. InputError if there are no labels."""
         if by == "photo":
             return self.gaussians
-        from sc3d.splatting.lifting import painted
-
-        return painted(self.gaussians, self.colors(by) / 255)
+        return self.gaussians.painted(self.colors(by) / 255)
 
     def colors(self, by: Coloring) -> np.ndarray:
         """(N, 3) uint8 RGB; of the photos: the mean over all directions of view, without what changes with
         them.
         """
         if by == "photo":
-            from sc3d.splatting.gaussians import SH_C0
-
-            return np.round(np.clip(0.5 + SH_C0 * self.gaussians.sh[:, 0].numpy(), 0, 1) * 255).astype(
-                np.uint8
-            )
+            return self.gaussians.base_colors
         if by not in SPLAT_COLORINGS:
             raise InputError(f"splats have no {by}: choose --by photo, label or confidence")
-        labels = self.labels
-        if labels is None:
+        label, confidence, table = self.labels()
+        return table.palette[label] if by == "label" else confidence_colors(confidence)
+
+    def labels(self) -> tuple[np.ndarray, np.ndarray, ClassTable]:
+        """`label`, `confidence` and `table`. InputError if there are none."""
+        if self.label is None or self.confidence is None or self.table is None:
             raise InputError("the splats have no labels: run `sc3d export SCENE --format splats`")
-        return labels.table.palette[labels.label] if by == "label" else confidence_colors(labels.confidence)
+        return self.label, self.confidence, self.table
 
     def only(self, ids: set[int] | None) -> DisplaySplats:
         """Those of some classes, None = all. InputError if there are none."""
         if ids is None:
             return self
-        labels = self.labels
-        if labels is None:
+        if self.label is None:
             raise InputError(
                 "--classes needs labels, and the splats have none: run `sc3d export SCENE --format splats`"
             )
-        chosen = np.isin(labels.label, sorted(ids))
+        labels, _, table = self.labels()
+        chosen = np.isin(labels, sorted(ids))
         if not chosen.any():
-            names = ", ".join(labels.table.name(label) for label in sorted(ids))
+            names = ", ".join(table.name(label) for label in sorted(ids))
             raise InputError(f"no splat has one of the classes {names}: nothing to show or write")
         return self[chosen]
 
@@ -106,10 +91,10 @@ class DisplaySplats:
             o3d.core.Tensor(self.gaussians.means.numpy().astype(np.float64) + self.origin)
         )
         cloud.point.colors = o3d.core.Tensor(self.colors("photo"))
-        labels = self.labels
-        if labels is not None:
-            cloud.point["label"] = o3d.core.Tensor(labels.label[:, None])
-            cloud.point["confidence"] = o3d.core.Tensor(labels.confidence[:, None])
+        if self.label is not None:
+            label, confidence, _ = self.labels()
+            cloud.point["label"] = o3d.core.Tensor(label[:, None])
+            cloud.point["confidence"] = o3d.core.Tensor(confidence[:, None])
         return cloud
 
     def most_visible(self, count: int) -> DisplaySplats:
@@ -126,8 +111,7 @@ class DisplaySplats:
         label, confidence = (
             None if values is None else values[chosen] for values in (self.label, self.confidence)
         )
-        gaussians = self.gaussians[chosen]  # type: ignore[index]  # tensors take NumPy's rows too
-        return replace(self, gaussians=gaussians, label=label, confidence=confidence)
+        return replace(self, gaussians=self.gaussians[chosen], label=label, confidence=confidence)
 
 
 def trained_splats(scene: Scene) -> DisplaySplats:
@@ -139,16 +123,15 @@ def trained_splats(scene: Scene) -> DisplaySplats:
 
 def read_splats(path: Path, table: ClassTable) -> DisplaySplats:
     """What `sc3d export SCENE --format splats` wrote; InputError if the file has no labels."""
-    from sc3d.io.clouds import read_cloud
     from sc3d.splatting.gaussians import Gaussians
 
-    gaussians, comments = Gaussians.load(path)
-    found = read_cloud(path).point
+    arrays, comments = read_splat_ply(path)
+    records, _ = read_records(path)
     origins = [line.split()[2:] for line in comments if line.startswith("sc3d origin ")]
-    if "label" not in found or "confidence" not in found or not origins:
+    if not {"label", "confidence"} <= set(records.dtype.names or ()) or not origins:
         raise InputError(f"{path} has no labels: run `sc3d export SCENE --format splats`")
-    label, confidence = (found[name].numpy().ravel() for name in ("label", "confidence"))
-    return DisplaySplats(gaussians, np.array(origins[0], float), label, confidence, table)
+    label, confidence = (np.ascontiguousarray(records[name]) for name in ("label", "confidence"))
+    return DisplaySplats(Gaussians.from_arrays(arrays), np.array(origins[0], float), label, confidence, table)
 
 
 def labelled_splats(scene: Scene) -> DisplaySplats:
@@ -172,8 +155,8 @@ def best_splats(scene: Scene) -> DisplaySplats:
 
 
 def splats_colored_by(scene: Scene, by: Coloring, classes: tuple[str, ...] = ()) -> DisplaySplats:
-    """The splats that can be colored in some way: gaussians.ply for the photos' colors, else the labelled ones,
-    of which only the named classes. For class colors, those of gaussians.ply do while there are no others.
+    """The splats that can be colored in some way, of the named classes: gaussians.ply for the photos' colors,
+    else the labelled ones. For class colors, gaussians.ply does while there are no others.
     """
     labelled = by == "confidence" or (by == "label" and scene.labelled_splats.exists())
     if labelled or classes:

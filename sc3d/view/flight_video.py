@@ -14,9 +14,9 @@ from tqdm import tqdm
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View, pinhole_view
 from sc3d.io.atomic import atomic_path
+from sc3d.splatting.evaluation import picture
 from sc3d.view.colors import Coloring
 from sc3d.view.display_splats import DisplaySplats
-from sc3d.view.splat_images import rendered
 from sc3d.view.viewpoints import fitted
 
 FRAMES_PER_SECOND = 25
@@ -58,7 +58,7 @@ def write_flight(
     gaussians = splats.gaussians if splats.label is None else splats.painted(by)
     ride = flight_path([view.shifted(splats.origin) for view in views], size)
     frames = (
-        rendered(gaussians, view, WHITE) for view in tqdm(ride, desc="flight", unit="frame", disable=None)
+        picture(gaussians, view, WHITE) for view in tqdm(ride, desc="flight", unit="frame", disable=None)
     )
     write_video(path, frames, (ride[0].width, ride[0].height))
 

@@ -112,7 +112,7 @@ def _tensor_geometries(renderable: Renderable) -> dict:
     tensor = o3d.core.Tensor.from_numpy
     colors = tensor(np.ascontiguousarray(renderable.colors, dtype=np.float32) / np.float32(255))
     points = tensor(np.ascontiguousarray(renderable.points, dtype=np.float32))
-    geometries = {}
+    geometries: dict[str, object] = {}
     if renderable.triangles is not None and len(renderable.triangles):
         mesh = o3d.t.geometry.TriangleMesh(
             points, tensor(np.ascontiguousarray(renderable.triangles, dtype=np.int32))
@@ -205,23 +205,21 @@ def _depth_range(renderable: Renderable, view: View) -> tuple[float, float]:
 def _legacy_geometries(renderable: Renderable) -> list:
     import open3d as o3d
 
-    points, colors = (
-        o3d.utility.Vector3dVector(renderable.points.astype(np.float64)),
-        o3d.utility.Vector3dVector(renderable.colors / 255.0),
-    )
+    points = o3d.utility.Vector3dVector(renderable.points.astype(np.float64))
+    colors = o3d.utility.Vector3dVector(renderable.colors / 255.0)
+    geometries: list = []
     if renderable.triangles is not None:
-        geometry = o3d.geometry.TriangleMesh(
-            points, o3d.utility.Vector3iVector(renderable.triangles.astype(np.int32))
-        )
-        geometry.vertex_colors = colors
+        triangles = o3d.utility.Vector3iVector(renderable.triangles.astype(np.int32))
+        mesh = o3d.geometry.TriangleMesh(points, triangles)
+        mesh.vertex_colors = colors
+        geometries.append(mesh)
     else:
-        geometry = o3d.geometry.PointCloud(points)
-        geometry.colors = colors
-    return [geometry] + (
-        [line_set(renderable.lines, renderable.line_color)]
-        if renderable.lines is not None and len(renderable.lines)
-        else []
-    )
+        cloud = o3d.geometry.PointCloud(points)
+        cloud.colors = colors
+        geometries.append(cloud)
+    if renderable.lines is not None and len(renderable.lines):
+        geometries.append(line_set(renderable.lines, renderable.line_color))
+    return geometries
 
 
 @contextmanager

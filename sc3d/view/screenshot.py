@@ -117,27 +117,27 @@ def screenshot_splats(
     style: what it says of coloring, direction and background
     returns: (H, W, 3) uint8 RGB
     """
-    from sc3d.view.splat_images import compare, rendered
+    from sc3d.splatting.evaluation import compare, picture
 
-    labels = splats.labels if style.by != "photo" else None
-    gaussians = splats.gaussians if labels is None else splats.painted(style.by)
+    label = splats.label if style.by != "photo" else None
+    gaussians = splats.gaussians if label is None else splats.painted(style.by)
     if view is None or photo is None:
         seen = gaussians.means[gaussians.opacities > 0.5].numpy()
         points = without_outliers(seen if len(seen) else gaussians.means.numpy())
-        image = rendered(gaussians, overview(points, size, style.from_above), style.background)
+        image = picture(gaussians, overview(points, size, style.from_above), style.background)
     else:
         source = view.shifted(splats.origin)
         target = fitted(source, half_of(size))
         pixels = resample(photo, source, target)
-        if labels is not None:
-            drawn, caption = rendered(gaussians, target, style.background), f"splats by {style.by}"
+        if label is not None:
+            drawn, caption = picture(gaussians, target, style.background), f"splats by {style.by}"
         else:
             found = compare(gaussians, target, pixels)
             pixels, drawn, caption = found.photo, found.rendered, f"splats, PSNR {found.psnr:.2f} dB"
         image = side_by_side((pixels, drawn), (view.name, caption))
-    if labels is None:
+    if label is None:
         return image
-    return add_legend(image, style.by, labels.table, set(np.unique(labels.label).tolist()))
+    return add_legend(image, style.by, splats.table, set(np.unique(label).tolist()))
 
 
 def draw_points(points: np.ndarray, view: View | None, size: tuple[int, int], style: Style) -> PointImage:

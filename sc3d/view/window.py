@@ -150,7 +150,7 @@ class _PanelWindow:
     def _build_legend(self, by: Coloring) -> Any:
         gui, scale = self._gui, color_scale(by)
         legend = gui.Vert(self._em // 4, gui.Margins(0, self._em // 2, 0, self._em // 2))
-        entries = legend_entries(by, self._display.class_table)
+        entries: list[tuple[str, Any]] = [*legend_entries(by, self._display.class_table)]
         if scale is not None:
             entries = [(scale.high, scale.colors[-1]), (scale.low, scale.colors[0])]
         for name, color in entries:
@@ -260,8 +260,8 @@ def _show_with_keys(
     """Keys 1 to 5 choose the coloring, F1 to F12 show and hide classes, P describes the point in the middle;
     the log is the legend.
 
-    lines: (L, 2, 3) ends of the cameras' lines, in the frame of `display`; hidden: ids of classes that are not
-        shown at the start
+    lines: (L, 2, 3) ends of the cameras' lines, in the frame of `display`; hidden: ids of classes not shown
+        at the start
     Raises Sc3dError if no window can be opened.
     """
     visualizer = o3d.visualization.VisualizerWithKeyCallback()

@@ -81,7 +81,7 @@ def test_laz_of_local_enu_lies_where_proj_says(tmp_path):
 def test_chunks_do_not_show(tmp_path, monkeypatch):
     scene = write_scene(tmp_path, random_cloud(), UTM)
     whole = read(scene)
-    monkeypatch.setattr(laz, "CHUNK", 77)
+    monkeypatch.setattr(laz, "POINTS_AT_ONCE", 77)
     assert (read(scene).points.array == whole.points.array).all()
 
 

@@ -13,10 +13,10 @@ from scipy import ndimage
 from sc3d.errors import InputError
 from sc3d.exporters import objects
 from sc3d.exporters.buildings import join_enclosed, roof_tops, split_buildings
-from sc3d.exporters.polygonize import main_direction, simplified, squared, trace
+from sc3d.exporters.polygonize import main_direction, orthogonalized, polygonize, simplified
 from sc3d.exporters.regions import cells_by_number, connected_cells, renumbered
 from sc3d.exporters.terrain import block_medians, ground_height
-from sc3d.exporters.trees import climb, split_crowns
+from sc3d.exporters.trees import grow_crowns, split_crowns
 from sc3d.geometry.raster import Raster
 from sc3d.settings.outputs import Export
 from sc3d.settings.synthesize import Synthesize
@@ -254,8 +254,8 @@ def test_rectangular_outline_of_a_noisy_l(turn):
     edge = ndimage.binary_dilation(noisy) & ~ndimage.binary_erosion(noisy)
     noisy = np.where(edge & (np.random.default_rng(3).random(GRID.shape) < 0.3), ~noisy, noisy)
     noisy = ndimage.binary_opening(ndimage.binary_closing(noisy))
-    outline = trace(noisy.astype(np.int32), GRID)[1]
-    found = squared(outline, 0.5)
+    outline = polygonize(noisy.astype(np.int32), GRID)[1]
+    found = orthogonalized(outline, 0.5)
     assert len(found.exterior.coords) == 7
     assert found.intersection(true).area > 0.96 * found.union(true).area
     off = (main_direction(found) - turn + np.pi / 4) % (np.pi / 2) - np.pi / 4
@@ -264,8 +264,8 @@ def test_rectangular_outline_of_a_noisy_l(turn):
 
 def test_round_buildings_are_not_squared():
     disk = (np.hypot(*(GRID.centers() - [20, 15]).T) < 8).reshape(GRID.shape)
-    outline = trace(disk.astype(np.int32), GRID)[1]
-    found = squared(outline, 0.5)
+    outline = polygonize(disk.astype(np.int32), GRID)[1]
+    found = orthogonalized(outline, 0.5)
     assert len(found.exterior.coords) > 7 and found.symmetric_difference(outline).area < 0.06 * outline.area
     assert found.equals(simplified(outline, 0.5))
 
@@ -273,9 +273,9 @@ def test_round_buildings_are_not_squared():
 def test_trace_keeps_area_and_holes():
     regions = np.where(box(GRID, 5, 5, 25, 20), 1, 0).astype(np.int32)
     regions[box(GRID, 10, 10, 15, 15)] = 0
-    outline = trace(regions, GRID)[1]
+    outline = polygonize(regions, GRID)[1]
     assert outline.area == pytest.approx(300 - 25) and len(outline.interiors) == 1
-    assert squared(outline, 0.5).area == pytest.approx(275, rel=0.01)
+    assert orthogonalized(outline, 0.5).area == pytest.approx(275, rel=0.01)
 
 
 def canopy_of(trees_: list[tuple[float, float, float, float]]) -> np.ndarray:
@@ -311,13 +311,13 @@ def test_a_lumpy_crown_is_one_tree():
     assert split_crowns(canopy_of(lobes + [(20, 15, 1.6, 8.2)]), GRID, 2.0).max() == 1
 
 
-def test_every_cell_climbs_upwards():
+def test_crowns_fill_the_canopy_around_their_tops():
     rng = np.random.default_rng(6)
     heights = ndimage.gaussian_filter(rng.random((60, 60)), 3) * 40
     tall = heights > np.quantile(heights, 0.3)
-    tops = climb(heights, tall, 0.5)
-    assert (tops > 0).sum() == tall.sum() and (tops[~tall] == 0).all()
-    for number, cells in enumerate(cells_by_number(tops, tops.max()), start=1):
+    crowns = grow_crowns(heights, tall, 0.5)
+    assert (crowns > 0).sum() == tall.sum() and (crowns[~tall] == 0).all()
+    for cells in cells_by_number(crowns, crowns.max()):
         peak = cells[np.argmax(heights.ravel()[cells])]
         around = np.hypot(*(np.argwhere(tall) - np.unravel_index(peak, tall.shape)).T) <= 0.5 * 2.51503 / 0.5
         assert heights[tall][around].max() == heights.ravel()[peak]

@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from sc3d.cli import main
-from sc3d.exporters.splats import append_properties, distance_to_class
+from sc3d.exporters.splats import distance_to_class
 from sc3d.geometry.cameras import local_origin
 from sc3d.io.images import read_image
+from sc3d.io.splats import origin_comment, read_splat_ply, write_splat_ply
 from sc3d.runner import sidecar
 from sc3d.scene.scene import Scene
 from sc3d.splatting.dataset import load_gaussians
@@ -46,7 +47,8 @@ def site() -> Gaussians:
     scales[len(ground) :] = np.log(0.03)
     quats = torch.tensor([1.0, 0, 0, 0]) + 0.02 * torch.randn(count, 4, generator=generator)
     logits = 4 + 0.5 * torch.randn(count, generator=generator)
-    return Gaussians(means, scales, 1.7 * quats, logits, 0.3 * torch.randn(count, 9, 3, generator=generator))
+    sh = 0.3 * torch.randn(count, 9, 3, generator=generator)
+    return Gaussians(means, scales, 1.7 * quats, logits, sh[:, 0].clone(), sh[:, 1:].clone())
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +57,7 @@ def scene(tmp_path_factory):
     run("label", path)
     run("propagate", path)
     origin = local_origin(views())
-    site().save(path / "gaussians.ply", [f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}"])
+    write_splat_ply(path / "gaussians.ply", site().arrays(), [origin_comment(origin)])
     run("export", path, "--format", "splats", "spz")
     return path
 
@@ -114,8 +116,8 @@ def test_open3d_reads_labelled_splats(scene, splats):
     assert cloud["label"].dtype == o3d.core.uint8
     np.testing.assert_array_equal(cloud["confidence"].numpy().ravel(), splats.confidence)
     np.testing.assert_array_equal(cloud["positions"].numpy(), gaussians.means.numpy())
-    np.testing.assert_array_equal(cloud["f_dc"].numpy(), gaussians.sh[:, 0].numpy())
-    np.testing.assert_array_equal(cloud["f_rest"].numpy(), gaussians.sh[:, 1:].numpy())
+    np.testing.assert_array_equal(cloud["f_dc"].numpy(), gaussians.sh_dc.numpy())
+    np.testing.assert_array_equal(cloud["f_rest"].numpy(), gaussians.sh_rest.numpy())
     np.testing.assert_array_equal(cloud["opacity"].numpy().ravel(), gaussians.opacity_logits.numpy())
     np.testing.assert_allclose(cloud["scale"].numpy(), gaussians.scales.numpy(), rtol=1e-6)
     np.testing.assert_array_equal(cloud["rot"].numpy(), gaussians.quats.numpy())
@@ -128,8 +130,8 @@ def test_spz_keeps_what_it_can_hold(scene, splats):
     assert np.abs(np.log(cloud["scale"].numpy()) - gaussians.log_scales.numpy()).max() <= 1 / 32 + 1e-5
     opacity = 1 / (1 + np.exp(-cloud["opacity"].numpy().ravel()))
     assert np.abs(opacity - gaussians.opacities.numpy()).max() <= 1 / 510 + 1e-6
-    assert np.abs(cloud["f_dc"].numpy() - gaussians.sh[:, 0].numpy()).max() <= 1 / (2 * 255 * 0.15) + 1e-5
-    rest = gaussians.sh[:, 1:].numpy().clip(-1, 127 / 128)
+    assert np.abs(cloud["f_dc"].numpy() - gaussians.sh_dc.numpy()).max() <= 1 / (2 * 255 * 0.15) + 1e-5
+    rest = gaussians.sh_rest.numpy().clip(-1, 127 / 128)
     assert (
         np.abs(cloud["f_rest"].numpy() - rest).max() <= 17 / 256 + 1e-6
         and np.abs(cloud["f_rest"].numpy() - rest)[:, :3].max() <= 9 / 256 + 1e-6
@@ -161,7 +163,7 @@ def test_only_the_chosen_classes_and_both_formats_alike(scene, tmp_path, splats)
 def test_the_comment_says_where_the_origin_lies(scene):
     before = (scene / "export" / "splats.ply").read_bytes()
     run("export", scene, "--format", "splats", "--epsg", "32615")
-    comments = Gaussians.load(scene / "export" / "splats.ply")[1]
+    comments = read_splat_ply(scene / "export" / "splats.ply")[1]
     easting, northing, height = local_origin(views())
     assert f"sc3d EPSG:32615 origin {easting:.3f} {northing:.3f} {height:.3f}" in comments
     run("export", scene, "--format", "splats", "--overwrite")
@@ -280,15 +282,15 @@ class TestBadInput:
             written.write_bytes(before)
 
 
-def test_append_properties_matches_columns_written_one_by_one(tmp_path):
+def test_further_properties_are_written_behind_the_known_ones(tmp_path):
     gaussians = site()[torch.arange(7)]
-    gaussians.save(tmp_path / "a.ply", ["a comment", "end_header"])
     values = np.random.default_rng(0).random(7).astype("<f4")
-    append_properties(tmp_path / "a.ply", {"label": np.arange(7, dtype=np.uint8) + 249, "sure": values})
+    extra = {"label": np.arange(7, dtype=np.uint8) + 249, "sure": values}
+    write_splat_ply(tmp_path / "a.ply", gaussians.arrays(), ["a comment", "end_header"], extra)
     cloud = o3d.t.io.read_point_cloud(str(tmp_path / "a.ply")).point
     assert cloud["label"].numpy().ravel().tolist() == [249, 250, 251, 252, 253, 254, 255]
     np.testing.assert_array_equal(cloud["sure"].numpy().ravel(), values)
-    assert Gaussians.load(tmp_path / "a.ply")[1] == ["a comment", "end_header"]
+    assert read_splat_ply(tmp_path / "a.ply")[1] == ["a comment", "end_header"]
 
 
 def test_distance_to_class_equals_brute_force():

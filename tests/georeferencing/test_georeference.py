@@ -139,7 +139,7 @@ class TestCrs:
     def test_wkt_is_read_back_as_the_same_crs(self):
         import pyproj
 
-        assert pyproj.CRS.from_wkt(from_origin(BRIGHTON).wkt).to_epsg() == 32615
+        assert pyproj.CRS.from_wkt(from_origin(BRIGHTON).crs.to_wkt("WKT1_GDAL")).to_epsg() == 32615
 
 
 XMP = '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description {attributes}>{elements}</rdf:Description></rdf:RDF></x:xmpmeta>'

@@ -669,6 +669,7 @@ class TestBadProjects:
             (lambda part: part["cameras"]["v2 dji"].pop("width"), "lacks"),
             (lambda part: part["shots"]["shot_0.jpg"].update(rotation=[1, 2]), "shot_0"),
             (lambda part: part["points"]["100"].pop("coordinates"), "points"),
+            (lambda part: [point.update(color=[9, 9, 9, 9]) for point in part["points"].values()], "points"),
             (lambda part: part.update(reference_lla={"latitude": 1}), "reference_lla"),
         ],
     )

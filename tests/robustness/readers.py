@@ -88,10 +88,11 @@ def _read_splats(folder: Path) -> object:
     import torch
 
     from sc3d.geometry.cameras import look_at, pinhole_view
+    from sc3d.io.splats import read_splat_ply
     from sc3d.splatting.gaussians import Gaussians
     from sc3d.splatting.rendering import render
 
-    gaussians, _ = Gaussians.load(folder / "gaussians.ply")
+    gaussians = Gaussians.from_arrays(read_splat_ply(folder / "gaussians.ply")[0])
     view = pinhole_view("a", (24, 16), (20, 20, 12, 8), look_at(np.array([0.0, 0, 6]), np.zeros(3)))
     with torch.no_grad():
         return render(gaussians, view)
@@ -99,27 +100,16 @@ def _read_splats(folder: Path) -> object:
 
 @cache
 def _trainer():
-    from sc3d.geometry.cameras import look_at, pinhole_view
-    from sc3d.splatting.dataset import TrainingData
-    from sc3d.splatting.trainer import Trainer
-    from tests.splatting.test_trainer import SHORT, trace
-
-    views = [
-        pinhole_view(
-            f"{i}.png",
-            (96, 64),
-            (90, 90, 48, 32),
-            look_at(np.array([4 * np.cos(i), 3 * np.sin(i), 9]), np.zeros(3)),
-        )
-        for i in range(3)
-    ]
-    points = np.random.default_rng(0).uniform(-3, 3, (60, 3)) * [1, 1, 0.1]
     from dataclasses import replace
 
-    return Trainer(
-        TrainingData(views, [trace(view)[0] for view in views], points, np.full((60, 3), 99, np.uint8)),
-        replace(SHORT, fill=False, max_gaussians=60),
-    )
+    from sc3d.splatting.trainer import Trainer
+    from tests.splatting.scenes import photographed, ring, valley
+    from tests.splatting.test_trainer import SHORT
+
+    data, *_ = photographed(ring()[:3], valley(), wave=3.0, noise=0.05, num_points=60)
+    trainer = Trainer(data, replace(SHORT, fill=False, max_gaussians=60))
+    trainer.step()  # before it, the optimizers are empty
+    return trainer
 
 
 def _build_checkpoint(folder: Path) -> None:
@@ -214,7 +204,7 @@ def _read_sidecars(folder: Path) -> object:
 
 
 def _read_weights(folder: Path) -> object:
-    from sc3d.segmentation.weights import find_weights, model_type
+    from sc3d.segmentation.models import find_weights, model_type
 
     return model_type(find_weights("owner/model", folder, download=False))
 
@@ -353,7 +343,7 @@ def _read_project(folder: Path) -> object:
 
 def _build_project(kind: str):
     def build(folder: Path) -> None:
-        import test_imports as made
+        from tests.importers import test_importers as made
 
         views, points = made.fly(), made.probe(20)
         folder.mkdir(parents=True, exist_ok=True)
@@ -396,7 +386,7 @@ def _read_geometries(folder: Path) -> object:
 
 def _build_las(suffix: str):
     def build(folder: Path) -> None:
-        import test_imports as made
+        from tests.importers import test_importers as made
 
         folder.mkdir(parents=True, exist_ok=True)
         made.write_las(folder / f"cloud.{suffix}", made.surveyed(60))

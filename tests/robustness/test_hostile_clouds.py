@@ -13,8 +13,8 @@ from sc3d.errors import InputError
 from sc3d.io import record_walk as kernels
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.las import check_las
+from sc3d.io.splats import read_splat_ply
 from sc3d.scene.labelled_cloud import read_labelled, read_votes
-from sc3d.splatting.gaussians import Gaussians
 from tests.robustness.hostile_files import (
     LITTLE,
     XYZ,
@@ -296,7 +296,7 @@ def test_splats_that_cannot_be_rendered(tmp_path, row, column, value):
     values = np.frombuffer(content[start:], "<f4").reshape(20, -1).copy()
     values[row, column] = value
     (tmp_path / "gaussians.ply").write_bytes(content[:start] + values.tobytes())
-    refused("not finite, or beyond", Gaussians.load, tmp_path / "gaussians.ply")
+    refused("not finite, or beyond", read_splat_ply, tmp_path / "gaussians.ply")
 
 
 # ---- LAS

@@ -309,7 +309,7 @@ def test_half_precision_stays_close(models, monkeypatch, segmenter):
 
     image = np.random.default_rng(5).integers(0, 256, (96, 128, 3)).astype(np.uint8)
     full = GroundedSam(_tiny(models, segmenter), TABLE)
-    monkeypatch.setattr("sc3d.segmentation.grounded_sam.choose_device", lambda settings: "cpu")
+    monkeypatch.setattr("sc3d.segmentation.models.choose_device", lambda settings: "cpu")
     half = GroundedSam(_tiny(models, segmenter, half=True), TABLE)
     seen = []
     half._segmenter.mask_decoder.register_forward_hook(

@@ -23,17 +23,17 @@ from sc3d.runner import execute
 from sc3d.scene.class_table import parse_classes
 from sc3d.scene.scene import Scene
 from sc3d.segmentation.mask_formats import outlines
+from sc3d.segmentation.mask_formats.annotations import paint
 from sc3d.segmentation.mask_formats.coco import decompress
-from sc3d.segmentation.mask_formats.drawing import paint
 from sc3d.segmentation.mask_formats.import_masks import import_masks
 from sc3d.segmentation.mask_formats.outlines import (
     OutlineError,
-    draw,
     ellipse,
-    encode,
     polygons,
+    rasterize,
     rectangle,
-    runs,
+    row_lengths,
+    run_lengths,
 )
 from sc3d.segmentation.mask_formats.source import MaskFiles, detect
 from sc3d.settings.labels import Segment
@@ -136,7 +136,8 @@ def test_pycocotools_agrees():
             code = coco_masks.encode(np.asfortranarray(mask.astype(np.uint8)))
             counts = decompress(code["counts"].decode())
             np.testing.assert_array_equal(
-                _image(runs(counts, (0, 0, width, height), True, (width, height)), (width, height)), mask
+                _image(run_lengths(counts, (0, 0, width, height), True, (width, height)), (width, height)),
+                mask,
             )
     for _ in range(50):  # polygons: the same up to the pixels on the outline
         ring = random.uniform(-5, 80, (int(random.integers(3, 8)), 2))
@@ -170,7 +171,7 @@ def _fill_slowly(ring: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def test_polygons_equal_brute_force(monkeypatch):
-    monkeypatch.setattr(outlines, "CHUNK", 7)
+    monkeypatch.setattr(outlines, "CROSSINGS_AT_ONCE", 7)
     random, size = np.random.default_rng(1), (13, 9)
     for index in range(60):
         ring = random.uniform(-6, 17, (int(random.integers(3, 9)), 2))
@@ -235,13 +236,15 @@ def test_runs_in_boxes_by_row_and_by_column():
         expected = np.zeros((21, 22), bool)
         expected[box[1] : box[1] + box[3], box[0] : box[0] + box[2]] = mask
         for counts, by_column in (
-            (encode(mask), False),
-            (encode(mask.T), True),
-            ([0, 0, *encode(mask)], False),
+            (row_lengths(mask), False),
+            (row_lengths(mask.T), True),
+            ([0, 0, *row_lengths(mask)], False),
         ):
-            np.testing.assert_array_equal(_image(runs(counts, box, by_column, (22, 21)), (22, 21)), expected)
-    patch = draw(
-        runs(encode(np.eye(1000, dtype=bool)[:, 300:310]), (5, 0, 10, 1000), False, (1000, 1000)),
+            np.testing.assert_array_equal(
+                _image(run_lengths(counts, box, by_column, (22, 21)), (22, 21)), expected
+            )
+    patch = rasterize(
+        run_lengths(row_lengths(np.eye(1000, dtype=bool)[:, 300:310]), (5, 0, 10, 1000), False, (1000, 1000)),
         (1000, 1000),
     )
     assert patch.mask.shape == (10, 10) and patch.top == 300  # only the lines that hold pixels
@@ -268,13 +271,13 @@ def test_runs_in_boxes_by_row_and_by_column():
 )
 def test_runs_that_do_not_fit_are_refused(counts, box):
     with pytest.raises(OutlineError):
-        runs(counts, box, True, (10, 10))
+        run_lengths(counts, box, True, (10, 10))
 
 
 @pytest.mark.parametrize("text", ["", "0o", "P", "\x00", "zzzzzzzz1", "é", "oooooooooooooooooooooo0"])
 def test_damaged_compressed_codes_are_refused(text):
     with pytest.raises(OutlineError):
-        runs(decompress(text), (0, 0, 10, 10), True, (10, 10))
+        run_lengths(decompress(text), (0, 0, 10, 10), True, (10, 10))
 
 
 # ---- overlaps

@@ -9,7 +9,7 @@ import pytest
 from scipy import ndimage
 
 from sc3d.scene.class_table import parse_classes
-from sc3d.segmentation.instances import Instance, write_instances
+from sc3d.segmentation.instances import write_instances
 from sc3d.segmentation.rle import (
     Window,
     area,
@@ -23,6 +23,7 @@ from sc3d.segmentation.rle import (
     join_runs,
     move_runs,
 )
+from tests.builders import instance_of
 
 
 def _random_masks(number: int):
@@ -97,7 +98,7 @@ def test_instance_file_is_coco(tmp_path):
         [{"id": 2, "name": "road", "color": [0, 0, 0]}, {"id": 9, "name": "tree", "color": [0, 0, 0]}], "test"
     )
     instances = tuple(
-        Instance.from_mask(mask, class_id, 0.5, 0.25, "big tree")
+        instance_of(mask, class_id, 0.5, 0.25, "big tree")
         for mask, class_id in zip(masks, (9, 2, 9), strict=True)
     )
     write_instances(tmp_path / "a.json", "a.jpg", (40, 60), instances, table)

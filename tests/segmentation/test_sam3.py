@@ -14,7 +14,7 @@ import pytest
 
 from sc3d.errors import InputError
 from sc3d.scene.class_table import parse_classes
-from sc3d.segmentation.merge import Areas, merge_instances
+from sc3d.segmentation.instances import Areas, merge_instances
 from sc3d.segmentation.rle import find_runs
 from sc3d.segmentation.sam3 import Sam3, _paint_concept
 from sc3d.settings.labels import Segment
@@ -159,7 +159,7 @@ def test_half_precision_stays_close(models, monkeypatch):
 
     with pytest.raises(InputError, match="half precision is for CUDA GPUs"):
         _backend(models, half=True)
-    monkeypatch.setattr("sc3d.segmentation.sam3.choose_device", lambda settings: "cpu")
+    monkeypatch.setattr("sc3d.segmentation.models.choose_device", lambda settings: "cpu")
     half, full, seen = _backend(models, half=True), _backend(models), []
     half._model.mask_decoder.register_forward_hook(
         lambda module, inputs, output: seen.append(output.pred_masks.dtype)

@@ -15,16 +15,15 @@ from sc3d.errors import InputError, MissingPackageError
 from sc3d.io.images import read_index_image, write_image
 from sc3d.scene.class_table import parse_classes
 from sc3d.segmentation.grounded_sam import GroundedSam
-from sc3d.segmentation.instances import Instance
+from sc3d.segmentation.instances import Areas, Instance, fill_gaps, merge_instances, paint_areas
 from sc3d.segmentation.mask_formats.import_masks import import_masks
-from sc3d.segmentation.merge import Areas, fill_gaps, merge_instances, paint, paint_areas
-from sc3d.segmentation.models import check_settings
+from sc3d.segmentation.models import check_settings, find_weights
 from sc3d.segmentation.rle import Window
 from sc3d.segmentation.sam3 import Sam3
 from sc3d.segmentation.segment import Folders, Segmentation, segment_photos
 from sc3d.segmentation.text_prompts import Caption, Prompt, build_captions, list_prompts, match_prompts
-from sc3d.segmentation.weights import find_weights
 from sc3d.settings.labels import Segment
+from tests.builders import instance_of
 
 TABLE = parse_classes(
     [
@@ -73,9 +72,7 @@ def test_merge_equals_reference_in_any_order():
         found = [
             (
                 mask,
-                Instance.from_mask(
-                    mask, int(random.integers(1, 256)), *random.choice([0.0, 0.25, 0.5, 1.0], 2)
-                ),
+                instance_of(mask, int(random.integers(1, 256)), *random.choice([0.0, 0.25, 0.5, 1.0], 2)),
             )
             for mask in masks
         ]
@@ -90,9 +87,9 @@ def test_merge_ties_by_area_then_class():
     whole, half = np.ones((2, 4), bool), np.zeros((2, 4), bool)
     half[:, :2] = True
     instances = [
-        Instance.from_mask(whole, 1, 0.5, 0.8),
-        Instance.from_mask(half, 9, 0.8, 0.5),
-        Instance.from_mask(half, 4, 0.5, 0.8),
+        instance_of(whole, 1, 0.5, 0.8),
+        instance_of(half, 9, 0.8, 0.5),
+        instance_of(half, 4, 0.5, 0.8),
     ]
     label, confidence = merge_instances(instances, (2, 4))
     assert label.tolist() == [[4, 4, 1, 1]] * 2
@@ -102,14 +99,14 @@ def test_merge_ties_by_area_then_class():
 def test_merge_ignores_worthless_and_marks_faint_instances():
     mask = np.ones((1, 2), bool)
     label, confidence = merge_instances(
-        [Instance.from_mask(mask, 3, 0.9, float("nan")), Instance.from_mask(mask, 3, 0.9, -0.1)], (1, 2)
+        [instance_of(mask, 3, 0.9, float("nan")), instance_of(mask, 3, 0.9, -0.1)], (1, 2)
     )
     assert not label.any() and not confidence.any()
-    label, confidence = merge_instances([Instance.from_mask(mask, 3, 0.01, 0.01)], (1, 2))
+    label, confidence = merge_instances([instance_of(mask, 3, 0.01, 0.01)], (1, 2))
     assert (label == 3).all() and (confidence == 1).all()
-    assert merge_instances([Instance.from_mask(mask, 3, 1.0, 1.03)], (1, 2))[1].max() == 255
+    assert merge_instances([instance_of(mask, 3, 1.0, 1.03)], (1, 2))[1].max() == 255
     with pytest.raises(InputError, match="photo"):
-        merge_instances([Instance.from_mask(mask, 3, 1.0, 1.0)], (2, 1))
+        merge_instances([instance_of(mask, 3, 1.0, 1.0)], (2, 1))
 
 
 def test_areas_equal_reference_and_fill_only_gaps():
@@ -145,11 +142,12 @@ def test_areas_equal_reference_and_fill_only_gaps():
             if said:
                 expected[:, row, column] = min(said)[1], -min(said)[0]
         areas = Areas(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8))
-        steps = [lambda value=value: paint(areas, *value, Window(0, 0, 9, 7)) for value in maps] + [
-            lambda: paint_areas(areas, part, window)
+        looks = [
+            (Areas(np.full_like(values, class_id), values), Window(0, 0, 9, 7)) for class_id, values in maps
         ]
-        for number in random.permutation(len(steps)):
-            steps[number]()
+        looks.append((part, window))
+        for number in random.permutation(len(looks)):
+            paint_areas(areas, *looks[number])
         np.testing.assert_array_equal(areas, expected)
         labels = np.where(random.random(shape) < 0.5, 9, 0).astype(np.uint8)
         filled, confidence = labels.copy(), labels * 3
@@ -366,7 +364,7 @@ class _Halves:
         return Segmentation(
             label,
             label * 100,
-            (Instance.from_mask(label > 0, 2, 0.8, 0.5, "road"),) if self.instances else None,
+            (instance_of(label > 0, 2, 0.8, 0.5, "road"),) if self.instances else None,
         )
 
 

@@ -9,11 +9,11 @@ from PIL import Image
 
 from sc3d.cli import main
 from sc3d.scene.class_table import parse_classes
-from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, deal, pick
+from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, assign_folds, sample_pixels
 from sc3d.segmentation.strokes.features import pixel_features
 from sc3d.segmentation.strokes.files import NOTHING, PhotoStrokes, StrokeShape, parse_shapes, read_strokes
 from sc3d.segmentation.strokes.guided_filter import fit_lines
-from sc3d.segmentation.strokes.novelty import learn_novelty
+from sc3d.segmentation.strokes.novelty import fit_novelty
 from sc3d.segmentation.strokes.pixel_classifier import best_temperature
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -110,7 +110,7 @@ def test_command_labels_photos_without_strokes(scene):
 
 def test_same_seed_same_masks(scene):
     first, second, other = (
-        Strokes.learn(scene / "strokes", scene / "images", TABLE, settings).segment(photo(5))
+        Strokes.fit(scene / "strokes", scene / "images", TABLE, settings).segment(photo(5))
         for settings in (QUICK, QUICK, StrokesSettings(members=2, trees=10, steps=120, seed=1))
     )
     assert np.array_equal(first.labels, second.labels) and np.array_equal(first.confidence, second.confidence)
@@ -120,7 +120,7 @@ def test_same_seed_same_masks(scene):
 def test_what_no_stroke_shows_stays_unlabelled_and_background_too(scene):
     label = truth()
     label[100:, :80] = 9  # a red thing
-    learned = Strokes.learn(scene / "strokes", scene / "images", TABLE, QUICK)
+    learned = Strokes.fit(scene / "strokes", scene / "images", TABLE, QUICK)
     found = learned.segment(photo(3, label)).labels
     assert (found[115:, 5:65] == 0).mean() > 0.95 and (found[20:80, 5:65] == 1).mean() > 0.95
     Image.fromarray(photo(1, label)).save(scene / "images" / "b.png")
@@ -129,14 +129,14 @@ def test_what_no_stroke_shows_stays_unlabelled_and_background_too(scene):
         shape("_background_", [[10, 145], [60, 145]], width=10),
     ]
     (scene / "strokes" / "b.json").write_text(json.dumps(labelme(red, imagePath="b.png")))
-    learned = Strokes.learn(scene / "strokes", scene / "images", TABLE, QUICK)
+    learned = Strokes.fit(scene / "strokes", scene / "images", TABLE, QUICK)
     found = learned.segment(photo(3, label))
     assert (found.labels[110:, 5:70] == 0).mean() > 0.98 and found.confidence[found.labels == 0].max() == 0
 
 
 def test_large_photos_are_looked_at_small_but_cut_finely(scene):
     settings = StrokesSettings(members=2, trees=10, steps=120, max_size=240)
-    learned = Strokes.learn(scene / "strokes", scene / "images", TABLE, settings)
+    learned = Strokes.fit(scene / "strokes", scene / "images", TABLE, settings)
     large = cv2.resize(photo(2), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
     label = learned.segment(large).labels
     assert label.shape == (640, 960)
@@ -310,7 +310,7 @@ def test_strokes_are_dealt_out_whole_and_evenly():
     sizes = random.integers(1, 60, 40)
     strokes = np.repeat(np.arange(40), sizes)
     codes = (strokes % 4 == 0).astype(int) + 2 * (strokes == 39)
-    folds = deal(strokes, codes, 3)
+    folds = assign_folds(strokes, codes, 3)
     assert all(len(np.unique(folds[strokes == name])) == 1 for name in range(40))
     assert (folds[strokes == 39] == -1).all()  # the only one of its class
     for code in (0, 1):
@@ -322,7 +322,7 @@ def test_pixels_are_picked_by_size_but_small_strokes_are_kept():
     strokes = np.repeat([1, 2, 3], [100_000, 10_000, 50])
     wanted = np.ones(len(strokes), bool)
     wanted[:1000] = False
-    places = pick(strokes, wanted, 5000, np.random.default_rng(0))
+    places = sample_pixels(strokes, wanted, 5000, np.random.default_rng(0))
     assert (np.diff(places) > 0).all() and places.min() >= 1000
     assert np.bincount(strokes[places]).tolist() == [0, 4539, 458, 50]
 
@@ -343,7 +343,7 @@ def test_temperature_is_recovered():
 def test_distance_decides_what_is_novel():
     random = np.random.default_rng(0)
     features = random.normal(0, 1, (3000, 12)).astype(np.float32)
-    novelty = learn_novelty(features, np.arange(3000) % 3)
+    novelty = fit_novelty(features, np.arange(3000) % 3)
     pixels = (
         np.repeat(random.normal(0, 1, (20, 12)), 16, axis=0)
         .reshape(20, 16, 12)
@@ -352,4 +352,4 @@ def test_distance_decides_what_is_novel():
     )
     far = pixels + 12
     assert novelty.share(pixels).mean() < 0.05 and novelty.share(far).min() > 0.99
-    assert learn_novelty(features, np.full(3000, -1)) is None
+    assert fit_novelty(features, np.full(3000, -1)) is None

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from sc3d.segmentation.instances import Instance, drop_duplicates
-from sc3d.segmentation.merge import Areas
+from sc3d.segmentation.instances import Areas, Instance, drop_duplicates
 from sc3d.segmentation.rle import Window, fill_runs, find_runs, iou, join_runs
 from sc3d.segmentation.tiled_inference import (
     Findings,
@@ -19,6 +18,7 @@ from sc3d.segmentation.tiled_inference import (
     list_tiles,
     segment_tiled,
 )
+from tests.builders import instance_of
 
 
 def _unpack(instance: Instance) -> np.ndarray:
@@ -94,9 +94,7 @@ class _Oracle:
         objects = image[..., 0] + 256 * image[..., 1].astype(np.int32)
         numbers = [] if image.shape[:2] == self.blind else np.unique(objects[objects > 0])
         found = [
-            Instance.from_mask(
-                objects == number, int(self.classes[number]), self.scores[number], 0.7, f"{number}"
-            )
+            instance_of(objects == number, int(self.classes[number]), self.scores[number], 0.7, f"{number}")
             for number in numbers
         ]
         objects = np.where(np.isin(objects, numbers), objects, 0)
@@ -211,7 +209,7 @@ def _box(
 ) -> Instance:
     mask = np.zeros(size, bool)
     mask[window[1] : window[3], window[0] : window[2]] = True
-    return Instance.from_mask(mask, class_id, score, 1.0)
+    return instance_of(mask, class_id, score, 1.0)
 
 
 TWO = [Window(0, 0, 100, 100), Window(80, 0, 180, 100)]

@@ -46,43 +46,43 @@ def _save_sam3(folder: Path) -> None:
     import torch
     from transformers import Sam3Config, Sam3Model, Sam3VideoConfig, Sam3VideoModel
 
-    size = dict(hidden_size=32, num_layers=1, num_attention_heads=2, intermediate_size=32)
-    vision = dict(
-        backbone_config=dict(
-            model_type="sam3_vit_model",
-            hidden_size=32,
-            intermediate_size=32,
-            num_hidden_layers=2,
-            num_attention_heads=2,
-            image_size=SIDE,
-            patch_size=14,
-            window_size=4,
-            global_attn_indexes=[1],
-            pretrain_image_size=56,
-        ),
-        fpn_hidden_size=32,
-        backbone_feature_sizes=[[32, 32], [16, 16], [8, 8]],
-    )
-    detector = dict(
-        vision_config=vision,
-        geometry_encoder_config=size,
-        detr_encoder_config=size,
-        detr_decoder_config=size | dict(num_layers=2, num_queries=12),
-        mask_decoder_config=dict(hidden_size=32, num_attention_heads=2),
-        text_config=dict(
-            model_type="clip_text_model",
-            vocab_size=600,
-            hidden_size=32,
-            intermediate_size=32,
-            projection_dim=16,
-            num_hidden_layers=1,
-            num_attention_heads=2,
-            max_position_embeddings=32,
-            bos_token_id=512,
-            eos_token_id=513,
-            pad_token_id=513,
-        ),
-    )
+    size = {"hidden_size": 32, "num_layers": 1, "num_attention_heads": 2, "intermediate_size": 32}
+    vision = {
+        "backbone_config": {
+            "model_type": "sam3_vit_model",
+            "hidden_size": 32,
+            "intermediate_size": 32,
+            "num_hidden_layers": 2,
+            "num_attention_heads": 2,
+            "image_size": SIDE,
+            "patch_size": 14,
+            "window_size": 4,
+            "global_attn_indexes": [1],
+            "pretrain_image_size": 56,
+        },
+        "fpn_hidden_size": 32,
+        "backbone_feature_sizes": [[32, 32], [16, 16], [8, 8]],
+    }
+    detector = {
+        "vision_config": vision,
+        "geometry_encoder_config": size,
+        "detr_encoder_config": size,
+        "detr_decoder_config": size | {"num_layers": 2, "num_queries": 12},
+        "mask_decoder_config": {"hidden_size": 32, "num_attention_heads": 2},
+        "text_config": {
+            "model_type": "clip_text_model",
+            "vocab_size": 600,
+            "hidden_size": 32,
+            "intermediate_size": 32,
+            "projection_dim": 16,
+            "num_hidden_layers": 1,
+            "num_attention_heads": 2,
+            "max_position_embeddings": 32,
+            "bos_token_id": 512,
+            "eos_token_id": 513,
+            "pad_token_id": 513,
+        },
+    }
     model = Sam3Model(Sam3Config(**detector))
     # spread the random outputs, so that some masks, scores and areas pass the thresholds and others do not
     with torch.no_grad():
@@ -94,23 +94,28 @@ def _save_sam3(folder: Path) -> None:
             for key, values in model.named_parameters():
                 if key.startswith(name):
                     values *= scale
-    tracker = dict(
-        model_type="sam3_tracker_video",
-        vision_config=dict(model_type="sam3_vision_model") | vision,
-        prompt_encoder_config=dict(hidden_size=32, image_size=SIDE, mask_input_channels=4),
-        mask_decoder_config=dict(hidden_size=32, mlp_dim=32, num_attention_heads=2, iou_head_hidden_dim=32),
-        memory_attention_hidden_size=32,
-        memory_attention_num_layers=1,
-        memory_attention_feed_forward_hidden_size=32,
-        memory_encoder_hidden_size=32,
-        memory_encoder_output_channels=8,
-        mask_downsampler_embed_dim=32,
-        memory_fuser_embed_dim=32,
-        memory_fuser_intermediate_dim=32,
-        memory_attention_rope_feat_sizes=[8, 8],
-    )
+    tracker = {
+        "model_type": "sam3_tracker_video",
+        "vision_config": {"model_type": "sam3_vision_model"} | vision,
+        "prompt_encoder_config": {"hidden_size": 32, "image_size": SIDE, "mask_input_channels": 4},
+        "mask_decoder_config": {
+            "hidden_size": 32,
+            "mlp_dim": 32,
+            "num_attention_heads": 2,
+            "iou_head_hidden_dim": 32,
+        },
+        "memory_attention_hidden_size": 32,
+        "memory_attention_num_layers": 1,
+        "memory_attention_feed_forward_hidden_size": 32,
+        "memory_encoder_hidden_size": 32,
+        "memory_encoder_output_channels": 8,
+        "mask_downsampler_embed_dim": 32,
+        "memory_fuser_embed_dim": 32,
+        "memory_fuser_intermediate_dim": 32,
+        "memory_attention_rope_feat_sizes": [8, 8],
+    }
     video = Sam3VideoModel(
-        Sam3VideoConfig(detector_config=dict(model_type="sam3") | detector, tracker_config=tracker)
+        Sam3VideoConfig(detector_config={"model_type": "sam3"} | detector, tracker_config=tracker)
     )
     video.detector_model.load_state_dict(model.state_dict())
     tokenizer = _clip_tokenizer(["building", "house", "roof", "road", "tree", "parking", "lot"])

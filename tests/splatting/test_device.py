@@ -1,4 +1,4 @@
-"""Training on another device, without one: every tensor of a step is where it should be."""
+"""Which device is picked; training on another one, without one: every tensor is where it should be."""
 
 from dataclasses import replace
 
@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from sc3d.errors import InputError, MissingPackageError
 from sc3d.settings.train import TrainSettings
-from sc3d.splatting import gsplat_backend, trainer
-from sc3d.splatting.train import train
+from sc3d.splatting import device, trainer
+from sc3d.splatting.gpu import gsplat_backend
+from sc3d.splatting.trainer import train
 from tests.pretend_device import PretendDevice
-from tests.splatting.test_analytic import photographed, ring, valley
-from tests.splatting.test_gsplat_backend import functions, reference  # noqa: F401, fixtures
+from tests.splatting.gpu.test_gsplat_backend import functions, reference  # noqa: F401, fixtures
+from tests.splatting.scenes import photographed, ring, valley
 
 
 def test_the_pretended_device_refuses_to_mix():
@@ -57,3 +59,19 @@ def test_training_stays_on_its_device(functions, monkeypatch):  # noqa: F811
         result = train(data, settings, progress=False)
     assert result.gaussians.means.device.type == "cpu" and len(result.gaussians) > 400
     assert np.isfinite(result.metrics["psnr"]) and np.isfinite(result.exposures).all()
+
+
+def test_device_is_picked_by_what_is_there(monkeypatch):
+    precision = torch.backends.cudnn.allow_tf32
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert device.pick_device("cpu").type == device.pick_device("auto").type == "cpu"
+    with pytest.raises(InputError, match="no CUDA device"):
+        device.pick_device("cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: None)
+    assert device.pick_device("auto").type == "cpu"
+    with pytest.raises(MissingPackageError, match="gsplat"):
+        device.pick_device("cuda")
+    monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: name)
+    assert device.pick_device("auto").type == device.pick_device("cuda").type == "cuda"
+    torch.backends.cudnn.allow_tf32 = precision

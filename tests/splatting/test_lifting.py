@@ -10,7 +10,7 @@ import torch
 
 from sc3d.geometry.cameras import View, look_at, pinhole_view
 from sc3d.splatting.gaussians import SH_C0, Gaussians
-from sc3d.splatting.lifting import class_images, evidence_by_gradient, lift, painted, winners
+from sc3d.splatting.lifting import evidence_by_gradient, lift, winners
 from sc3d.splatting.rendering import render
 from tests.reference.splatting import render_reference
 from tests.splatting.test_rendering import make_gaussians, make_view
@@ -47,7 +47,7 @@ def plates(depths, scale=300.0):
     means = torch.tensor([[0.0, 0.0, depth] for depth in depths])
     scales = torch.tensor([scale, scale, 1e-3]).log().repeat(count, 1)
     quats = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1)
-    return Gaussians(means, scales, quats, torch.full((count,), 30.0), torch.zeros(count, 1, 3))
+    return Gaussians(means, scales, quats, torch.full((count,), 30.0), torch.zeros(count, 3))
 
 
 def test_equals_the_gradient_of_the_renderer():
@@ -67,14 +67,12 @@ def test_equals_a_dense_float64_twin():
     gaussians, view = make_gaussians(60), make_view()
     mask, sure = patches(view)
     found = lift(gaussians, [view], lambda _: (mask, sure), NUM_IDS)
-    parts = [tensor.double() for tensor in painted(gaussians, np.full((60, 3), 0.5)).parameters().values()]
+    parts = [tensor.double() for tensor in gaussians.painted(np.full((60, 3), 0.5)).parameters().values()]
     for label in range(1, NUM_IDS):
         colors = parts[4].clone().requires_grad_()
         image = render_reference(Gaussians(*parts[:4], colors), view)[0][..., 0]
         (image * torch.from_numpy((mask == label) * sure / 255.0)).sum().backward()
-        np.testing.assert_allclose(
-            found[:, label], colors.grad[:, 0, 0].numpy() / SH_C0, rtol=1e-4, atol=1e-4
-        )
+        np.testing.assert_allclose(found[:, label], colors.grad[:, 0].numpy() / SH_C0, rtol=1e-4, atol=1e-4)
 
 
 def test_all_evidence_of_a_class_is_the_alpha_of_its_pixels():
@@ -149,16 +147,6 @@ def test_winner_is_the_largest_share_and_the_first_of_equals():
     label, confidence = winners(np.array([[0, 1, 3.0, 0], [0, 2, 2, 0], [0, 0, 0, 5]]))
     assert label.tolist() == [2, 1, 3]
     np.testing.assert_allclose(confidence, [0.75, 0.5, 1])
-
-
-def test_class_images_are_alpha_weighted():
-    gaussians, view = make_gaussians(200, size=-1.0), make_view()
-    label = np.random.default_rng(0).integers(0, 5, 200)
-    images = class_images(gaussians, view, np.eye(5)[label][:, 1:])
-    rest = class_images(gaussians, view, np.eye(5)[label][:, :1])[..., 0]
-    alpha = render(gaussians, view, geometry=False).alpha.numpy()
-    assert images.shape == (37, 45, 4) and rest.max() > 0.1
-    np.testing.assert_allclose(images.sum(axis=2) + rest, alpha, atol=1e-5)
 
 
 def test_distortion_and_sizes_are_refused():

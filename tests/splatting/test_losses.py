@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from sc3d.geometry.cameras import look_at, pinhole_view, pixel_centers, rays
-from sc3d.geometry.view_selection import nearest_views, neighbor_views
-from sc3d.splatting import losses
-from sc3d.splatting.consistency import consistent, pinhole, pixel_rays, reprojection_error
-from sc3d.splatting.cpu.normal_loss import depth_normal_loss
+from sc3d.splatting import device, losses
+from sc3d.splatting.consistency import pinhole
+from sc3d.splatting.cpu import normal_loss
+from sc3d.splatting.gpu import losses as gpu_losses
 
 SIZE, CALIBRATION = (96, 64), (90.0, 85.0, 50.0, 30.0)
 PLANE = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
@@ -49,64 +49,9 @@ def plane_maps(view) -> tuple[torch.Tensor, torch.Tensor]:
     return alpha[..., None] * torch.from_numpy(normal).float(), alpha * float(view.center @ PLANE)
 
 
-def test_rays_are_those_of_the_camera_module():
-    view = camera(2, 1)
-    points = (pixel_rays(view) * plane_depth(view)[..., None]).reshape(-1, 3).double().numpy()
-    world = (points - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
-    assert np.abs(world @ PLANE).max() < 1e-4
-
-
-def test_plane_has_no_geometric_error():
-    view, other = camera(2, 1), camera(-1, 2, 12, (80, 70), (100.0, 99.0, 41.0, 33.0))
-    depth, other_depth = plane_depth(view), plane_depth(other)
-    points_cam = (pixel_rays(view) * depth[..., None]).reshape(-1, 3)
-    error, valid = reprojection_error(points_cam, view, other_depth, other)
-    assert valid.float().mean() > 0.5
-    assert error[valid].max() < 2e-3
-    assert losses.geometric_loss(error, valid) < 1e-3
-
-
-def test_wrong_depth_has_the_epipolar_error_and_useful_gradients():
-    view, other = camera(2, 1), camera(-1, 2)
-    depth = (plane_depth(view) * 1.01).requires_grad_()
-    error, valid = reprojection_error(
-        (pixel_rays(view) * depth[..., None]).reshape(-1, 3), view, plane_depth(other), other
-    )
-    assert 0.05 < error[valid].median() < 1
-    losses.geometric_loss(error, valid).backward()
-    assert torch.isfinite(depth.grad).all()
-    assert (depth.grad[depth.grad != 0] > 0).float().mean() > 0.95  # all depths are too large
-
-
-def test_depth_that_is_missing_is_not_compared():
-    view, other = camera(2, 1), camera(-1, 2)
-    other_depth = plane_depth(other)
-    other_depth[:, :40] = 0
-    depth = plane_depth(view)
-    points_cam = (pixel_rays(view) * depth[..., None]).reshape(-1, 3)
-    _, all_valid = reprojection_error(points_cam, view, plane_depth(other), other)
-    error, valid = reprojection_error(points_cam, view, other_depth, other)
-    assert 0.1 < valid.sum() / all_valid.sum() < 0.9
-    assert error[valid].max() < 2e-3
-    behind = pixel_rays(view).reshape(-1, 3) * -5.0
-    assert not reprojection_error(behind, view, other_depth, camera(3, 0))[1].any()
-
-
-def test_consistency_counts_views():
-    view, others = camera(2, 1), [camera(-1, 2), camera(0, -1), camera(1, 3)]
-    depth = plane_depth(view)
-    depth[:5] = 0
-    depth[30:40] *= 1.08
-    maps = [(plane_depth(other), other) for other in others]
-    maps[2] = (maps[2][0] * 0.9, others[2])
-    count = consistent(depth, view, maps)
-    assert (count[:5] == 0).all() and (count[30:40] == 0).all()
-    assert (count[15:25, 30:60] == 2).all() and count.max() == 2
-
-
 def test_normals_from_depth_are_exact_on_a_tilted_plane():
     view = camera(2, 1)
-    normals = losses.normals_from_depth(plane_depth(view).requires_grad_(), view).detach()
+    normals = gpu_losses.normals_from_depth(plane_depth(view).requires_grad_(), pinhole(view)).detach()
     expected = torch.from_numpy(view.cam_from_world[:3, :3] @ PLANE).float()
     assert expected[2] < 0  # towards the camera
     assert (normals[1:-1, 1:-1] - expected).abs().max() < 1e-3
@@ -117,11 +62,12 @@ def test_normal_loss_is_zero_on_a_plane_and_positive_off_it():
     view = camera(2, 1)
     normal, distance = plane_maps(view)
     alpha, edges = normal.norm(dim=2), torch.zeros(view.height, view.width)
-    depth_normals = losses.normals_from_depth(plane_depth(view), view)
-    assert losses.normal_loss(normal, depth_normals, alpha, edges) < 1e-3
+    depth, calibration = plane_depth(view), pinhole(view)
     tilted = normal @ torch.from_numpy(look_at(np.zeros(3), np.array([0.1, 1.0, 0.2]))[:3, :3]).float()
-    assert losses.normal_loss(tilted, depth_normals, alpha, edges) > 0.1
-    assert losses.normal_loss(tilted, depth_normals, alpha, edges + 1) == 0
+    for loss in (normal_loss.depth_normal_loss, gpu_losses.depth_normal_loss):
+        assert loss(normal, depth, alpha, edges, calibration) < 1e-3
+        assert loss(tilted, depth, alpha, edges, calibration) > 0.1
+        assert loss(tilted, depth, alpha, edges + 1, calibration) == 0
 
 
 def test_normal_kernel_equals_its_reference():
@@ -135,13 +81,9 @@ def test_normal_kernel_equals_its_reference():
         torch.rand(view.height, view.width, generator=generator),
     )
     results = []
-    for fused in (True, False):
+    for kernels in (normal_loss, gpu_losses):
         depth, normals = start.clone().requires_grad_(), normal.clone().requires_grad_()
-        loss = (
-            depth_normal_loss(normals, depth, alpha, edges, pinhole(view))
-            if fused
-            else losses.normal_loss(normals, losses.normals_from_depth(depth, view), alpha, edges)
-        )
+        loss = kernels.depth_normal_loss(normals, depth, alpha, edges, pinhole(view))
         (3 * loss).backward()
         results.append((loss.detach(), depth.grad, normals.grad))
     for one, other in zip(*results, strict=True):
@@ -167,18 +109,19 @@ def test_warped_plane_correlates():
     )
 
 
-def test_patch_kernel_equals_its_reference():
+def test_patch_kernel_equals_its_reference(monkeypatch):
     view, other = camera(2, 1), camera(-1, 2, 11, (80, 70), (100.0, 99.0, 41.0, 33.0))
     normal, distance = plane_maps(view)
     pixels = torch.from_numpy(pixel_centers(*SIZE).astype(np.int64))
     grays = (plane_photo(view), view), (plane_photo(other), other)
     results = []
-    for function in (losses.patch_dissimilarity, losses.patch_dissimilarity_reference):
+    for there in (False, True):
+        monkeypatch.setattr(device, "has_kernels", lambda tensor, there=there: not there)
         planes = (
             (normal * torch.tensor([1.0, 1.1, 0.98])).reshape(-1, 3).requires_grad_(),
             (distance * 1.02).reshape(-1).requires_grad_(),
         )
-        values, inside = function(planes, pixels, *grays)
+        values, inside = losses.patch_dissimilarity(planes, pixels, *grays)
         (values * inside * torch.linspace(0, 1, len(values))).sum().backward()
         results.append((values.detach() * inside, inside, planes[0].grad, planes[1].grad))
     ours, reference = results
@@ -205,7 +148,7 @@ def test_photometric_gradient_leads_to_the_plane():
 
 def test_flat_patches_do_not_correlate_and_do_not_explode():
     flat = torch.full((5, 49), 0.4, requires_grad=True)
-    correlation = losses.normalized_correlation(flat, torch.rand(5, 49))
+    correlation = gpu_losses.normalized_correlation(flat, torch.rand(5, 49))
     correlation.sum().backward()
     assert correlation.abs().max() < 1e-3 and torch.isfinite(flat.grad).all()
 
@@ -232,22 +175,3 @@ def test_image_edges_are_relative():
     image[:, 6:] = 0.3
     edges = losses.image_edges(image)
     assert edges.max() == 1 and not edges[:, :5].any() and not edges[:, 7:].any()
-
-
-def test_neighbors_share_points_at_a_good_angle():
-    points = np.random.default_rng(0).uniform(-5, 5, (200, 3)) * [1, 1, 0]
-    centers = np.array([[0, 0, 20], [0.2, 0, 20], [4, 0, 20], [-4, 0, 20], [0, 30, 5], [6, 0, 20]], float)
-    everything = np.arange(200)
-    tracks = [everything, everything, everything[:150], everything[:100], everything[:120], np.zeros(0, int)]
-    found = neighbor_views(tracks, points, centers, count=2)
-    assert found[0].tolist() == [2, 3]  # 1 is too close, 4 too oblique, 5 shares nothing
-    assert found[5].tolist()[0] == 2  # without tracks: the nearest
-    assert [len(others) for others in neighbor_views(None, points, centers, count=3)] == [3] * 6
-
-
-def test_nearest_views_do_not_depend_on_units():
-    centers = np.random.default_rng(1).uniform(0, 10, (20, 3))
-    for one, other in zip(nearest_views(centers), nearest_views(centers * 1000 + 5e5), strict=True):
-        assert one.tolist() == other.tolist()
-    assert nearest_views(np.zeros((1, 3)))[0].size == 0
-    assert nearest_views(np.eye(3)[:2])[0].tolist() == [1]

@@ -13,20 +13,18 @@ from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.rendering import render, unbiased_depth
 from tests.reference.splatting import render_reference, rotation_matrices
 
-NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh")
+NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
 BACKGROUND = torch.tensor([0.2, 0.5, 0.7])
 
 
 def make_gaussians(count=150, coefficients=16, seed=0, size=-1.8):
     generator = torch.Generator().manual_seed(seed)
     spread = torch.tensor([2.0, 1.5, 1.0])
-    return Gaussians(
-        torch.randn(count, 3, generator=generator) * spread,
-        torch.randn(count, 3, generator=generator) * 0.6 + size,
-        torch.randn(count, 4, generator=generator),
-        torch.randn(count, generator=generator) * 2,
-        torch.randn(count, coefficients, 3, generator=generator) * 0.3,
-    )
+    means = torch.randn(count, 3, generator=generator) * spread
+    log_scales = torch.randn(count, 3, generator=generator) * 0.6 + size
+    quats, logits = torch.randn(count, 4, generator=generator), torch.randn(count, generator=generator) * 2
+    sh = torch.randn(count, coefficients, 3, generator=generator) * 0.3
+    return Gaussians(means, log_scales, quats, logits, sh[:, 0].clone(), sh[:, 1:].clone())
 
 
 def make_view(width=45, height=37, calibration=(40.0, 42.0, 27.3, 15.1)):
@@ -145,7 +143,7 @@ def test_tilted_wall_has_exact_depth():
         torch.log(torch.tensor([[0.8, 0.8, 1e-4]])).repeat(count, 1),
         quat_of(rotation.T @ axes).repeat(count, 1),
         torch.full((count,), 2.0),
-        torch.zeros(count, 1, 3),
+        torch.zeros(count, 3),
     )
     rendering = render(gaussians, view)
     u, v = np.meshgrid(np.arange(60) + 0.5, np.arange(44) + 0.5)

@@ -1,4 +1,4 @@
-"""Training on a small analytic scene: quality, determinism, resume, cap, odd inputs."""
+"""Training on scenes made of a few planes and spheres: quality, depth, determinism, resume, cap, odd inputs."""
 
 from dataclasses import replace
 
@@ -7,75 +7,32 @@ import pytest
 import torch
 
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import look_at, pinhole_view, rays
-from sc3d.geometry.view_selection import neighbor_views
+from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.evaluation import depth_map
-from sc3d.splatting.initialization import fill_points
-from sc3d.splatting.train import train, write_log
+from sc3d.splatting.trainer import train
+from sc3d.stages.train import write_log
+from tests.splatting.scenes import SIZE, photographed, plane, ring, sphere, valley
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-WIDTH, HEIGHT = 96, 64
+WIDTH, HEIGHT = SIZE
 SHORT = TrainSettings(iterations=60, sh_degree=0, max_gaussians=2000, coarse_until=0.2)
 
 
-def surface_color(points: np.ndarray) -> np.ndarray:
-    """A smooth texture whose waves are longer than a few pixels, (N, 3) in [0, 1]."""
-    x, y, z = points.T
-    waves = [np.sin(2.1 * x + 0.7 * y + z), np.sin(1.3 * y - 0.9 * x + 2 * z), np.sin(1.7 * x - 1.1 * y)]
-    fine = 0.12 * np.sin(4.0 * x) * np.sin(4.4 * y)
-    return 0.5 + 0.25 * np.stack(waves, 1) + fine[:, None]
-
-
-def trace(view) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 3) uint8 photo and (H, W) depth of two planes that form a valley: z = 0.3 |x|."""
-    directions, along = rays(view)
-    hits = []
-    for side in (1, -1):
-        normal = np.array([-0.3 * side, 0, 1.0])
-        distance = -(view.center @ normal) / (directions @ normal)
-        hits.append(np.where(distance > 0, distance, np.inf))
-    distance = np.minimum(*hits)  # the space above both planes is convex
-    color = surface_color(view.center + distance[:, None] * directions)
-    return (color * 255 + 0.5).astype(np.uint8).reshape(HEIGHT, WIDTH, 3), (distance * along).reshape(
-        HEIGHT, WIDTH
-    )
-
-
 @pytest.fixture(scope="module")
-def scene() -> tuple[TrainingData, list[np.ndarray]]:
-    centers = [(4 * np.cos(a), 3 * np.sin(a), 9 + np.cos(3 * a)) for a in np.arange(8) * np.pi / 4]
-    views = [
-        pinhole_view(
-            f"{i}.png",
-            (WIDTH, HEIGHT),
-            (90, 90, WIDTH / 2 + 2, HEIGHT / 2 - 1),
-            look_at(np.array(c), np.array([0.2 * c[0], 0, 0])),
-        )
-        for i, c in enumerate(centers)
-    ]
-    photos, depths = zip(*map(trace, views), strict=True)
-    random = np.random.default_rng(0)
-    points = np.concatenate([random.uniform(-8, 8, (1500, 2)), np.zeros((1500, 1))], 1)
-    points[:, 2] = 0.3 * np.abs(points[:, 0])
-    colors = (surface_color(points) * 255).astype(np.uint8)
-    return TrainingData(views, list(photos), points + random.normal(0, 0.05, points.shape), colors), list(
-        depths
-    )
+def scene() -> tuple[TrainingData, np.ndarray]:
+    return photographed(ring(), valley(), wave=3.0, noise=0.05)[:2]
 
 
-@pytest.mark.parametrize(("plain", "tolerance"), [(True, 0.015), (False, 0.008)])
+@pytest.mark.parametrize(("plain", "tolerance"), [(True, 0.015), (False, 0.005)])
 def test_training_recovers_color_and_depth(scene, plain, tolerance):
     data, depths = scene
-    result = train(
-        data,
-        TrainSettings(
-            iterations=350, sh_degree=0, max_gaussians=6000, plain=plain, test_every=8, num_patches=1024
-        ),
-        progress=False,
+    settings = TrainSettings(
+        iterations=300, sh_degree=0, max_gaussians=5000, plain=plain, test_every=8, num_patches=1024
     )
+    result = train(data, settings, progress=False)
     assert result.metrics["psnr"] > 22 and result.log[-1]["psnr"] > 22
     errors = []
     for view, truth in zip(data.views, depths, strict=True):
@@ -88,20 +45,54 @@ def test_training_recovers_color_and_depth(scene, plain, tolerance):
     assert np.median(np.concatenate(errors)) < tolerance
 
 
-def test_empty_parts_are_filled_at_the_right_depth(scene):
-    data, _ = scene
-    sparse = data.points[:, 0] < -1  # the right half has no sparse points
-    data = replace(data, points=data.points[sparse], colors=data.colors[sparse])
-    neighbors = neighbor_views(None, data.points, np.stack([view.center for view in data.views]))
-    points, colors = fill_points(data, neighbors, 3000)
-    right = points[points[:, 0] > 0.5]
-    assert len(right) > 150
-    height = right[:, 2] - 0.3 * np.abs(right[:, 0])
-    assert np.median(np.abs(height)) < 0.15 and np.abs(np.median(height)) < 0.1  # at 9 units distance
-    expected = surface_color(points) * 255
-    assert np.median(np.abs(colors - expected)) < 15
-    masked = replace(data, masks=lambda index: np.zeros((HEIGHT, WIDTH), bool))
-    assert len(fill_points(masked, neighbors, 3000)[0]) == 0
+def depth_errors(data, depths, **options):
+    """(V, H, W) relative depth errors after a short training, NaN where alpha is below 0.9."""
+    settings = TrainSettings(
+        **{"iterations": 200, "sh_degree": 0, "max_gaussians": 5000, "num_patches": 1024} | options
+    )
+    gaussians = train(data, settings, progress=False).gaussians
+    maps = [depth_map(gaussians, view) for view in data.views]
+    return np.stack(
+        [
+            np.where(alpha > 0.9, np.abs(depth - truth) / truth, np.nan)
+            for (depth, alpha, _), truth in zip(maps, depths, strict=True)
+        ]
+    )
+
+
+def test_principal_point_far_from_the_middle():
+    data, depths, _ = photographed(ring((90.0, 90.0, 20.0, 54.0)), valley(), wave=3.0, noise=0.05)
+    errors = depth_errors(data, depths)
+    assert np.isfinite(errors).mean() > 0.75
+    assert np.nanmedian(errors) < 0.01
+
+
+def test_sphere_over_a_plane():
+    shapes = [plane([0, 0, 1], 0.0), sphere([0, 0, 1.6], 1.3)]
+    data, depths, indices = photographed(ring(), shapes, wave=3.0, noise=0.05)
+    errors = depth_errors(data, depths)
+    assert np.isfinite(errors).mean() > 0.85
+    for index in (0, 1):
+        assert np.nanmedian(errors[indices == index]) < 0.02
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.01])
+def test_deep_scene_keeps_its_depth_at_any_scale(unit):
+    """Ground from 20 m in front of the cameras to a wall that is 120 m away, in meters and in units of 100 m."""
+    centers = np.array([(-14, 0, 20), (-8, 3, 23), (-3, -3, 18), (3, 2, 22), (8, -2, 19), (14, 1, 21)], float)
+    poses = [look_at(center * unit, np.array([0.3 * center[0], 50, 0]) * unit) for center in centers]
+    views = [
+        pinhole_view(f"{row}.png", SIZE, (60.0, 60.0, 48.0, 32.0), pose) for row, pose in enumerate(poses)
+    ]
+    data, depths, _ = photographed(
+        views, [plane([0, 0, 1], 0.0), plane([0, 1, 0], 105 * unit)], wave=20 * unit, noise=0.4 * unit
+    )
+    assert depths.min() < 23 * unit and depths.max() > 119 * unit
+    errors = depth_errors(data, depths, iterations=270)
+    for nearest, farthest in ((0, 35), (35, 70), (70, 130)):
+        chosen = errors[(depths > nearest * unit) & (depths < farthest * unit)]
+        assert np.isfinite(chosen).mean() > 0.7
+        assert np.nanmedian(chosen) < 0.025
 
 
 def test_same_seed_same_result_and_resume_is_exact(scene, tmp_path):
@@ -177,7 +168,7 @@ def test_exposure_of_photos_is_found(scene):
     photos = [
         np.clip(photo * gain, 0, 255).astype(np.uint8) for photo, gain in zip(data.images, gains, strict=True)
     ]
-    result = train(replace(data, images=photos), replace(SHORT, iterations=300), progress=False)
+    result = train(replace(data, images=photos), replace(SHORT, iterations=160), progress=False)
     brightness = np.exp(result.exposures[:, 0]) + 2 * result.exposures[:, 1]
     assert brightness[gains > 1].min() > brightness[gains < 1].max()
 

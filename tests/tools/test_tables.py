@@ -16,6 +16,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.io.clouds import read_cloud
 from sc3d.io.images import read_index_image
+from sc3d.io.splats import write_splat_ply
 from sc3d.labelling.cloud import Cloud
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label, Propagate
@@ -304,13 +305,9 @@ def test_surface_of_the_truth_itself_is_perfect(folder, tmp_path, monkeypatch, c
         read_cloud(truth.path / "truth.ply").point.positions.numpy() - local_origin(truth.model.views)
     ).float()
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(points), 1)
-    Gaussians(
-        points,
-        torch.full_like(points, np.log(0.4)),
-        quats,
-        torch.full((len(points),), 4.0),
-        torch.zeros(len(points), 1, 3),
-    ).save(scene / "gaussians.ply")
+    scales, logits = torch.full_like(points, np.log(0.4)), torch.full((len(points),), 4.0)
+    gaussians = Gaussians(points, scales, quats, logits, torch.zeros_like(points))
+    write_splat_ply(scene / "gaussians.ply", gaussians.arrays())
     assert "--voxel-size" in fails(capsys, "surface", scene, truth.path)
     (scene / "mesh.ply.json").write_text(json.dumps({"summary": {"voxel_size": 0.25}}))
     assert voxel_size_of(Scene(scene)) == 0.25

@@ -13,6 +13,7 @@ from sc3d.geometry.raycast import Surface, first_surface, see_points
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.images import read_index_image
 from sc3d.scene.scene import Scene
+from sc3d.splatting.dataset import load_gaussians
 from sc3d.splatting.evaluation import depth_map
 from sc3d.splatting.gaussians import Gaussians
 
@@ -52,7 +53,7 @@ def surface_figures(scene: Scene, truth: Scene, voxel_size: float) -> SurfaceFig
     views = [view.shifted(origin) for view in scene.model.views]
     mesh, true_mesh = _surface(scene.mesh, origin), _surface(truth.path / "truth_mesh.ply", origin)
     ids = {entry.name: entry.id for entry in truth.class_table()}
-    depth = _depth_errors(Gaussians.load(scene.gaussians)[0], mesh, views, truth, ids["tree"])
+    depth = _depth_errors(load_gaussians(scene)[0], mesh, views, truth, ids["tree"])
     completeness = _completeness(mesh, true_mesh, views, truth, WITHIN * voxel_size, origin)
     accuracy = float((_distances(true_mesh, _samples(scene, origin)) <= WITHIN * voxel_size).mean())
     return SurfaceFigures(**depth, completeness=completeness, accuracy=accuracy, voxel_size=voxel_size)

@@ -11,15 +11,18 @@ import torch
 
 from sc3d.io.provenance import peak_memory_mb, reset_peak_memory
 from sc3d.settings.train import TrainSettings
-from sc3d.splatting import rendering as render
-from sc3d.splatting.cpu import projection as kernels_project
-from sc3d.splatting.cpu import projection_backward as kernels_backproject
-from sc3d.splatting.cpu import rasterization as kernels_raster
-from sc3d.splatting.cpu import rasterization_backward as kernels_unraster
-from sc3d.splatting.cpu import ssim
+from sc3d.splatting import strategy
+from sc3d.splatting.cpu import (
+    projection,
+    projection_backward,
+    rasterization,
+    rasterization_backward,
+    tile_binning,
+)
 from sc3d.splatting.dataset import TrainingData
-from sc3d.splatting.optimizer import RowAdam
-from sc3d.splatting.strategy import current
+from sc3d.splatting.gaussians import Gaussians
+from sc3d.splatting.losses import image_loss
+from sc3d.splatting.rendering import render
 from sc3d.splatting.trainer import Trainer
 from tools.benchmark.fragments import count_fragments
 from tools.benchmark.machine import Stopwatch, fma_gflops, num_threads, use_threads
@@ -27,11 +30,11 @@ from tools.benchmark.workload import Workload
 
 # what the renderer calls for each stage; `loss`, `adam` and `total` are timed around the calls
 FUNCTIONS = {
-    "project": [(kernels_project, "project")],
-    "sort and bin": [(render, "sort_into_tiles")],
-    "forward": [(kernels_raster, "rasterize"), (kernels_raster, "collect_contributions")],
-    "backward": [(kernels_unraster, "rasterize_backward")],
-    "project backward": [(kernels_backproject, "project_backward")],
+    "project": [(projection, "project_view")],
+    "sort and bin": [(tile_binning, "sort_into_tiles")],
+    "forward": [(rasterization, "rasterize"), (rasterization, "collect_contributions")],
+    "backward": [(rasterization_backward, "rasterize_backward")],
+    "project backward": [(projection_backward, "project_backward")],
 }
 STAGES = ("project", "sort and bin", "forward", "loss", "backward", "project backward", "adam")
 FLOPS = 54 + 82  # per slot, forward and backward, with normals and plane distance
@@ -46,10 +49,8 @@ class Iteration:
 
     def __init__(self, workload: Workload) -> None:
         view, photo = workload.views[0], workload.photos[0]
-        parameters = {
-            name: tensor.clone().requires_grad_() for name, tensor in workload.gaussians.parameters().items()
-        }
-        self.optimizer = RowAdam(parameters, dict.fromkeys(parameters, 1e-7))
+        copies = {name: tensor.clone() for name, tensor in workload.gaussians.parameters().items()}
+        self.optimizer = strategy.adam(Gaussians(**copies), dict.fromkeys(copies, 1e-7))
         self.view = view
         self.target = (
             torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1))).float().div(255).permute(1, 2, 0)
@@ -65,12 +66,13 @@ class Iteration:
         """
         watch = Stopwatch()
         with watch.watching(FUNCTIONS), watch.stage("total"):
-            rendering = render.render(current(self.optimizer), self.view)
+            rendering = render(strategy.current_gaussians(self.optimizer), self.view)
             with watch.stage("loss"):
-                loss = ssim.image_loss(rendering.color, self.target)
+                loss = image_loss(rendering.color, self.target)
             torch.autograd.backward([loss, rendering.normal, rendering.plane_distance], [None, *self.slopes])
             with watch.stage("adam"):
                 self.optimizer.step()
+                self.optimizer.zero_grad(set_to_none=True)
         seconds = {stage: watch.seconds[stage] for stage in STAGES}
         return seconds | {
             "rest": watch.seconds["total"] - sum(seconds.values()),
@@ -177,10 +179,9 @@ def _trainer(workload: Workload, plain: bool) -> Trainer:
         settings,
     )
     for name, tensor in workload.gaussians.parameters().items():
-        trainer.optimizer.parameters[name].data.copy_(tensor)
-    trainer.optimizer.rates = {
-        name: log_likelihood * 1e-6 for name, log_likelihood in trainer.optimizer.rates.items()
-    }
+        trainer.gaussians.parameters()[name].data.copy_(tensor)
+    for group in trainer.optimizer.param_groups:
+        group["lr"] *= 1e-6
     trainer.iteration = round(_LATE * _STEPS)
     return trainer
 

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from sc3d.errors import InputError
 from sc3d.io.images import IMAGE_SUFFIXES
 from sc3d.io.limits import MAX_MASK_PIXELS
 from sc3d.scene.scene import check_mask_aspect
-from sc3d.segmentation.mask_formats.mapping import Classes
+from sc3d.segmentation.mask_formats.mapping import ClassMapping
 
 logger = logging.getLogger(__name__)
 
@@ -24,7 +25,7 @@ MAX_TEXT = 400  # characters of a message about one mismatch
 
 
 @dataclass(frozen=True)
-class Mask:
+class CheckedMask:
     """A checked mask that has not been read yet.
 
     origin: where it comes from, for messages
@@ -42,7 +43,7 @@ class Checks:
     example and their number.
     """
 
-    def __init__(self, photo_sizes: dict[str, tuple[int, int]], classes: Classes) -> None:
+    def __init__(self, photo_sizes: dict[str, tuple[int, int]], classes: ClassMapping) -> None:
         """photo_sizes: (width, height) px by photo name, no two of one stem."""
         self.classes = classes
         self._photo_sizes = photo_sizes
@@ -81,7 +82,7 @@ class Checks:
             )
         return found.pop() if len(found) == 1 else None
 
-    def size(self, name: str, stated: tuple[object, object] | None, origin: str) -> tuple[int, int] | None:
+    def size(self, name: str, stated: tuple[Any, Any] | None, origin: str) -> tuple[int, int] | None:
         """(width, height) px of the mask of a photo: as stated if that fits the photo, the photo's own if
         nothing is stated.
         """

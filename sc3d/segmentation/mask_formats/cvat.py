@@ -2,8 +2,7 @@
 later.
 
 Format: https://docs.cvat.ai/docs/manual/advanced/xml_format. Read by a parser that refuses document type
-    declarations, and with them
-entities, which can make a small file fill the memory or read others.
+declarations, and with them entities, which can make a small file fill the memory or read others.
 """
 
 from __future__ import annotations
@@ -14,23 +13,23 @@ from pathlib import Path
 from xml.parsers import expat
 
 from sc3d.errors import InputError
-from sc3d.segmentation.mask_formats.drawing import Drawing, Shape
+from sc3d.segmentation.mask_formats.annotations import Annotation, PhotoAnnotations
 from sc3d.segmentation.mask_formats.outlines import (
     OutlineError,
     Polygons,
-    Runs,
+    RunLengths,
     ellipse,
     polygons,
     rectangle,
-    runs,
+    run_lengths,
 )
 
 WITHOUT_AREA = {"points", "polyline", "cuboid", "skeleton", "tag"}
 WITH_AREA = {"polygon", "box", "ellipse", "mask"}
 
 
-def read_cvat(file: Path) -> Iterator[Drawing]:
-    """The drawings of a CVAT file, one per image; InputError if it is none, or one for videos."""
+def read_cvat(file: Path) -> Iterator[PhotoAnnotations]:
+    """The annotations of a CVAT file, image by image; InputError if it is none, or one for videos."""
     document = _Document(file)
     parser = expat.ParserCreate()
     parser.StartDoctypeDeclHandler = document.refuse
@@ -43,7 +42,7 @@ def read_cvat(file: Path) -> Iterator[Drawing]:
         raise InputError(f"cannot read {file}: {error.strerror}") from None
     except (expat.ExpatError, ValueError, LookupError) as error:
         raise InputError(f"{file} is not valid XML ({error})") from None
-    yield from document.drawings
+    yield from document.photos
 
 
 class _Document:
@@ -51,10 +50,10 @@ class _Document:
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        self.drawings: list[Drawing] = []
+        self.photos: list[PhotoAnnotations] = []
         self._depth = 0
         self._image: dict[str, str] | None = None
-        self._shapes: list[tuple[int, Shape]] = []
+        self._annotations: list[tuple[int, Annotation]] = []
 
     def refuse(self, *declaration: object) -> None:
         raise InputError(
@@ -68,23 +67,21 @@ class _Document:
         if tag == "track":
             raise InputError(f"{self.file} is CVAT for video: export the task as 'CVAT for images 1.1'")
         if tag == "image":
-            self._image, self._shapes = attributes, []
+            self._image, self._annotations = attributes, []
         elif self._image is not None and tag in WITH_AREA | WITHOUT_AREA:
             outline = partial(_outline, tag, attributes) if tag in WITH_AREA else None
-            self._shapes.append(
-                (self._level(attributes), Shape(tag, (attributes.get("label", ""),), outline))
-            )
+            found = Annotation(tag, (attributes.get("label", ""),), outline)
+            self._annotations.append((self._level(attributes), found))
 
     def end(self, tag: str) -> None:
         self._depth -= 1
         if tag == "image" and self._image is not None:
             size = (self._image.get("width"), self._image.get("height"))
-            shapes = tuple(shape for _, shape in sorted(self._shapes, key=lambda entry: entry[0]))
-            self.drawings.append(
-                Drawing(
-                    str(self.file), (self._image.get("name", ""),), None if None in size else size, shapes
-                )
+            found = tuple(
+                annotation for _, annotation in sorted(self._annotations, key=lambda entry: entry[0])
             )
+            photos, stated = (self._image.get("name", ""),), None if None in size else size
+            self.photos.append(PhotoAnnotations(str(self.file), photos, stated, found))
             self._image = None
 
     def _level(self, attributes: dict[str, str]) -> int:
@@ -96,7 +93,7 @@ class _Document:
             ) from None
 
 
-def _outline(tag: str, attributes: dict[str, str], size: tuple[int, int]) -> Polygons | Runs:
+def _outline(tag: str, attributes: dict[str, str], size: tuple[int, int]) -> Polygons | RunLengths:
     rotation = float(attributes.get("rotation", 0))
     if tag == "polygon":
         pairs = attributes["points"].replace(";", ",").split(",")
@@ -109,7 +106,7 @@ def _outline(tag: str, attributes: dict[str, str], size: tuple[int, int]) -> Pol
         return ellipse(
             [attributes["cx"], attributes["cy"]], [attributes["rx"], attributes["ry"]], rotation, size
         )
-    box = tuple(int(attributes[key]) for key in ("left", "top", "width", "height"))
-    if min(box) < 0 or max(box) > max(size):
+    left, top, width, height = (int(attributes[key]) for key in ("left", "top", "width", "height"))
+    if min(left, top, width, height) < 0 or max(left, top, width, height) > max(size):
         raise OutlineError("lies outside of the image")
-    return runs(attributes["rle"].split(","), box, False, size)
+    return run_lengths(attributes["rle"].split(","), (left, top, width, height), False, size)

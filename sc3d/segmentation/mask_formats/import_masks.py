@@ -13,11 +13,28 @@ from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path, discard
 from sc3d.io.images import image_size, open_image, read_index_image, write_image
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.scene import match_masks
-from sc3d.segmentation.mask_formats.checks import Mask
+from sc3d.scene.scene import Scene, match_masks, photo_sizes
+from sc3d.segmentation.mask_formats.checks import CheckedMask
 from sc3d.segmentation.mask_formats.source import MaskFiles, read_masks
+from sc3d.settings.labels import Segment
 
 logger = logging.getLogger(__name__)
+
+
+def import_scene_masks(scene: Scene, settings: Segment, class_table: ClassTable) -> dict[str, object]:
+    """Masks of `--masks` into the scene, or a look at those that are there; returns figures for the summary."""
+    if settings.masks is None:
+        if settings.mapping is not None or settings.format not in ("auto", "index"):
+            raise InputError("--mapping and --format say how to read --masks, which is missing")
+        if not scene.masks.is_dir():
+            raise InputError(
+                "--masks FOLDER is needed (or --backend grounded-sam, which makes masks from the prompts in classes.json)"
+            )
+        return {"masks": len(scene.mask_files(scene.masks, class_table)), "source": "already in the scene"}
+    source, sizes = MaskFiles(settings.masks, settings.format, settings.mapping), photo_sizes(scene.images)
+    names = import_masks(source, scene.masks, sizes, class_table, settings.confidence, scene.confidence)
+    warn_of_turned([scene.photo(name) for name in names])
+    return {"masks": len(names), "confidence": settings.confidence is not None}
 
 
 def import_masks(
@@ -38,8 +55,8 @@ def import_masks(
     returns: names of the photos that have a mask, in order
 
     Raises InputError before anything is written if a file does not fit. With `scene_confidence` but no
-    `confidence`, confidence maps that
-    the scene already has are removed, because they describe the masks that are replaced.
+    `confidence`, confidence maps that the scene already has are removed, because they describe the masks that
+    are replaced.
     """
     if confidence is not None and scene_confidence is None:
         raise InputError("confidence maps are given, but not where in the scene they belong")
@@ -56,7 +73,7 @@ def import_masks(
     if scene_confidence is not None:
         _check_target(confidence, scene_confidence)
     with ExitStack() as folders:  # all is written before anything replaces what is there
-        if maps and confidence.resolve() != scene_confidence.resolve():
+        if maps and confidence and scene_confidence and confidence.resolve() != scene_confidence.resolve():
             _copy(maps, folders.enter_context(atomic_path(scene_confidence)))
         if not in_place:  # in place, they are already there and checked
             _draw(masks, folders.enter_context(atomic_path(scene_masks)))
@@ -70,7 +87,7 @@ def check_masks(
     photo_sizes: dict[str, tuple[int, int]],
     class_table: ClassTable,
     confidence: Path | None = None,
-) -> tuple[dict[str, Mask], dict[str, Path]]:
+) -> tuple[dict[str, CheckedMask], dict[str, Path]]:
     """Masks that are not drawn yet, and confidence maps, by photo name; InputError, in one line, for all that
     does not fit.
     """
@@ -97,7 +114,7 @@ def warn_of_turned(photos: list[Path]) -> None:
 
 
 def _match_confidence(
-    folder: Path, photo_sizes: dict[str, tuple[int, int]], masks: dict[str, Mask]
+    folder: Path, photo_sizes: dict[str, tuple[int, int]], masks: dict[str, CheckedMask]
 ) -> dict[str, Path]:
     """Confidence maps by photo name, each readable and as large as the mask it belongs to."""
     maps = match_masks(folder, photo_sizes, None)
@@ -129,7 +146,7 @@ def _copy(files: dict[str, Path], folder: Path) -> None:
         write_image(folder / file.name, read_index_image(file))
 
 
-def _draw(masks: dict[str, Mask], folder: Path) -> None:
+def _draw(masks: dict[str, CheckedMask], folder: Path) -> None:
     from tqdm import tqdm
 
     folder.mkdir()

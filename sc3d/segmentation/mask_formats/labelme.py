@@ -16,41 +16,46 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.json_files import read_json
-from sc3d.segmentation.mask_formats.drawing import Drawing, Shape
+from sc3d.segmentation.mask_formats.annotations import Annotation, PhotoAnnotations
 from sc3d.segmentation.mask_formats.outlines import (
     OutlineError,
     Polygons,
-    Runs,
+    RunLengths,
     ellipse,
-    encode,
     numbers,
     polygons,
     rectangle,
-    runs,
+    row_lengths,
+    run_lengths,
 )
 
 WITHOUT_AREA = {"point", "points", "line", "linestrip"}
 
 
-def read_labelme(file: Path) -> Iterator[Drawing]:
-    """The drawing of a LabelMe file; the photo is found by its imagePath, or else by the file's own name."""
+def read_labelme(file: Path) -> Iterator[PhotoAnnotations]:
+    """The annotations of a LabelMe file; the photo is found by its imagePath, or else by the file's own name."""
     content = read_json(file)
     shapes = content.get("shapes") if isinstance(content, dict) else None
-    if not isinstance(shapes, list) or not all(isinstance(shape, dict) for shape in shapes):
+    if (
+        not isinstance(content, dict)
+        or not isinstance(shapes, list)
+        or not all(isinstance(shape, dict) for shape in shapes)
+    ):
         raise InputError(f"{file} is not a LabelMe file: it has no list of shapes")
     size = (content.get("imageWidth"), content.get("imageHeight"))
     path = content.get("imagePath")
     photos = (path, file.name) if isinstance(path, str) and path else (file.name,)
-    yield Drawing(str(file), photos, None if None in size else size, tuple(_shape(shape) for shape in shapes))
+    found = tuple(_annotation(shape) for shape in shapes)
+    yield PhotoAnnotations(str(file), photos, None if None in size else size, found)
 
 
-def _shape(shape: dict) -> Shape:
+def _annotation(shape: dict) -> Annotation:
     kind = str(shape.get("shape_type") or "polygon")
     keys = (str(shape.get("label", "")),)
-    return Shape(kind, keys, None if kind in WITHOUT_AREA else partial(_outline, shape, kind))
+    return Annotation(kind, keys, None if kind in WITHOUT_AREA else partial(_outline, shape, kind))
 
 
-def _outline(shape: dict, kind: str, size: tuple[int, int]) -> Polygons | Runs:
+def _outline(shape: dict, kind: str, size: tuple[int, int]) -> Polygons | RunLengths:
     points = shape["points"]
     if kind in ("polygon", "oriented_rectangle", "rotation"):
         return polygons([points], size)
@@ -65,7 +70,7 @@ def _outline(shape: dict, kind: str, size: tuple[int, int]) -> Polygons | Runs:
     raise OutlineError("is of a type that is not known")
 
 
-def _mask(text: str, corners: np.ndarray, size: tuple[int, int]) -> Runs:
+def _mask(text: str, corners: np.ndarray, size: tuple[int, int]) -> RunLengths:
     """A PNG in base64 for the pixels from the first to the second corner, both included; its size is checked
     before it is decoded.
     """
@@ -87,4 +92,4 @@ def _mask(text: str, corners: np.ndarray, size: tuple[int, int]) -> Runs:
             mask = np.array(image.convert("L")) > 0
     except (OSError, SyntaxError, binascii.Error, Image.DecompressionBombError):
         raise OutlineError("has a damaged picture") from None
-    return runs(encode(mask), (left, top, width, height), False, size)
+    return run_lengths(row_lengths(mask), (left, top, width, height), False, size)

@@ -18,7 +18,7 @@ UNKNOWN = -1
 
 
 @dataclass(frozen=True)
-class Classes:
+class ClassMapping:
     """The class table of a scene, with what stands for its classes elsewhere.
 
     mapping: class id by id, name or color in the files, 0 = unlabelled; None without --mapping
@@ -79,7 +79,7 @@ class Classes:
                 ((0, 0, 0), 0, "unlabelled"),
                 *((self._color(key), class_id, key) for key, class_id in self.mapping.items()),
             ]
-        table, owners = np.full(1 << 24, UNKNOWN, np.int16), {}
+        table, owners = np.full(1 << 24, UNKNOWN, np.int16), dict[int, int]()
         for color, class_id, owner in colors:
             code = color[0] << 16 | color[1] << 8 | color[2]
             if owners.get(code, class_id) not in (class_id, 0):
@@ -92,28 +92,30 @@ class Classes:
     def _color(self, key: str) -> tuple[int, int, int]:
         code = re.fullmatch(r"#([0-9a-fA-F]{6})", key)
         if code:
-            return tuple(bytes.fromhex(code[1]))
+            red, green, blue = bytes.fromhex(code[1])
+            return red, green, blue
         values = re.fullmatch(r"[\[(]?\s*([0-9]{1,3})\s*,\s*([0-9]{1,3})\s*,\s*([0-9]{1,3})\s*[\])]?", key)
         if not values or max(map(int, values.groups())) > 255:
             raise InputError(f'{self.origin}: {key!r} is no color: write it as "#d63c3c" or "[214, 60, 60]"')
-        return tuple(map(int, values.groups()))
+        red, green, blue = map(int, values.groups())
+        return red, green, blue
 
 
-def read_mapping(mapping: Path | None, table: ClassTable) -> Classes:
+def read_mapping(mapping: Path | None, table: ClassTable) -> ClassMapping:
     """The table with the mapping of a JSON file, if there is one.
 
     The file holds an object: keys are ids ("7"), names ("wall") or colors ("#d63c3c", "[214, 60, 60]") of
-    the masks; values are names or ids
-    of the table, or null or "ignore" for unlabelled. Raises InputError for anything else.
+    the masks; values are names or ids of the table, or null or "ignore" for unlabelled. Raises InputError for
+    anything else.
     """
     if mapping is None:
-        return Classes(table)
+        return ClassMapping(table)
     content = read_json(mapping)
     if not isinstance(content, dict) or not content:
         raise InputError(
             f'{mapping} must hold an object such as {{"wall": "building", "7": "road", "#00ff00": "tree", "sky": null}}'
         )
-    return Classes(
+    return ClassMapping(
         table, {key.strip(): _class_id(key, value, table, mapping) for key, value in content.items()}, mapping
     )
 
@@ -144,4 +146,6 @@ def _by_name(name: str, table: ClassTable) -> int | None:
     """Class id of a name; exact if there is one, else whatever the case if only one fits."""
     exact = [entry.id for entry in table if entry.name == name.strip()]
     alike = [entry.id for entry in table if entry.name.casefold() == name.strip().casefold()]
-    return (exact or (alike if len(alike) == 1 else []) or [None])[0]
+    if exact:
+        return exact[0]
+    return alike[0] if len(alike) == 1 else None

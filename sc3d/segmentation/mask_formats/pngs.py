@@ -1,9 +1,8 @@
 """PNGs with one id or one color per pixel, `<photo stem>.png`; values are taken exactly, nothing is guessed.
 
 Ids are those of the class table, or those of a mapping: then also 16-bit, such as ADE20K's and Cityscapes'.
-Colors are those of the class
-table or of a mapping; a color between two classes, as JPEG and smooth scaling leave behind, is an error and
-not the nearest class.
+Colors are those of the class table or of a mapping; a color between two classes, as JPEG and smooth scaling
+leave behind, is an error and not the nearest class.
 """
 
 from __future__ import annotations
@@ -16,28 +15,28 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.images import image_size, open_image, read_index_image
-from sc3d.segmentation.mask_formats.checks import Checks, Mask
-from sc3d.segmentation.mask_formats.mapping import UNKNOWN, Classes
+from sc3d.segmentation.mask_formats.checks import CheckedMask, Checks
+from sc3d.segmentation.mask_formats.mapping import UNKNOWN, ClassMapping
 
 SIXTEEN_BIT = {"I", "I;16", "I;16B"}
 COLORED = {"RGB", "RGBA"}
 
 
-def check_png(file: Path, colored: bool, checks: Checks) -> Iterator[tuple[str, Mask]]:
+def check_png(file: Path, colored: bool, checks: Checks) -> Iterator[tuple[str, CheckedMask]]:
     """The photo and mask of a PNG, after a look at all its pixels; mismatches go to `checks`."""
     name = checks.photo((file.name,), str(file))
     size = None if name is None else checks.size(name, image_size(file), str(file))
-    if size is None:
+    if name is None or size is None:
         return
     codes = _read_colors(file) if colored else _read_ids(file, checks.classes)
     unknown = (checks.classes.by_color if colored else checks.classes.by_id)[codes] == UNKNOWN
     if unknown.any():
         checks.add("value", _describe(file, codes, unknown, colored, checks.classes))
         return
-    yield name, Mask(str(file), size, partial(read_png, file, colored, checks.classes))
+    yield name, CheckedMask(str(file), size, partial(read_png, file, colored, checks.classes))
 
 
-def read_png(file: Path, colored: bool, classes: Classes) -> np.ndarray:
+def read_png(file: Path, colored: bool, classes: ClassMapping) -> np.ndarray:
     """(H, W) uint8 class ids of a checked PNG."""
     if colored:
         return classes.by_color[_read_colors(file)].astype(np.uint8)
@@ -57,7 +56,7 @@ def is_colored(file: Path) -> bool:
         return True
 
 
-def _read_ids(file: Path, classes: Classes) -> np.ndarray:
+def _read_ids(file: Path, classes: ClassMapping) -> np.ndarray:
     """(H, W) uint8 or uint16."""
     with open_image(file, "mask") as image:
         if image.mode not in SIXTEEN_BIT:
@@ -80,7 +79,9 @@ def _read_colors(file: Path) -> np.ndarray:
     return codes
 
 
-def _describe(file: Path, codes: np.ndarray, unknown: np.ndarray, colored: bool, classes: Classes) -> str:
+def _describe(
+    file: Path, codes: np.ndarray, unknown: np.ndarray, colored: bool, classes: ClassMapping
+) -> str:
     row, column = (int(index[0]) for index in np.nonzero(unknown))
     code, count = int(codes[row, column]), int(np.count_nonzero(unknown))
     where = "the class table" if classes.mapping is None else str(classes.origin)

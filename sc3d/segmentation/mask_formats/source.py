@@ -11,10 +11,10 @@ from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.scene.class_table import ClassTable
-from sc3d.segmentation.mask_formats.checks import Checks, Mask
+from sc3d.segmentation.mask_formats.annotations import to_mask
+from sc3d.segmentation.mask_formats.checks import CheckedMask, Checks
 from sc3d.segmentation.mask_formats.coco import read_coco
 from sc3d.segmentation.mask_formats.cvat import read_cvat
-from sc3d.segmentation.mask_formats.drawing import to_mask
 from sc3d.segmentation.mask_formats.labelme import read_labelme
 from sc3d.segmentation.mask_formats.mapping import read_mapping
 from sc3d.segmentation.mask_formats.pngs import check_png, is_colored
@@ -41,7 +41,7 @@ class MaskFiles:
 
 def read_masks(
     source: MaskFiles, photo_sizes: dict[str, tuple[int, int]], class_table: ClassTable
-) -> dict[str, Mask]:
+) -> dict[str, CheckedMask]:
     """Masks by photo name, all checked and none drawn yet.
 
     photo_sizes: (width, height) px by photo name
@@ -49,7 +49,7 @@ def read_masks(
     """
     kind = detect(source.path) if source.format == "auto" else source.format
     checks = Checks(photo_sizes, read_mapping(source.mapping, class_table))
-    masks: dict[str, Mask] = {}
+    masks: dict[str, CheckedMask] = {}
     for file in _files(source.path, kind):
         try:
             for name, mask in _read(file, kind, checks):
@@ -67,12 +67,12 @@ def read_masks(
     return dict(sorted(masks.items()))
 
 
-def _read(file: Path, kind: str, checks: Checks) -> Iterator[tuple[str, Mask]]:
+def _read(file: Path, kind: str, checks: Checks) -> Iterator[tuple[str, CheckedMask]]:
     if kind in ("index", "color"):
         yield from check_png(file, kind == "color", checks)
         return
-    for drawing in READERS[kind](file):
-        found = to_mask(drawing, checks)
+    for photo in READERS[kind](file):
+        found = to_mask(photo, checks)
         if found is not None:
             yield found
 

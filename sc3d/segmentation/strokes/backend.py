@@ -18,14 +18,14 @@ from sc3d.segmentation.segment import Segmentation
 from sc3d.segmentation.strokes.features import pixel_features
 from sc3d.segmentation.strokes.files import BACKGROUND, NOTHING, PhotoStrokes, read_strokes
 from sc3d.segmentation.strokes.guided_filter import fit_lines
-from sc3d.segmentation.strokes.novelty import Novelty, learn_novelty
+from sc3d.segmentation.strokes.novelty import Novelty, fit_novelty
 
 logger = logging.getLogger(__name__)
 
-_FLOOR = 1e-4  # smallest probability after filtering
-_LEAST = 60  # pixels of a stroke that are always learned from, if it has as many
-_PIECE = 128  # px of the reduced photo
-_FINEST = 4096  # px; larger photos get masks of this size, enlarged
+_MIN_PROBABILITY = 1e-4  # smallest probability after filtering
+_MIN_PIXELS = 60  # pixels of a stroke that are always learned from, if it has as many
+_PIECE_SIDE = 128  # px of the reduced photo
+_MAX_SIDE = 4096  # px; larger photos get masks of this size, enlarged
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class StrokesSettings:
 
 
 @dataclass(frozen=True)
-class _Learned:
+class _TrainingPixels:
     """What one photo teaches. features: (N, F); codes: class ids (N,); strokes: (N,) number of the stroke;
     pixels: (N,) place in the reduced photo.
     """
@@ -84,7 +84,7 @@ class Strokes:
         self.temperature = 1.0  # below 1 sharpens probabilities, above 1 blunts them
 
     @classmethod
-    def learn(
+    def fit(
         cls,
         folder: Path,
         photos_folder: Path,
@@ -101,17 +101,19 @@ class Strokes:
         drawn = read_strokes(folder, photos_folder, class_table)
         painted = [_paint(photo, settings.max_size) for photo in drawn]
         _check_classes([labels for labels, _ in painted], class_table, folder, settings.require_all)
-        taught = [_teach(photo, *paint, settings) for photo, paint in zip(drawn, painted, strict=True)]
-        labels = np.concatenate([part.labels for part in taught])
+        training = [
+            _training_pixels(photo, *paint, settings) for photo, paint in zip(drawn, painted, strict=True)
+        ]
+        labels = np.concatenate([part.labels for part in training])
         label_of_code, codes = np.unique(labels, return_inverse=True)
-        strokes = np.concatenate([part.strokes + (index << 40) for index, part in enumerate(taught)])
-        folds = deal(strokes, codes, settings.members)
-        samples = Samples(np.concatenate([part.features for part in taught]), codes, folds)
+        strokes = np.concatenate([part.strokes + (index << 40) for index, part in enumerate(training)])
+        folds = assign_folds(strokes, codes, settings.members)
+        samples = Samples(np.concatenate([part.features for part in training]), codes, folds)
         classifier = train(samples, settings.members, settings.trees, settings.steps, settings.seed)
         learned = cls(
-            classifier, learn_novelty(samples.features, folds), label_of_code.astype(np.uint8), settings
+            classifier, fit_novelty(samples.features, folds), label_of_code.astype(np.uint8), settings
         )
-        learned.temperature = learned._calibrate(drawn, taught, codes, folds)
+        learned.temperature = learned._calibrate(drawn, training, codes, folds)
         logger.info(
             "learned from %d strokes on %d photos; temperature %.2f",
             sum(int(marks.max()) for _, marks in painted),
@@ -128,7 +130,7 @@ class Strokes:
             class x 255, 0 where unlabelled
         """
         height, width = image.shape[:2]
-        small, fine = reduced(image, self._settings.max_size), reduced(image, _FINEST)
+        small, fine = shrink(image, self._settings.max_size), shrink(image, _MAX_SIDE)
         guide = fine.astype(np.float32) / 255
         best, total = np.zeros(guide.shape[:2], np.float32), np.zeros(guide.shape[:2], np.float32)
         labels = np.zeros(guide.shape[:2], np.uint8)
@@ -164,26 +166,26 @@ class Strokes:
         return np.concatenate([probabilities * (1 - unknown)[..., None], unknown[..., None]], axis=-1)
 
     def _sharpened(self, plane: np.ndarray) -> np.ndarray:
-        return np.clip(plane, _FLOOR, 1) ** np.float32(1 / self.temperature)
+        return np.clip(plane, _MIN_PROBABILITY, 1) ** np.float32(1 / self.temperature)
 
     def _calibrate(
-        self, drawn: list[PhotoStrokes], taught: list[_Learned], codes: np.ndarray, folds: np.ndarray
+        self, drawn: list[PhotoStrokes], training: list[_TrainingPixels], codes: np.ndarray, folds: np.ndarray
     ) -> float:
         """The temperature that suits strokes as members see them that did not learn from them, after the
         filter.
         """
         from sc3d.segmentation.strokes.pixel_classifier import best_temperature
 
-        ends = np.cumsum([0, *(len(part.labels) for part in taught)])
+        ends = np.cumsum([0, *(len(part.labels) for part in training)])
         found, truth = [np.zeros((0, len(self._label_of_code)), np.float32)], [codes[:0]]
-        for index in sorted(range(len(drawn)), key=lambda index: -len(taught[index].labels))[
+        for index in sorted(range(len(drawn)), key=lambda index: -len(training[index].labels))[
             : self._settings.calibration_photos
         ]:
             part = slice(ends[index], ends[index + 1])
-            small = reduced(read_image(drawn[index].photo), self._settings.max_size)
+            small = shrink(read_image(drawn[index].photo), self._settings.max_size)
             features, guide = pixel_features(small), small.astype(np.float32) / 255
             for member in np.unique(folds[part][folds[part] >= 0]):
-                pixels = taught[index].pixels[folds[part] == member]
+                pixels = training[index].pixels[folds[part] == member]
                 lines = fit_lines(
                     guide,
                     self._classifier.probabilities(features, int(member)),
@@ -192,14 +194,15 @@ class Strokes:
                 )
                 found.append(
                     np.stack(
-                        [np.clip(line.apply(guide).ravel()[pixels], _FLOOR, 1) for line in lines], axis=1
+                        [np.clip(line.apply(guide).ravel()[pixels], _MIN_PROBABILITY, 1) for line in lines],
+                        axis=1,
                     )
                 )
                 truth.append(codes[part][folds[part] == member])
         return best_temperature(np.concatenate(found), np.concatenate(truth))
 
 
-def deal(strokes: np.ndarray, codes: np.ndarray, num_parts: int) -> np.ndarray:
+def assign_folds(strokes: np.ndarray, codes: np.ndarray, num_parts: int) -> np.ndarray:
     """Deal strokes out to parts of about equal size within each class, largest first.
 
     strokes: (N,) int number of each pixel's stroke; codes: (N,) int of its class
@@ -219,7 +222,7 @@ def deal(strokes: np.ndarray, codes: np.ndarray, num_parts: int) -> np.ndarray:
 
 
 def _paint(photo: PhotoStrokes, max_size: int) -> tuple[np.ndarray, np.ndarray]:
-    width, height = _reduced_size(*photo.size, max_size)
+    width, height = _shrunk_size(*photo.size, max_size)
     return photo.paint(width, height)
 
 
@@ -239,19 +242,19 @@ def _check_classes(
         )
 
 
-def _teach(
+def _training_pixels(
     photo: PhotoStrokes, labels: np.ndarray, strokes: np.ndarray, settings: StrokesSettings
-) -> _Learned:
+) -> _TrainingPixels:
     """Pixels under the strokes of a photo, a share of each stroke."""
     random = np.random.default_rng([settings.seed, *photo.photo.stem.encode()])
     rows = np.concatenate(
         [
-            pick(strokes.ravel(), labels.ravel() == label, settings.pixels, random)
+            sample_pixels(strokes.ravel(), labels.ravel() == label, settings.pixels, random)
             for label in np.unique(labels[labels != NOTHING])
         ]
     )
-    features = pixel_features(reduced(read_image(photo.photo), settings.max_size))
-    return _Learned(
+    features = pixel_features(shrink(read_image(photo.photo), settings.max_size))
+    return _TrainingPixels(
         features.reshape(-1, features.shape[-1])[rows], labels.ravel()[rows], _pieces(strokes, rows), rows
     )
 
@@ -263,11 +266,15 @@ def _pieces(strokes: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     strokes: (H, W) int32 numbers; pixels: (N,) places in it
     """
     rows, columns = np.divmod(pixels, strokes.shape[1])
-    return strokes.ravel()[pixels].astype(np.int64) << 20 | (rows // _PIECE) << 10 | columns // _PIECE
+    return (
+        strokes.ravel()[pixels].astype(np.int64) << 20 | (rows // _PIECE_SIDE) << 10 | columns // _PIECE_SIDE
+    )
 
 
-def pick(strokes: np.ndarray, wanted: np.ndarray, most: int, random: np.random.Generator) -> np.ndarray:
-    """Places of at most about `most` wanted pixels, of each stroke its share, but at least `_LEAST` of small
+def sample_pixels(
+    strokes: np.ndarray, wanted: np.ndarray, most: int, random: np.random.Generator
+) -> np.ndarray:
+    """Places of at most about `most` wanted pixels, of each stroke its share, but at least `_MIN_PIXELS` of small
     ones: they correct large ones.
 
     strokes: (P,) int number of each pixel's stroke; wanted: (P,) bool
@@ -276,20 +283,21 @@ def pick(strokes: np.ndarray, wanted: np.ndarray, most: int, random: np.random.G
     places = random.permutation(np.flatnonzero(wanted))
     order = places[np.argsort(strokes[places], kind="stable")]
     _, starts, sizes = np.unique(strokes[order], return_index=True, return_counts=True)
-    shares = np.minimum(sizes, np.maximum(_LEAST, sizes * min(1.0, most / sizes.sum())).astype(np.int64))
+    shares = np.minimum(sizes, np.maximum(_MIN_PIXELS, sizes * min(1.0, most / sizes.sum())).astype(np.int64))
     rank = np.arange(len(order)) - np.repeat(starts, sizes)
     return np.sort(order[rank < np.repeat(shares, sizes)])
 
 
-def _reduced_size(width: int, height: int, max_size: int) -> tuple[int, int]:
+def _shrunk_size(width: int, height: int, max_size: int) -> tuple[int, int]:
     scale = min(1.0, max_size / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def reduced(image: np.ndarray, max_size: int) -> np.ndarray:
+def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
     """(h, w, 3) uint8 photo whose longest side is at most `max_size` px."""
-    size = _reduced_size(*image.shape[1::-1], max_size)
-    return image if size == image.shape[1::-1] else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    height, width = image.shape[:2]
+    size = _shrunk_size(width, height, max_size)
+    return image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def _check_packages() -> None:

@@ -1,12 +1,10 @@
 """What a user drew on photos: strokes, polygons and colors, read, checked and painted at any size.
 
 LabelMe JSON: shapes of type linestrip, line, point (with `"width": <px>`, which LabelMe keeps although it
-does not know it), polygon,
-rectangle and circle; coordinates in px from the upper left corner of the photo as it is stored; later shapes
-cover earlier ones.
-The label is the name of a class, or `_background_` for what belongs to no class. PNG: the colors of the
-class table; black and
-transparent pixels say nothing. A photo may have both, the PNG below.
+does not know it), polygon, rectangle and circle; coordinates in px from the upper left corner of the photo as
+it is stored; later shapes cover earlier ones. The label is the name of a class, or `_background_` for what
+belongs to no class. PNG: the colors of the class table; black and transparent pixels say nothing. A photo may
+have both, the PNG below.
 """
 
 from __future__ import annotations
@@ -14,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,10 +27,10 @@ BACKGROUND = "_background_"  # LabelMe's own name for it
 NOTHING = -1  # a pixel without a stroke; 0 is background
 MIN_POINTS = {"point": 1, "line": 2, "linestrip": 1, "polygon": 3, "rectangle": 2, "circle": 2}
 DEFAULT_WIDTH = 0.005  # of a stroke that states none, share of the photo's longest side
-_FAR = 1e5  # px; more cannot be meant, and would overflow the fixed-point coordinates of OpenCV
+_MAX_COORDINATE = 1e5  # px; more cannot be meant, and would overflow the fixed-point coordinates of OpenCV
 _SHIFT = 4  # fractional bits of those coordinates
-_THICKEST = 32767  # px, to OpenCV
-_LEAST_SHARE = 0.25  # of a reduced pixel that a PNG must cover
+_MAX_THICKNESS = 32767  # px, to OpenCV
+_MIN_SHARE = 0.25  # of a reduced pixel that a PNG must cover
 
 
 @dataclass(frozen=True)
@@ -124,14 +123,14 @@ def parse_shapes(
     origin: names the file in messages; size: (width, height) px of the photo
     """
     shapes = content.get("shapes") if isinstance(content, dict) else None
-    if not isinstance(shapes, list):
+    if not isinstance(content, dict) or not isinstance(shapes, list):
         raise InputError(f"{origin} is not a LabelMe file: it has no list of shapes")
-    stated = (content.get("imageWidth"), content.get("imageHeight"))
+    stated: tuple[Any, Any] = (content.get("imageWidth"), content.get("imageHeight"))
     scale = 1.0
     if stated != (None, None):
-        if not all(isinstance(side, int) and 0 < side < _FAR for side in stated):
+        if not all(isinstance(side, int) and 0 < side < _MAX_COORDINATE for side in stated):
             raise InputError(f"{origin}: imageWidth and imageHeight must be whole numbers of px")
-        check_mask_aspect(Path(str(origin)), stated, size)
+        check_mask_aspect(origin, stated, size)
         scale = max(size) / max(stated)
     ids = {entry.name: entry.id for entry in class_table} | {BACKGROUND: 0}
     return tuple(
@@ -168,7 +167,7 @@ def _is_number(value: object) -> bool:
         isinstance(value, int | float)
         and not isinstance(value, bool)
         and math.isfinite(value)
-        and abs(value) < _FAR
+        and abs(value) < _MAX_COORDINATE
     )
 
 
@@ -221,7 +220,7 @@ def _reduce(picture: np.ndarray, width: int, height: int) -> np.ndarray:
             for label in ids
         ]
     )
-    return np.where(shares.max(axis=0) >= _LEAST_SHARE, ids[shares.argmax(axis=0)], NOTHING).astype(np.int16)
+    return np.where(shares.max(axis=0) >= _MIN_SHARE, ids[shares.argmax(axis=0)], NOTHING).astype(np.int16)
 
 
 def _components(labels: np.ndarray) -> tuple[np.ndarray, int]:
@@ -252,7 +251,7 @@ def _draw(shape: StrokeShape, scale: np.ndarray, default_width: float, size: tup
     if shape.kind in ("polygon", "rectangle", "circle"):
         cv2.fillPoly(canvas, fixed, 1, shift=_SHIFT)
     else:
-        thickness = min(max(1, round((shape.width or default_width) * float(scale.mean()))), _THICKEST)
+        thickness = min(max(1, round((shape.width or default_width) * float(scale.mean()))), _MAX_THICKNESS)
         # a single point is no line to OpenCV
         cv2.polylines(canvas, [np.concatenate([fixed[0], fixed[0][-1:]])], False, 1, thickness, shift=_SHIFT)
     return canvas > 0

@@ -1,8 +1,7 @@
 """Guided filter: probabilities are smoothed, but not across the edges of the photo.
 
 Source: He, Sun and Tang, "Guided image filtering" (2013), color guide; the coefficients are found at a
-    reduced size and applied to the
-large photo, as in He and Sun, "Fast guided filter" (2015).
+reduced size and applied to the large photo, as in He and Sun, "Fast guided filter" (2015).
 """
 
 from __future__ import annotations

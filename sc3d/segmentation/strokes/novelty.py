@@ -12,15 +12,15 @@ from scipy.spatial import cKDTree
 
 _DIMENSIONS = 6  # principal components: more only make distances more alike
 _QUANTILE = 0.995  # of the distances of held-out strokes that still pass for known
-_STEP = 4  # px between the places looked at
+_PIXEL_STEP = 4  # px between the places looked at
 # of features: a difference that another photo of the same thing may well show, although strokes do not
 _UNIT = 1.0
-_NARROW = 5  # such steps: what is narrower is no object
-_MOST = 15_000  # pixels to compare with
+_NARROW_STEPS = 5  # such steps: what is narrower is no object
+_MAX_SAMPLES = 15_000  # pixels to compare with
 
 
 @dataclass(frozen=True)
-class _Space:
+class _FeatureSpace:
     """Where distances are measured: principal components, half whitened because the first say most, and what
     they leave over.
 
@@ -48,7 +48,7 @@ class _Space:
 class Novelty:
     """known: places of pixels under strokes; reach: distance from them up to which a pixel is known."""
 
-    space: _Space
+    space: _FeatureSpace
     known: cKDTree
     reach: float
 
@@ -58,15 +58,15 @@ class Novelty:
         features: (H, W, F) float32
         returns: (H, W) float32: 0 within reach of a stroke's pixel, 1 from twice the reach on
         """
-        sparse = features[::_STEP, ::_STEP]
+        sparse = features[::_PIXEL_STEP, ::_PIXEL_STEP]
         distances = self.known.query(self.space.place(sparse.reshape(-1, features.shape[-1])))[0]
         share = np.clip(distances / self.reach - 1, 0, 1).reshape(sparse.shape[:2]).astype(np.float32)
         # windows across an edge are unlike both sides
-        share = cv2.morphologyEx(share, cv2.MORPH_OPEN, np.ones((_NARROW, _NARROW), np.uint8))
+        share = cv2.morphologyEx(share, cv2.MORPH_OPEN, np.ones((_NARROW_STEPS, _NARROW_STEPS), np.uint8))
         return cv2.resize(share, features.shape[1::-1], interpolation=cv2.INTER_LINEAR)
 
 
-def learn_novelty(features: np.ndarray, folds: np.ndarray) -> Novelty | None:
+def fit_novelty(features: np.ndarray, folds: np.ndarray) -> Novelty | None:
     """Learn what strokes look like, and how far apart those of different parts are; None if there are not two
     parts to compare.
 
@@ -77,21 +77,21 @@ def learn_novelty(features: np.ndarray, folds: np.ndarray) -> Novelty | None:
         return None
     space = _fit(features)
     places = space.place(features)
-    thinned = slice(None, None, -(-len(features) // _MOST))
+    thinned = slice(None, None, -(-len(features) // _MAX_SAMPLES))
     distances = [cKDTree(places[folds != part][thinned]).query(places[folds == part])[0] for part in parts]
     return Novelty(
         space, cKDTree(places[thinned]), max(float(np.quantile(np.concatenate(distances), _QUANTILE)), _UNIT)
     )
 
 
-def _fit(features: np.ndarray) -> _Space:
+def _fit(features: np.ndarray) -> _FeatureSpace:
     center, scale = features.mean(axis=0), features.std(axis=0) + _UNIT
     _, sizes, axes = np.linalg.svd((features - center) / scale, full_matrices=False)
-    space = _Space(
+    space = _FeatureSpace(
         center,
         scale,
         axes[:_DIMENSIONS],
         np.sqrt(np.maximum(sizes[:_DIMENSIONS] / np.sqrt(len(features)), _UNIT)),
     )
     rest = max(float(space.place(features)[:, -1].std()), _UNIT)
-    return _Space(space.center, space.scale, space.axes, space.sizes, rest)
+    return _FeatureSpace(space.center, space.scale, space.axes, space.sizes, rest)

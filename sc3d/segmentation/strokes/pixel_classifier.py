@@ -1,9 +1,9 @@
 """A classifier of feature vectors: small neural networks and randomised trees, which err in different places,
 trained crosswise.
 
-Strokes are dealt out to as many parts as there are members; each member learns from all parts but its own. So
-every stroke is judged by a
-member that has not seen it, which is what calibration needs, and all members together have seen all strokes.
+Strokes are dealt out to as many folds as there are members; each member learns from all folds but its own. So
+every stroke is judged by a member that has not seen it, which is what calibration needs, and all members
+together have seen all strokes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from sklearn.ensemble import ExtraTreesClassifier
 
-_CHUNK = 1 << 17  # pixels at once
+_PIXELS_AT_ONCE = 1 << 17  # pixels at once
 _BATCH = 512
 _RATE = 6e-3  # peak of the learning rate
 # temperature; strokes lie where it is easy, so that all may be right and still say nothing of edges
@@ -63,7 +63,8 @@ class PixelClassifier:
         rows = features.reshape(-1, features.shape[-1])
         members = self.members if member is None else self.members[member : member + 1]
         found = [
-            self._classify(rows[start : start + _CHUNK], members) for start in range(0, len(rows), _CHUNK)
+            self._classify(rows[start : start + _PIXELS_AT_ONCE], members)
+            for start in range(0, len(rows), _PIXELS_AT_ONCE)
         ]
         return np.concatenate(found).reshape(*features.shape[:-1], -1)
 

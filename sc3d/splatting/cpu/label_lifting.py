@@ -1,9 +1,8 @@
 """Numba kernels: how much of each class every Gaussian shows in a view.
 
-The walk of `kernels_raster` with the same operations, hence the same fragments and weights; instead of
-compositing colors it sums the weights w
-of a fragment over the pixels of each class. A tile keeps one plane of mask weights per class that occurs in
-it, mostly one or two.
+The walk of `rasterization` with the same operations, hence the same fragments and weights; instead of
+compositing colors it sums the weights w of a fragment over the pixels of each class. A tile keeps one plane
+of mask weights per class that occurs in it, mostly one or two.
 """
 
 from __future__ import annotations
@@ -11,83 +10,87 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sc3d.splatting.cpu.projection import RECORD
+from sc3d.geometry.cameras import View
+from sc3d.splatting.cpu.projection import RECORD, camera_array, gaussian_arrays, project_view
 from sc3d.splatting.cpu.rasterization import (
     CHECK,
-    LOG2_MIN_ALPHA,
-    MAX_ALPHA,
-    MIN_TRANSMITTANCE,
     PLANE,
     STRIDE,
+    alpha_of,
     finished,
+    log2_alpha,
+    may_pass,
     measure_rows,
     open_tile,
 )
-from sc3d.splatting.cpu.simd import (
-    LANES,
-    any_at_least,
-    exp2,
-    fma,
-    load,
-    minimum,
-    ramp,
-    splat,
-    store,
-    total,
-    where_at_least,
-)
-from sc3d.splatting.cpu.tile_binning import TILE
+from sc3d.splatting.cpu.simd import LANES, fma, load, ramp, splat, store, total
+from sc3d.splatting.cpu.tile_binning import TILE, sort_into_tiles, tile_frame
+from sc3d.splatting.gaussians import Gaussians
 
 NONE = np.uint8(255)  # a pixel without label; so a view may have 255 classes
 _ZERO = np.float32(0.0)
 
 
+def add_evidence(
+    gaussians: Gaussians,
+    view: View,
+    mask: np.ndarray,
+    weights: np.ndarray,
+    scale: float,
+    evidence: np.ndarray,
+) -> None:
+    """Add a view's sum of w * mask weight * scale, rounded, to evidence (N, num_ids) int64.
+
+    mask: (H, W) uint8 class ids, 0 = no label; weights: (H, W) float32
+    """
+    ids = np.flatnonzero(np.bincount(mask.ravel(), minlength=256)[1:]) + 1
+    if not len(ids) or not len(gaussians):
+        return
+    records, depths, _ = project_view(gaussian_arrays(gaussians), 0, camera_array(view))
+    tiles = sort_into_tiles((view.width, view.height), records, depths)
+    columns = np.full(256, NONE)
+    columns[ids] = np.arange(len(ids))
+    contributions = np.zeros((len(tiles.ranks), len(ids)), np.float32)
+    _lift(tiles, columns[mask], weights, contributions)
+    _collect(tiles, contributions, ids, scale, evidence)
+
+
 @numba.njit(cache=True, error_model="numpy")
-def _lift_tile(
-    records, ranks, instances, first, last, origin_x, origin_y, rows, columns, classes, pixels, contributions
-):
+def _lift_tile(tiles, tile, frame, classes, pixels, contributions):
     """Runs a tile front to back and writes sum(w * mask weight) of each instance and class into contributions
     (P, C).
 
     classes: (K,) columns of contributions; pixels: planes transmittance and mask weight of each of the K
         classes
     """
-    lane, low, high, limit = ramp(), splat(LOG2_MIN_ALPHA), splat(MAX_ALPHA), splat(MIN_TRANSMITTANCE)
+    records, lane = tiles.records, ramp()
     lines, ends = np.empty(3 * TILE, np.float32), np.empty(2 * TILE, np.int32)
     sums = np.empty(classes.shape[0] * LANES, np.float32)
-    for entry in range(first, last):
+    first = tiles.starts[tile]
+    for entry in range(first, tiles.starts[tile + 1]):
         if (entry - first) % CHECK == CHECK - 1 and finished(pixels):
             return
-        base = np.int64(ranks[entry]) * RECORD
-        first_row, last_row = measure_rows(records, base, origin_x, origin_y, rows, columns, lines, ends)
+        base = np.int64(tiles.ranks[entry]) * RECORD
+        first_row, last_row = measure_rows(records, base, frame, lines, ends)
         minus_decay = splat(-records[base + 3])
         sums[:] = _ZERO
         for row in range(first_row, last_row + 1):
-            column, end, center, peak = (
-                np.int64(ends[row]),
-                np.int64(ends[TILE + row]),
-                lines[TILE + row],
-                splat(lines[2 * TILE + row]),
-            )
+            center, peak = lines[TILE + row], splat(lines[2 * TILE + row])
+            column, end = np.int64(ends[row]), np.int64(ends[TILE + row])
             while column < end:
                 place = row * STRIDE + column
-                transmittance = load(pixels, place)
+                u = lane + splat(np.float32(column) - center)
                 column += LANES
-                if not any_at_least(transmittance, limit):
+                transmittance = load(pixels, place)
+                if not may_pass(transmittance):
                     continue
-                u = lane + splat(np.float32(column - LANES) - center)
-                exponent = fma(minus_decay * u, u, peak)
-                alpha = where_at_least(
-                    exponent, low, where_at_least(transmittance, limit, minimum(exp2(exponent), high))
-                )
-                w = alpha * transmittance
+                w = alpha_of(log2_alpha(minus_decay, u, peak), transmittance) * transmittance
                 store(pixels, place, transmittance - w)
                 for k in range(classes.shape[0]):
-                    store(
-                        sums, k * LANES, fma(w, load(pixels, place + (k + 1) * PLANE), load(sums, k * LANES))
-                    )
+                    weight = load(pixels, place + (k + 1) * PLANE)
+                    store(sums, k * LANES, fma(w, weight, load(sums, k * LANES)))
         for k in range(classes.shape[0]):
-            contributions[np.int64(instances[entry]), classes[k]] = total(load(sums, k * LANES))
+            contributions[np.int64(tiles.instances[entry]), classes[k]] = total(load(sums, k * LANES))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -108,56 +111,40 @@ def _classes_of(columns_image, top, left, rows, columns, slots):
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def lift(records, ranks, instances, starts, order, columns_image, weights, contributions):
+def _lift(tiles, columns_image, weights, contributions):
     """Sums of all tiles.
 
-    records: (M * 16,) in depth order; ranks, instances: (P,) tile by tile, starts (tiles + 1,); order:
-        (tiles,) permutation, for balance
     columns_image: (H, W) uint8 column of contributions that the pixel's class has, NONE = no label; weights:
         (H, W) float32 of the mask
     contributions: (P, C) float32, zero on entry
     """
     height, width = columns_image.shape
-    tiles_x = (width + TILE - 1) // TILE
-    for item in numba.prange(order.shape[0]):
-        tile = order[item]
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        rows, columns = min(TILE, height - top), min(TILE, width - left)
+    for item in numba.prange(tiles.order.shape[0]):
+        tile = tiles.order[item]
+        frame = tile_frame(tile, width, height)
+        left, top, rows, columns = frame
         slots = np.empty(NONE, np.int64)
         classes = _classes_of(columns_image, top, left, rows, columns, slots)
-        if starts[tile] < starts[tile + 1] and classes.shape[0] > 0:
+        if tiles.starts[tile] < tiles.starts[tile + 1] and classes.shape[0] > 0:
             pixels = np.empty((1 + classes.shape[0]) * PLANE, np.float32)
             open_tile(pixels, rows, columns)
             for row in range(rows):
                 for column in range(columns):
                     label = columns_image[top + row, left + column]
                     if label != NONE:
-                        pixels[(1 + slots[label]) * PLANE + row * STRIDE + column] = weights[
-                            top + row, left + column
-                        ]
-            _lift_tile(
-                records,
-                ranks,
-                instances,
-                starts[tile],
-                starts[tile + 1],
-                np.float32(left),
-                np.float32(top),
-                rows,
-                columns,
-                classes,
-                pixels,
-                contributions,
-            )
+                        place = (1 + slots[label]) * PLANE + row * STRIDE + column
+                        pixels[place] = weights[top + row, left + column]
+            _lift_tile(tiles, tile, frame, classes, pixels, contributions)
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def collect(visible, offsets, contributions, ids, scale, evidence):
+def _collect(tiles, contributions, ids, scale, evidence):
     """Adds the sums of each Gaussian's instances, times `scale` and rounded, to evidence (N, num_ids) int64.
 
     ids: (C,) column of evidence of each column of contributions. Whole numbers: the order of views does not
         matter.
     """
+    visible, offsets = tiles.visible, tiles.offsets
     for rank in numba.prange(visible.shape[0]):
         for k in range(ids.shape[0]):
             value = 0.0

@@ -1,6 +1,6 @@
 """The single-view normal loss with its analytic gradient as two passes over the image.
 
-`losses.normal_loss` with `losses.normals_from_depth` is the slow twin.
+`gpu.losses` has the slow twin.
 
 With a, b the differences of the 4 neighbors' points across and down, m = b x a, n = m / |m| and residual
 signs s = sign(A n - N):
@@ -14,6 +14,8 @@ import numba
 import numpy as np
 import torch
 from torch import Tensor
+
+from sc3d.splatting.consistency import ray_slopes
 
 
 def depth_normal_loss(
@@ -39,8 +41,7 @@ class _NormalLoss(torch.autograd.Function):
         planes = normal.detach().permute(2, 0, 1).contiguous().numpy()
         flat = (tensor.detach().contiguous().numpy() for tensor in (depth, alpha, edges))
         depth_array, alpha_array, edge_array = flat
-        columns = ((np.arange(width) + 0.5 - calibration[2]) / calibration[0]).astype(np.float32)
-        rows = ((np.arange(height) + 0.5 - calibration[3]) / calibration[1]).astype(np.float32)
+        columns, rows = ray_slopes(width, height, calibration)
         normal_slope, depth_slope = torch.zeros(3, height, width), torch.zeros(height, width)
         pulls, sums = np.zeros((height, width, 6), np.float32), np.zeros((height, 2))
         _compare(

@@ -1,5 +1,5 @@
 """1 - NCC of patches warped by their planes, with its analytic gradient, as one kernel;
-`losses.patch_dissimilarity_reference` is the slow twin.
+`gpu.losses` has the slow twin.
 
 A patch pixel with ray r (z = 1) lands at q = d R r - t (n . r), projected. With gray values a_p of the photo
 and b_p sampled at q_p, and
@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+PATCH_RADIUS = 3  # the kernel's 3, 7 and 49
 NOISE = 1 / 255**2
 """variance of gray values that counts as noise"""
 

@@ -1,5 +1,4 @@
-"""Numba kernels that turn Gaussians into screen-space records, and gradients of records into gradients of
-Gaussians.
+"""Numba kernels that turn Gaussians into screen-space records.
 
 The exponent of a splat is written with the Schur complement of its 2D covariance S instead of its inverse:
 with dx, dy = pixel - mean,
@@ -18,9 +17,14 @@ code.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
+from typing import NamedTuple
 
 import numba
 import numpy as np
+
+from sc3d.geometry.cameras import View
+from sc3d.splatting.gaussians import Gaussians
 
 RECORD = 16
 CHUNK = 256  # Gaussians per parallel work item
@@ -30,12 +34,64 @@ MIN_ALPHA = 1.0 / 255.0
 LOG2E_HALF = 0.5 * math.log2(math.e)
 # standard deviations at which an opaque splat falls to 1/255
 _REACH = math.sqrt(2.0 * math.log(255.0)) + 0.01
+# half image sizes that a mean may lie outside the image before its Jacobian is clamped: 1.3 tan(fov / 2)
+_JACOBIAN_MARGIN = 0.3
+_STREAMS = 16  # interleaving of work items, so that threads with contiguous shares get similar work
 _SLACK = 1e-3  # extents are this much too large (in log2 alpha), so that rounding never hides a fragment
 
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 _C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 _C0 = 0.28209479177387814
+
+
+class GaussianArrays(NamedTuple):
+    """The parameters of N Gaussians, shapes as in `Gaussians`, float32 and contiguous."""
+
+    means: np.ndarray
+    log_scales: np.ndarray
+    quats: np.ndarray
+    opacity_logits: np.ndarray
+    sh_dc: np.ndarray
+    sh_rest: np.ndarray
+
+
+def gaussian_arrays(gaussians: Gaussians) -> GaussianArrays:
+    """The tensors as arrays; memory is shared where they are contiguous."""
+    return GaussianArrays(
+        *(tensor.detach().contiguous().numpy() for tensor in gaussians.parameters().values())
+    )
+
+
+def camera_array(view: View) -> np.ndarray:
+    """(25,) float64: rotation (9, row-major), translation (3), fx, fy, cx, cy, width, height, camera center
+    (3), and the limits of x / z (2) and y / z (2) beyond which the Jacobian is that of the limit.
+    """
+    pose, focal, principal = view.cam_from_world, view.matrix[[0, 1], [0, 1]], view.matrix[:2, 2]
+    size = np.array([view.width, view.height], np.float64)
+    margin = _JACOBIAN_MARGIN * size / (2 * focal)
+    limits = np.stack([-principal / focal - margin, (size - principal) / focal + margin], axis=1)
+    return np.concatenate(
+        [pose[:3, :3].ravel(), pose[:3, 3], focal, principal, size, view.center, limits.ravel()]
+    )
+
+
+@lru_cache(maxsize=64)
+def interleaved(count: int) -> np.ndarray:
+    """(count,) int64 permutation: 0, 16, 32, ..., 1, 17, ..."""
+    return np.concatenate([np.arange(first, count, _STREAMS, np.int64) for first in range(_STREAMS)])
+
+
+def project_view(
+    gaussians: GaussianArrays, degree: int, camera: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Records (N, 16), camera depths (N,) and 3 sigma radii (N,), px; 0 where a Gaussian cannot touch the
+    image. camera: `camera_array`
+    """
+    count = len(gaussians.means)
+    records, depths, radii = np.empty((count, RECORD), np.float32), *np.zeros((2, count), np.float32)
+    project(gaussians, degree, camera, interleaved(-(-count // CHUNK)), records, depths, radii)
+    return records, depths, radii
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -170,7 +226,7 @@ def _covariance(axes, scales, j00, j11, j02, j12, rows):
 
 @numba.njit(cache=True, error_model="numpy")
 def _touches(center, half, size):
-    """Whether [center - half, center + half] holds a pixel center of 0.5, 1.5, ... size - 0.5; False for NaN."""
+    """Whether [center - half, center + half] holds a pixel center 0.5, 1.5, ... size - 0.5; False for NaN."""
     low, high = center - half, center + half
     return (
         low <= size - 0.5
@@ -180,54 +236,50 @@ def _touches(center, half, size):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _color(sh, degree, i, basis, channel):
-    value = 0.5
-    for k in range((degree + 1) * (degree + 1)):
-        value += basis[k] * sh[i, k, channel]
+def _color(gaussians, degree, i, basis, channel):
+    value = 0.5 + basis[0] * gaussians.sh_dc[i, channel]
+    for k in range(1, (degree + 1) * (degree + 1)):
+        value += basis[k] * gaussians.sh_rest[i, k - 1, channel]
     return value
 
 
+class _Scratch(NamedTuple):
+    rotation: np.ndarray
+    axes: np.ndarray
+    scales: np.ndarray
+    rows: np.ndarray
+    basis: np.ndarray
+
+
 @numba.njit(cache=True, error_model="numpy")
-def _project_one(
-    i,
-    means,
-    log_scales,
-    quats,
-    opacity_logits,
-    sh,
-    degree,
-    camera,
-    rotation,
-    axes,
-    scales,
-    rows,
-    basis,
-    records,
-):
-    """Fills the record of Gaussian i; returns (depth, 3 sigma radius in px), both 0 if it cannot touch the
-    image.
-    """
+def _near_image(i, means, log_scales, camera):
+    """Whether a sphere around Gaussian i may touch the image: asked before any expensive work."""
     x, y, z = _mean_cam(means, i, camera)
     if not z >= NEAR:
-        return 0.0, 0.0
-    width, height = camera[16], camera[17]
+        return False
     j00, j11, j02, j12, _, _ = _jacobian(x, y, z, camera)
     mean_x, mean_y = j00 * x + camera[14], j11 * y + camera[15]
-    # a sphere around it, before any expensive work
     bound = _REACH * math.exp(max(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2]))
     half_x, half_y = bound * (j00 + abs(j02)) + _REACH, bound * (j11 + abs(j12)) + _REACH
-    if not (
-        mean_x + half_x > 0.0
-        and mean_x - half_x < width
-        and mean_y + half_y > 0.0
-        and mean_y - half_y < height
-    ):
-        return 0.0, 0.0
-    log_opacity = -math.log2(np.float32(1.0) + math.exp(-opacity_logits[i]))
+    across = mean_x + half_x > 0.0 and mean_x - half_x < camera[16]
+    return across and mean_y + half_y > 0.0 and mean_y - half_y < camera[17]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _project_one(i, gaussians, degree, camera, scratch, records):
+    """Fills the record of Gaussian i, which is near the image; returns (depth, 3 sigma radius in px), both 0
+    if it cannot touch the image.
+    """
+    rotation, axes, scales, rows, basis = scratch
+    means, log_scales = gaussians.means, gaussians.log_scales
+    x, y, z = _mean_cam(means, i, camera)
+    j00, j11, j02, j12, _, _ = _jacobian(x, y, z, camera)
+    mean_x, mean_y = j00 * x + camera[14], j11 * y + camera[15]
+    log_opacity = -math.log2(np.float32(1.0) + math.exp(-gaussians.opacity_logits[i]))
     room = log_opacity - math.log2(MIN_ALPHA) + _SLACK
     if not room > _SLACK:
         return 0.0, 0.0
-    _axes_cam(quats, i, camera, rotation, axes)
+    _axes_cam(gaussians.quats, i, camera, rotation, axes)
     for k in range(3):
         scales[k] = math.exp(log_scales[i, k])
     sxx, sxy, syy = _covariance(axes, scales, j00, j11, j02, j12, rows)
@@ -236,8 +288,8 @@ def _project_one(
     if not (
         determinant > 0.0
         and math.isfinite(determinant)
-        and _touches(mean_x, half_x, width)
-        and _touches(mean_y, half_y, height)
+        and _touches(mean_x, half_x, camera[16])
+        and _touches(mean_y, half_y, camera[17])
     ):
         return 0.0, 0.0
     distance = math.sqrt(x * x + y * y + z * z)
@@ -255,7 +307,7 @@ def _project_one(
     )
     records[i, 6], records[i, 7], records[i, 15] = half_x, half_y, half_x * sxy / sxx
     for k in range(3):
-        records[i, 8 + k] = max(_color(sh, degree, i, basis, k), 0.0)
+        records[i, 8 + k] = max(_color(gaussians, degree, i, basis, k), 0.0)
         records[i, 11 + k] = sign * axes[k, axis]
     records[i, 14] = abs(facing)
     middle = 0.5 * (sxx + syy)
@@ -263,38 +315,15 @@ def _project_one(
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def project(means, log_scales, quats, opacity_logits, sh, degree, camera, order, records, depths, radii):
-    """Records (N, 16), camera depths (N,) and 3 sigma radii (N,), px; 0 where a Gaussian cannot touch the
-    image.
-
-    camera: (25,) float64: rotation (9, row-major), translation (3), fx, fy, cx, cy, width, height, camera
-        center (3), and the limits of
-        x / z (2) and y / z (2) beyond which the Jacobian is that of the limit
-    order: permutation of the chunks, for balance between threads
+def project(gaussians, degree, camera, order, records, depths, radii):
+    """Fills what `project_view` returns; depths and radii are zero on entry. order: permutation of the
+    chunks.
     """
-    count = means.shape[0]
+    count, means, log_scales = depths.shape[0], gaussians.means, gaussians.log_scales
     for item in numba.prange(order.shape[0]):
-        rotation, axes, scales, rows, basis = (
-            np.empty((3, 3)),
-            np.empty((3, 3)),
-            np.empty(3),
-            np.empty((2, 3)),
-            np.full(16, _C0),
+        scratch = _Scratch(
+            np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty((2, 3)), np.full(16, _C0)
         )
         for i in range(order[item] * CHUNK, min(count, (order[item] + 1) * CHUNK)):
-            depths[i], radii[i] = _project_one(
-                i,
-                means,
-                log_scales,
-                quats,
-                opacity_logits,
-                sh,
-                degree,
-                camera,
-                rotation,
-                axes,
-                scales,
-                rows,
-                basis,
-                records,
-            )
+            if _near_image(i, means, log_scales, camera):
+                depths[i], radii[i] = _project_one(i, gaussians, degree, camera, scratch, records)

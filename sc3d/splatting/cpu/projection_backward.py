@@ -1,6 +1,4 @@
-"""Numba kernels: from per-instance raster gradients to gradients of the five parameter tensors (reverse of
-`kernels_project`).
-"""
+"""Numba kernels: the reverse of `projection`, from raster gradients of instances to those of parameters."""
 
 from __future__ import annotations
 
@@ -47,10 +45,11 @@ def _plane_gradient(sums, axes, axis, x, y, z, grad_axes, grad_mean):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _color_gradient(i, sums, means, sh, degree, camera, basis, slopes, grad_sh, grad_means):
+def _color_gradient(i, sums, gaussians, degree, camera, basis, slopes, gradients):
     """Gradient of the SH coefficients, and of the mean through the viewing direction. Channels clamped at 0
     have none.
     """
+    means, rest = gaussians.means, gaussians.sh_rest
     dx, dy, dz = means[i, 0] - camera[18], means[i, 1] - camera[19], means[i, 2] - camera[20]
     distance = math.sqrt(dx * dx + dy * dy + dz * dz)
     dx, dy, dz = dx / distance, dy / distance, dz / distance
@@ -59,22 +58,23 @@ def _color_gradient(i, sums, means, sh, degree, camera, basis, slopes, grad_sh, 
     gx, gy, gz = 0.0, 0.0, 0.0
     for channel in range(3):
         gradient = sums[8 + channel]
-        if _color(sh, degree, i, basis, channel) < 0.0:
+        if _color(gaussians, degree, i, basis, channel) < 0.0:
             continue
-        for k in range((degree + 1) * (degree + 1)):
-            grad_sh[i, k, channel] = gradient * basis[k]
-            gx += gradient * sh[i, k, channel] * slopes[k, 0]
-            gy += gradient * sh[i, k, channel] * slopes[k, 1]
-            gz += gradient * sh[i, k, channel] * slopes[k, 2]
+        gradients.sh_dc[i, channel] = gradient * basis[0]
+        for k in range(1, (degree + 1) * (degree + 1)):
+            gradients.sh_rest[i, k - 1, channel] = gradient * basis[k]
+            gx += gradient * rest[i, k - 1, channel] * slopes[k, 0]
+            gy += gradient * rest[i, k - 1, channel] * slopes[k, 1]
+            gz += gradient * rest[i, k - 1, channel] * slopes[k, 2]
     along = gx * dx + gy * dy + gz * dz
-    grad_means[i, 0] += (gx - along * dx) / distance
-    grad_means[i, 1] += (gy - along * dy) / distance
-    grad_means[i, 2] += (gz - along * dz) / distance
+    gradients.means[i, 0] += (gx - along * dx) / distance
+    gradients.means[i, 1] += (gy - along * dy) / distance
+    gradients.means[i, 2] += (gz - along * dz) / distance
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _quat_gradient(i, quats, scale, g, grad_quats):
-    """Gradient of the unnormalized quaternion from g (3, 3), that of the rotation matrix; scale = 1 / |quat|."""
+    """Gradient of the unnormalized quaternion from g (3, 3), that of the rotation; scale = 1 / |quat|."""
     w, x, y, z = quats[i, 0] * scale, quats[i, 1] * scale, quats[i, 2] * scale, quats[i, 3] * scale
     gw = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
     gx = 2 * (
@@ -102,7 +102,7 @@ def _quat_gradient(i, quats, scale, g, grad_quats):
 
 @numba.njit(cache=True, error_model="numpy")
 def _screen_gradient(sums, a, h, m):
-    """Gradient of the 2D mean (x, y) and of Sxx, Sxy, Syy from the pixel sums (see `kernels_project` for a,
+    """Gradient of the 2D mean (x, y) and of Sxx, Sxy, Syy from the pixel sums (see `projection` for a,
     h, m).
     """
     grad_x = a * sums[1]
@@ -151,29 +151,19 @@ def _projection_gradient(
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
 def project_backward(
-    visible,
-    offsets,
-    gradients,
-    means,
-    log_scales,
-    quats,
-    opacity_logits,
-    sh,
-    degree,
-    camera,
-    grad_means,
-    grad_log_scales,
-    grad_quats,
-    grad_opacity_logits,
-    grad_sh,
-    gradient,
-    absolute_gradient,
+    tiles, sums_of_instances, gaussians, degree, camera, gradients, lengths, absolute_lengths
 ):
-    """Fills the rows of visible Gaussians in the five gradients (zero elsewhere) and in the two densification
-    statistics.
+    """Fills the rows of visible Gaussians in their gradients and in the two densification statistics, all
+    zero on entry.
 
-    visible: (M,) Gaussian ids; offsets: (M + 1,) first raster gradient of each in gradients (P, 16)
+    tiles: `TileLists`; sums_of_instances: (P, 16) raster gradients; gradients: `GaussianArrays`
+    lengths, absolute_lengths: (N,) length of the gradient by the 2D mean, NDC units, and the same from
+        absolute gradients of pixels
     """
+    visible, offsets = tiles.visible, tiles.offsets
+    means, log_scales = gaussians.means, gaussians.log_scales
+    # numba drops writes to a record's arrays in the body of prange
+    grad_means, grad_log_scales, grad_logits = gradients.means, gradients.log_scales, gradients.opacity_logits
     count = visible.shape[0]
     for item in numba.prange((count + CHUNK - 1) // CHUNK):
         rotation, axes, scales, rows = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty((2, 3))
@@ -186,10 +176,10 @@ def project_backward(
         basis, slopes, sums = np.empty(16), np.empty((16, 3)), np.empty(SUMS)
         for rank in range(item * CHUNK, min(count, (item + 1) * CHUNK)):
             i = visible[rank]
-            _total(offsets[rank], offsets[rank + 1], gradients, sums)
+            _total(offsets[rank], offsets[rank + 1], sums_of_instances, sums)
             x, y, z = _mean_cam(means, i, camera)
             jacobian = _jacobian(x, y, z, camera)
-            scale = _axes_cam(quats, i, camera, rotation, axes)
+            scale = _axes_cam(gaussians.quats, i, camera, rotation, axes)
             for k in range(3):
                 scales[k] = math.exp(log_scales[i, k])
             sxx, sxy, syy = _covariance(
@@ -213,8 +203,8 @@ def project_backward(
                         + camera[3 + row] * grad_axes[1, k]
                         + camera[6 + row] * grad_axes[2, k]
                     )
-            _quat_gradient(i, quats, scale, grad_rotation, grad_quats)
-            _color_gradient(i, sums, means, sh, degree, camera, basis, slopes, grad_sh, grad_means)
-            grad_opacity_logits[i] = sums[0] / (1.0 + math.exp(opacity_logits[i]))
-            gradient[i] = math.hypot(screen[0] * camera[16] * 0.5, screen[1] * camera[17] * 0.5)
-            absolute_gradient[i] = math.hypot(sums[6] * camera[16] * 0.5, sums[7] * camera[17] * 0.5)
+            _quat_gradient(i, gaussians.quats, scale, grad_rotation, gradients.quats)
+            _color_gradient(i, sums, gaussians, degree, camera, basis, slopes, gradients)
+            grad_logits[i] = sums[0] / (1.0 + math.exp(gaussians.opacity_logits[i]))
+            lengths[i] = math.hypot(screen[0] * camera[16] * 0.5, screen[1] * camera[17] * 0.5)
+            absolute_lengths[i] = math.hypot(sums[6] * camera[16] * 0.5, sums[7] * camera[17] * 0.5)

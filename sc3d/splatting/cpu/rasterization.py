@@ -1,13 +1,12 @@
 """Numba kernels that composite tiles front to back.
 
 Inside a tile the Gaussian is the outer loop, its rows come next, and runs of 8 pixels between the ends of its
-ellipse are the inner one.
-All pixel state of a tile lives in one small flat buffer, plane after plane, with rows padded so that a run
-may start at any column;
-padding and pixels outside the image have transmittance 0 and so never count. See `kernels_project` for the
-record and its u, m, a, h.
-`kernels_unraster` repeats the walk: what decides whether a fragment counts is the same operations in both, so
-both see the same fragments.
+ellipse are the inner one. All pixel state of a tile lives in one small flat buffer, plane after plane, with
+rows padded so that a run may start at any column; padding and pixels outside the image have transmittance 0
+and so never count. See `projection` for the record and its u, m, a, h.
+
+`rasterization_backward` and `label_lifting` repeat the walk with the functions of this module, so all see the
+same fragments.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from sc3d.splatting.cpu.simd import (
     total,
     where_at_least,
 )
-from sc3d.splatting.cpu.tile_binning import ROOM, TILE, first_pixel, last_pixel
+from sc3d.splatting.cpu.tile_binning import ROOM, TILE, first_pixel, last_pixel, tile_frame
 
 MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4
@@ -68,14 +67,16 @@ def finished(pixels):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def measure_rows(records, base, origin_x, origin_y, rows, columns, lines, ends):
+def measure_rows(records, base, frame, lines, ends):
     """Where the ellipse of a record meets the 16 pixel rows of a tile; returns first and last row.
 
+    frame: of `tile_frame`
     lines (3 * 16,): dy, center - 0.5 (px, tile frame) and log2 alpha at the center of each row
     ends (2 * 16,): first column and one past the last column of each row
     """
-    mean_y, half_y = records[base + 1] - origin_y, records[base + 7]
-    mean_x, slope = splat(records[base] - origin_x - _HALF), splat(records[base + 2])
+    left, top, rows, columns = np.float32(frame[0]), np.float32(frame[1]), frame[2], frame[3]
+    mean_y, half_y = records[base + 1] - top, records[base + 7]
+    mean_x, slope = splat(records[base] - left - _HALF), splat(records[base + 2])
     minus_decay_y, log_opacity, inverse_decay = (
         splat(-records[base + 4]),
         splat(records[base + 5]),
@@ -95,114 +96,108 @@ def measure_rows(records, base, origin_x, origin_y, rows, columns, lines, ends):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _forward_tile(
-    records, ranks, instances, first, last, origin_x, origin_y, rows, columns, geometry, pixels, contributions
-):
+def may_pass(transmittance):
+    """Whether any of 8 pixels lets light through."""
+    return any_at_least(transmittance, splat(MIN_TRANSMITTANCE))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def log2_alpha(minus_decay, u, peak):
+    """log2 alpha of 8 pixels, without its limits."""
+    return fma(minus_decay * u, u, peak)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def alpha_of(exponent, transmittance):
+    """Alpha of 8 pixels; 0 below 1/255, and where no light comes through."""
+    alpha = where_at_least(transmittance, splat(MIN_TRANSMITTANCE), minimum(exp2(exponent), splat(MAX_ALPHA)))
+    return where_at_least(exponent, splat(LOG2_MIN_ALPHA), alpha)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def add_to_plane(pixels, place, w, value):
+    """Adds w * value to 8 pixels."""
+    store(pixels, place, fma(w, value, load(pixels, place)))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _forward_tile(tiles, tile, frame, geometry, pixels, contributions):
     """Composites one tile into `pixels`; contributions (P, 2): sum of weights and largest transmittance of
     each instance.
     """
-    lane, low, high, limit = ramp(), splat(LOG2_MIN_ALPHA), splat(MAX_ALPHA), splat(MIN_TRANSMITTANCE)
+    records, lane, low = tiles.records, ramp(), splat(LOG2_MIN_ALPHA)
     lines, ends = np.empty(3 * TILE, np.float32), np.empty(2 * TILE, np.int32)
-    for entry in range(first, last):
+    first = tiles.starts[tile]
+    for entry in range(first, tiles.starts[tile + 1]):
         if (entry - first) % CHECK == CHECK - 1 and finished(pixels):
             return
-        base = np.int64(ranks[entry]) * RECORD
-        first_row, last_row = measure_rows(records, base, origin_x, origin_y, rows, columns, lines, ends)
+        base = np.int64(tiles.ranks[entry]) * RECORD
+        first_row, last_row = measure_rows(records, base, frame, lines, ends)
         minus_decay = splat(-records[base + 3])
         red, green, blue = splat(records[base + 8]), splat(records[base + 9]), splat(records[base + 10])
-        normal_x, normal_y, normal_z = (
-            splat(records[base + 11]),
-            splat(records[base + 12]),
-            splat(records[base + 13]),
-        )
+        nx, ny, nz = splat(records[base + 11]), splat(records[base + 12]), splat(records[base + 13])
         distance = splat(records[base + 14])
         weight, brightest = splat(_ZERO), splat(_ZERO)
         for row in range(first_row, last_row + 1):
-            column, end, center, peak = (
-                np.int64(ends[row]),
-                np.int64(ends[TILE + row]),
-                lines[TILE + row],
-                splat(lines[2 * TILE + row]),
-            )
+            center, peak = lines[TILE + row], splat(lines[2 * TILE + row])
+            column, end = np.int64(ends[row]), np.int64(ends[TILE + row])
             while column < end:
                 place = row * STRIDE + column
-                transmittance = load(pixels, place)
-                if not any_at_least(transmittance, limit):
-                    column += LANES
-                    continue
                 u = lane + splat(np.float32(column) - center)
-                exponent = fma(minus_decay * u, u, peak)
-                alpha = where_at_least(
-                    exponent, low, where_at_least(transmittance, limit, minimum(exp2(exponent), high))
-                )
-                w = alpha * transmittance
+                column += LANES
+                transmittance = load(pixels, place)
+                if not may_pass(transmittance):
+                    continue
+                exponent = log2_alpha(minus_decay, u, peak)
+                w = alpha_of(exponent, transmittance) * transmittance
                 store(pixels, place, transmittance - w)
                 weight = weight + w
                 brightest = maximum(brightest, where_at_least(exponent, low, transmittance))
-                store(pixels, place + PLANE, fma(w, red, load(pixels, place + PLANE)))
-                store(pixels, place + 2 * PLANE, fma(w, green, load(pixels, place + 2 * PLANE)))
-                store(pixels, place + 3 * PLANE, fma(w, blue, load(pixels, place + 3 * PLANE)))
+                add_to_plane(pixels, place + PLANE, w, red)
+                add_to_plane(pixels, place + 2 * PLANE, w, green)
+                add_to_plane(pixels, place + 3 * PLANE, w, blue)
                 if geometry:
-                    store(pixels, place + 4 * PLANE, fma(w, normal_x, load(pixels, place + 4 * PLANE)))
-                    store(pixels, place + 5 * PLANE, fma(w, normal_y, load(pixels, place + 5 * PLANE)))
-                    store(pixels, place + 6 * PLANE, fma(w, normal_z, load(pixels, place + 6 * PLANE)))
-                    store(pixels, place + 7 * PLANE, fma(w, distance, load(pixels, place + 7 * PLANE)))
-                column += LANES
-        instance, seen = np.int64(instances[entry]), largest(brightest)
-        contributions[instance, 0], contributions[instance, 1] = (
-            total(weight),
-            seen if seen >= MIN_TRANSMITTANCE else _ZERO,
-        )
+                    add_to_plane(pixels, place + 4 * PLANE, w, nx)
+                    add_to_plane(pixels, place + 5 * PLANE, w, ny)
+                    add_to_plane(pixels, place + 6 * PLANE, w, nz)
+                    add_to_plane(pixels, place + 7 * PLANE, w, distance)
+        instance, seen = np.int64(tiles.instances[entry]), largest(brightest)
+        contributions[instance, 0] = total(weight)
+        contributions[instance, 1] = seen if seen >= MIN_TRANSMITTANCE else _ZERO
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def rasterize(records, ranks, instances, starts, order, background, geometry, image, contributions):
+def rasterize(tiles, background, geometry, image, contributions):
     """Composites all tiles.
 
-    records: (M * 16,) in depth order; ranks, instances: (P,) tile by tile, starts (tiles + 1,); order:
-        (tiles,) permutation, for balance
-    background: (3,); image: (8, H, W) filled with color, normal, plane distance, alpha; contributions: (P,
-        2), zero on entry
+    tiles: `TileLists`; background: (3,); image: (8, H, W) filled with color, normal, plane distance, alpha
+    contributions: (P, 2) filled with sum of weights and largest transmittance of each instance, zero on entry
     """
     height, width = image.shape[1], image.shape[2]
-    tiles_x = (width + TILE - 1) // TILE
-    for item in numba.prange(order.shape[0]):
-        tile = order[item]
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        rows, columns = min(TILE, height - top), min(TILE, width - left)
+    for item in numba.prange(tiles.order.shape[0]):
+        tile = tiles.order[item]
+        frame = tile_frame(tile, width, height)
+        left, top, rows, columns = frame
         pixels = np.empty(CHANNELS * PLANE, np.float32)
         open_tile(pixels, rows, columns)
-        _forward_tile(
-            records,
-            ranks,
-            instances,
-            starts[tile],
-            starts[tile + 1],
-            np.float32(left),
-            np.float32(top),
-            rows,
-            columns,
-            geometry,
-            pixels,
-            contributions,
-        )
+        _forward_tile(tiles, tile, frame, geometry, pixels, contributions)
         for row in range(rows):
             for column in range(columns):
-                place = row * STRIDE + column
+                place, y, x = row * STRIDE + column, top + row, left + column
                 for channel in range(3):
-                    image[channel, top + row, left + column] = (
-                        pixels[place + (channel + 1) * PLANE] + pixels[place] * background[channel]
-                    )
+                    color = pixels[place + (channel + 1) * PLANE]
+                    image[channel, y, x] = color + pixels[place] * background[channel]
                 for channel in range(3, 7):
-                    image[channel, top + row, left + column] = pixels[place + (channel + 1) * PLANE]
-                image[7, top + row, left + column] = _ONE - pixels[place]
+                    image[channel, y, x] = pixels[place + (channel + 1) * PLANE]
+                image[7, y, x] = _ONE - pixels[place]
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def collect_contributions(visible, offsets, contributions, weight, max_transmittance):
+def collect_contributions(tiles, contributions, weight, max_transmittance):
     """Per Gaussian: sum of its instances' weights and largest transmittance; rows of invisible Gaussians are
     not touched.
     """
+    visible, offsets = tiles.visible, tiles.offsets
     for rank in numba.prange(visible.shape[0]):
         total_weight, largest_seen = 0.0, _ZERO
         for instance in range(offsets[rank], offsets[rank + 1]):

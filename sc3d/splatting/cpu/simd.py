@@ -91,7 +91,7 @@ def load(typingctx, array, index):
 
 @intrinsic
 def store(typingctx, array, index, value):
-    """Write eight neighbors of a flat contiguous float32 array from `index`; no bounds check, any alignment."""
+    """Write eight neighbors of a flat contiguous float32 array from `index`; no check, any alignment."""
 
     def codegen(context, builder, sig, args):
         builder.store(

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sc3d.splatting import device
 from sc3d.splatting.cpu.simd import LANES, absolute, fma, load, ramp, splat, store, total, where_at_least
 
 _RADIUS = 5
@@ -22,48 +21,20 @@ _HALO = LANES  # columns to the left and right of a block; at least the radius
 _ROWS, _COLUMNS = 64, 128  # block of one work item; 11 rows of it stay in the first-level cache
 _WIDTH = _COLUMNS + 2 * _HALO
 _PLANE = (_ROWS + 2 * _RADIUS) * _WIDTH
-_WEIGHTS = np.exp(-0.5 * (np.arange(_RADIUS + 1) / 1.5) ** 2)
-_W0, _W1, _W2, _W3, _W4, _W5 = (
-    np.float32(weight) for weight in _WEIGHTS / (_WEIGHTS[0] + 2 * _WEIGHTS[1:].sum())
-)
-_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
+_TAPS = np.exp(-0.5 * (np.arange(_RADIUS + 1) / 1.5) ** 2)
+WINDOW = (_TAPS / (_TAPS[0] + 2 * _TAPS[1:].sum())).astype(np.float32)
+"""Taps of the window from its middle on."""
+C1, C2 = 0.01**2, 0.03**2
+_W0, _W1, _W2, _W3, _W4, _W5 = WINDOW
+_C1, _C2 = np.float32(C1), np.float32(C2)
 _ZERO = np.float32(0.0)
 
 
-def ssim_loss(image: Tensor, target: Tensor) -> Tensor:
-    """1 - mean SSIM of two (H, W, 3) images in [0, 1]; differentiable in `image` only."""
-    return image_loss(image, target, 1.0)
-
-
-def image_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+def image_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
     """(1 - ssim_weight) mean |image - target| + ssim_weight (1 - mean SSIM) of two (H, W, 3) images;
-    differentiable in `image` only.
-
-    Fastest for float32 images stored plane by plane (as `render` returns them), e.g. `target.permute(2, 0,
-    1).contiguous().permute(1, 2, 0)`.
+    differentiable in `image` only; fastest for float32 images stored plane by plane.
     """
-    if device.has_kernels(image):
-        return _ImageLoss.apply(image, target, 1.0 - ssim_weight, ssim_weight)
-    return image_loss_torch(image, target, ssim_weight)
-
-
-def image_loss_torch(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """`image_loss` in torch operations, for GPUs."""
-    x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)
-    mx, my, squares, product = _blurred(torch.cat([x, y, x * x + y * y, x * y])).chunk(4)
-    means, energy = mx * my, mx * mx + my * my
-    c1, c2 = float(_C1), float(_C2)
-    similarity = (2 * means + c1) * (2 * (product - means) + c2) / ((energy + c1) * (squares - energy + c2))
-    return (1 - ssim_weight) * (x - y).abs().mean() + ssim_weight * (1 - similarity.mean())
-
-
-def _blurred(planes: Tensor) -> Tensor:
-    """(P, H, W) planes under the window, zero outside."""
-    taps = planes.new_tensor(
-        np.concatenate([_WEIGHTS[:0:-1], _WEIGHTS]) / (_WEIGHTS[0] + 2 * _WEIGHTS[1:].sum())
-    )
-    down = torch.nn.functional.conv2d(planes[:, None], taps[None, None, :, None], padding=(_RADIUS, 0))
-    return torch.nn.functional.conv2d(down, taps[None, None, None, :], padding=(0, _RADIUS))[:, 0]
+    return _ImageLoss.apply(image, target, 1.0 - ssim_weight, ssim_weight)
 
 
 class _ImageLoss(torch.autograd.Function):

@@ -9,16 +9,58 @@ are listed.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
-from sc3d.splatting.cpu.projection import MIN_ALPHA
+from sc3d.splatting.cpu.projection import MIN_ALPHA, interleaved
 
 TILE = 16
-# log2 alpha above 1/255; half the slack of the extents in `kernels_project`
+# log2 alpha above 1/255; half the slack of the extents in `projection`
 ROOM = np.float32(-math.log2(MIN_ALPHA) + 5e-4)
+_BLOCKS = 8  # work items of the counting sort
 _HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0.0), np.float32(1.0)
+
+
+class TileLists(NamedTuple):
+    """What touches which tile: P instances of M visible Gaussians.
+
+    visible: (M,) Gaussian ids; offsets: (M + 1,) first instance of each; records: (M * 16,) near to far
+    ranks, instances: (P,) tile by tile and near to far, row in `records` and number; starts: (tiles + 1,)
+    order: (tiles,) permutation in which threads share the tiles
+    """
+
+    visible: np.ndarray
+    offsets: np.ndarray
+    records: np.ndarray
+    ranks: np.ndarray
+    instances: np.ndarray
+    starts: np.ndarray
+    order: np.ndarray
+
+
+def sort_into_tiles(size: tuple[int, int], all_records: np.ndarray, depths: np.ndarray) -> TileLists:
+    """Tile lists of the records (N, 16) with a depth above 0. size: width, height, px"""
+    width, height = size
+    visible = np.flatnonzero(depths)
+    order, records = _near_to_far(depths[visible]), np.empty((len(visible), all_records.shape[1]), np.float32)
+    tiles = -(-width // TILE) * -(-height // TILE)
+    histograms, starts = np.zeros((_BLOCKS, tiles), np.int32), np.empty(tiles + 1, np.int64)
+    offsets = np.zeros(len(visible) + 1, np.int64)
+    count_instances(order, visible, all_records, records, width, height, histograms, offsets[1:])
+    np.cumsum(offsets, out=offsets)
+    place_blocks(histograms, starts)
+    ranks, instances = np.empty(offsets[-1], np.int32), np.empty(offsets[-1], np.int32)
+    place_instances(order, records, width, height, histograms, offsets, ranks, instances)
+    return TileLists(visible, offsets, records.reshape(-1), ranks, instances, starts, interleaved(tiles))
+
+
+def _near_to_far(depths: np.ndarray) -> np.ndarray:
+    """(M,) indices that sort positive float32 depths; ties by index."""
+    keys = depths.view(np.uint32).astype(np.uint64) << np.uint64(32) | np.arange(len(depths), dtype=np.uint64)
+    keys.sort()
+    return (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -34,6 +76,14 @@ def first_pixel(low, limit):
 def last_pixel(high, limit):
     """Largest pixel index <= limit whose center is <= high, at least -1."""
     return np.int64(min(max(high + _HALF, _ZERO), np.float32(limit) + _ONE)) - 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def tile_frame(tile, width, height):
+    """Left, top, rows and columns of a tile, px."""
+    tiles_x = (width + TILE - 1) // TILE
+    left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    return left, top, min(TILE, height - top), min(TILE, width - left)
 
 
 @numba.njit(cache=True, error_model="numpy")

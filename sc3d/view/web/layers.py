@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -206,7 +207,7 @@ class CameraLayer:
     def __init__(self, server: viser.ViserServer, views: Sequence[View], depth: float) -> None:
         """depth: length of the pyramids, world units"""
         self._root = server.scene.add_frame("/cameras", show_axes=False)
-        self._handles: dict[str, viser.CameraFrustumHandle] = {}
+        self._handles = {}
         for view in views:
             pinhole = undistorted(view)
             fov, aspect = field_of_view(pinhole)
@@ -227,7 +228,7 @@ class CameraLayer:
     def on_click(self, chosen: Callable[[str, viser.ClientHandle], None]) -> None:
         """Call `chosen` with the name of the photo whose camera is clicked, and the browser."""
         for name, handle in self._handles.items():
-            _call_on_click(handle, name, chosen)
+            handle.on_click(partial(_click, chosen, name))
 
     def set_images(self, images: dict[str, np.ndarray]) -> None:
         """Photos in the pyramids of these cameras, and of no others: (h, w, 3) uint8 RGB by name."""
@@ -250,10 +251,10 @@ class CameraLayer:
         self._root.visible = visible
 
 
-def _call_on_click(
-    handle: viser.CameraFrustumHandle, name: str, chosen: Callable[[str, viser.ClientHandle], None]
+def _click(
+    chosen: Callable[[str, viser.ClientHandle], None], name: str, event: viser.SceneNodePointerEvent
 ) -> None:
-    handle.on_click(lambda event: chosen(name, event.client))
+    chosen(name, event.client)
 
 
 def node_name(table: ClassTable | None, label: int) -> str:

@@ -135,7 +135,8 @@ def write_page(path: Path, view: WebView) -> None:
             layer.show(by == view.by and not view.splats_first)
         load = view.load_splats
         if view.splats_first and load is not None:
-            SplatLayer(server, lambda: load().most_visible(FILE_SPLATS), display, view.by, hidden).show(True)
+            few = SplatLayer(server, lambda: load().most_visible(FILE_SPLATS), display, view.by, hidden)
+            few.show(True)
         views = [one.shifted(display.origin) for one in view.drawn_views]
         CameraLayer(server, views, frustum_depth(views, display.points) if views else 1.0)
         _start(server, view, display, views)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -52,13 +53,12 @@ class ShowPanel:
     def __init__(self, page: Page, by: Coloring, hidden: set[int], splats_first: bool) -> None:
         self._page, self.hidden, gui = page, set(hidden), page.server.gui
         with gui.add_folder("Show"):
-            splats = page.splats
-            if splats is not None:
+            if page.splats is not None:
                 layers = gui.add_dropdown(
                     "Layers", ("cloud", "splats", "both"), initial_value="splats" if splats_first else "cloud"
                 )
-                layers.on_update(lambda _: self._choose_layers(layers.value, splats))
-                self._choose_layers(layers.value, splats)
+                layers.on_update(lambda _: self._choose_layers(layers.value))
+                self._choose_layers(layers.value)
             self._by = gui.add_dropdown("Color by", page.display.colorings, initial_value=by)
             self._legend = gui.add_html(legend_html(by, page.display))
             has_relief = page.display.has_relief
@@ -99,20 +99,22 @@ class ShowPanel:
             *(label for label in counts if label),
             *([0] if 0 in counts or self._page.splats is not None else []),
         ]:
-            self._add_class(gui, label, table.name(label), counts.get(label, 0))
+            box = gui.add_checkbox(
+                table.name(label), label not in self.hidden, hint=f"{counts.get(label, 0):,} points"
+            )
+            box.on_update(partial(self._switch_class, label))
 
-    def _add_class(self, gui: viser.GuiApi, label: int, name: str, count: int) -> None:
-        box = gui.add_checkbox(name, label not in self.hidden, hint=f"{count:,} points")
-        box.on_update(lambda _: self._show_class(label, box.value))
-
-    def _choose_layers(self, name: str, splats: SplatLayer) -> None:
+    def _choose_layers(self, name: str) -> None:
         self._page.cloud.show(name != "splats")
+        if self._page.splats is None:
+            return
         try:
-            splats.show(name != "cloud")
+            self._page.splats.show(name != "cloud")
         except Sc3dError as error:  # they are read when they are first shown
             logger.warning("the splats cannot be shown: %s", error)
 
-    def _show_class(self, label: int, visible: bool) -> None:
+    def _switch_class(self, label: int, event: viser.GuiEvent) -> None:
+        visible = event.target.value
         (self.hidden.discard if visible else self.hidden.add)(label)
         for layer in (self._page.cloud, self._page.splats):
             if layer is not None:
@@ -145,8 +147,7 @@ class PhotoPanel:
 
     def choose(self, name: str) -> None:
         """Show a photo."""
-        # calls `_show`
-        self._names.value = name  # type: ignore[misc]  # viser defines the setter apart from its property
+        self._names.value = name  # type: ignore[misc]  # calls `_show`; viser types it as read-only
 
     def _show(self, name: str) -> None:
         self._page.cameras.hide(None)

@@ -307,7 +307,7 @@ def two_layers(table) -> DisplaySplats:
         torch.full((count, 3), float(np.log(0.3))),
         torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
         torch.full((count,), 6.0),
-        torch.zeros(count, 1, 3),
+        torch.zeros(count, 3),
     )
     return DisplaySplats(
         gaussians,

@@ -1,17 +1,15 @@
-"""`render.render` for Gaussians on a GPU, through gsplat's low-level functions (written against gsplat
-1.5.3).
+"""The GPU backend of `rendering.render`: gsplat's low-level functions (written against gsplat 1.5.3).
 
 The rules are those of the CPU kernels: near plane 0.01, +0.3 px^2, Jacobian clamp at 1.3 tan(fov / 2) around
-the real principal point, pixel centers
-at +0.5, fragments from alpha 1/255 on. gsplat bins boxes of min(3.33, sqrt(2 ln(255 opacity))) standard
-deviations, rounded up to whole pixels;
-alpha is below 1/255 outside of them, so no fragment is lost. It differs in four ways:
+the real principal point, pixel centers at +0.5, fragments from alpha 1/255 on. gsplat bins boxes of
+min(3.33, sqrt(2 ln(255 opacity))) standard deviations, rounded up to whole pixels; alpha is below 1/255
+outside of them, so no fragment is lost. It differs in four ways:
 - alpha is limited to 0.999 instead of 0.99;
 - a pixel ends before the fragment that would bring its transmittance to 1e-4 instead of after it;
 - a Gaussian is visible (radius > 0) if that box touches the image, the CPU's if the box without rounding
-    holds a pixel center;
+  holds a pixel center;
 - sums are float32 in the order of the GPU's atomic additions: gradients vary in their last digits from run to
-    run.
+  run.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import View
 from sc3d.splatting.device import INSTALL
 from sc3d.splatting.gaussians import Gaussians
-from sc3d.splatting.rendering import Rendering, ViewStatistics
+from sc3d.splatting.rendered_view import Rendering, ViewStatistics
 
 TILE = 16
 NEAR = 0.01
@@ -65,8 +63,7 @@ def cuda_functions() -> Functions:
         from gsplat.cuda._backend import _C as kernels
     except Exception as error:  # whatever its build raises
         raise MissingPackageError(
-            f"gsplat has no CUDA kernels and cannot compile them ({type(error).__name__}): install a gsplat wheel built for "
-            "this torch, or the CUDA toolkit (or use --device cpu)"
+            f"gsplat has no CUDA kernels and cannot compile them ({type(error).__name__}): install a gsplat wheel built for this torch, or the CUDA toolkit (or use --device cpu)"
         ) from None
     if kernels is None:
         raise MissingPackageError(
@@ -79,11 +76,10 @@ def cuda_functions() -> Functions:
 class _Screen:
     """N Gaussians projected into one view, in gsplat's form: a leading dimension of 1 for the view.
 
-    means2d: (1, N, 2) px; conics: (1, N, 3) xx, xy, yy of the inverse covariance, 1 / px^2; opacities: (1,
-        N); radii: (1, N, 2) int32 half
-    extents, px, 0 = cannot touch the image, all else of that row is then undefined
-    offsets: (1, rows, columns) int32 first entry of each tile in ids: (P,) int32 Gaussians tile by tile, near
-        to far; size: width, height, px
+    means2d: (1, N, 2) px; conics: (1, N, 3) xx, xy, yy of the inverse covariance, 1 / px^2; opacities: (1, N)
+    radii: (1, N, 2) int32 half extents, px; 0 = cannot touch the image, the rest of that row is undefined
+    offsets: (1, rows, columns) int32 first entry of each tile in ids
+    ids: (P,) int32 Gaussians tile by tile, near to far; size: width, height, px
     """
 
     means2d: Tensor
@@ -144,68 +140,42 @@ class GsplatStatistics(ViewStatistics):
         return torch.where(screen.visible, lengths, 0)
 
 
-def render_gsplat(
-    gaussians: Gaussians,
-    view: View,
-    sh_degree: int,
-    background: Tensor | None,
-    geometry: bool,
-    functions: Functions,
+def render_gpu(
+    gaussians: Gaussians, view: View, sh_degree: int, background: Tensor | None, geometry: bool
 ) -> Rendering:
-    """`render.render` with checked arguments. sh_degree: at most the stored one; functions:
-    `cuda_functions()`, or twins of them.
-    """
+    """`rendering.render` with checked arguments. sh_degree: at most the stored one"""
+    functions = cuda_functions()
     screen = project(gaussians, view, functions)
-    if screen.means2d.requires_grad:
+    differentiable = screen.means2d.requires_grad
+    if differentiable:
         screen.means2d.retain_grad()
-    features = _features(gaussians, view, sh_degree, geometry, functions)
-    image, alpha = functions.rasterize_to_pixels(
-        screen.means2d,
-        screen.conics,
-        features[None],
-        screen.opacities,
-        *screen.rasterization,
-        absgrad=screen.means2d.requires_grad,
-    )
+    features = _features(gaussians, view, sh_degree, geometry, functions)[None]
+    splats = screen.means2d, screen.conics, features, screen.opacities
+    image, alpha = functions.rasterize_to_pixels(*splats, *screen.rasterization, absgrad=differentiable)
     image, alpha = image[0], alpha[0, ..., 0]
     color = image[..., :3]
     if background is not None:
         color = color + (1 - alpha)[..., None] * background.detach().to(color)
-    normal, plane_distance = (
-        (image[..., 3:6], image[..., 6]) if geometry else (torch.zeros_like(color), torch.zeros_like(alpha))
-    )
-    return Rendering(
-        color, alpha, normal, plane_distance, _three_sigma(screen), GsplatStatistics(screen, functions)
-    )
+    if geometry:
+        normal, plane_distance = image[..., 3:6], image[..., 6]
+    else:
+        normal, plane_distance = torch.zeros_like(color), torch.zeros_like(alpha)
+    statistics = GsplatStatistics(screen, functions)
+    return Rendering(color, alpha, normal, plane_distance, _three_sigma(screen), statistics)
 
 
 def project(gaussians: Gaussians, view: View, functions: Functions) -> _Screen:
     """The Gaussians on the screen, differentiable, and the tile lists."""
     means, opacities, size = gaussians.means, gaussians.opacities, (view.width, view.height)
     pose, matrix = (means.new_tensor(array)[None] for array in (view.cam_from_world, view.matrix))
+    splats, rules = (means, None, gaussians.quats, gaussians.scales), {"eps2d": DILATION, "near_plane": NEAR}
     radii, means2d, depths, conics, _ = functions.fully_fused_projection(
-        means,
-        None,
-        gaussians.quats,
-        gaussians.scales,
-        pose,
-        matrix,
-        *size,
-        eps2d=DILATION,
-        near_plane=NEAR,
-        opacities=opacities.detach(),
+        *splats, pose, matrix, *size, **rules, opacities=opacities.detach()
     )
     columns, rows = (-(-length // TILE) for length in size)
     _, keys, ids = functions.isect_tiles(means2d.detach(), radii, depths.detach(), TILE, columns, rows)
-    return _Screen(
-        means2d,
-        conics,
-        opacities[None],
-        radii,
-        functions.isect_offset_encode(keys, 1, columns, rows),
-        ids,
-        size,
-    )
+    offsets = functions.isect_offset_encode(keys, 1, columns, rows)
+    return _Screen(means2d, conics, opacities[None], radii, offsets, ids, size)
 
 
 def contributions(screen: _Screen, functions: Functions) -> tuple[Tensor, Tensor]:
@@ -215,9 +185,8 @@ def contributions(screen: _Screen, functions: Functions) -> tuple[Tensor, Tensor
     gsplat lists the fragments of a band of rows at a time, pixel by pixel and near to far: a pixel that
     starts with transmittance 0 has none.
     """
-    means2d, conics, opacities = (
-        tensor.detach() for tensor in (screen.means2d, screen.conics, screen.opacities)
-    )
+    splats = [tensor.detach() for tensor in (screen.means2d, screen.conics, screen.opacities)]
+    means2d, conics, opacities = splats
     weight, largest = torch.zeros_like(opacities[0]), torch.zeros_like(opacities[0])
     width, height = screen.size
     rows = max(1, BAND_PIXELS // width)
@@ -225,12 +194,11 @@ def contributions(screen: _Screen, functions: Functions) -> tuple[Tensor, Tensor
         band = means2d.new_zeros(1, height, width)
         band[:, top : top + rows] = 1
         ids, pixels, _ = functions.rasterize_to_indices_in_range(
-            0, _ALL, band, means2d, conics, opacities, *screen.rasterization
+            0, _ALL, band, *splats, *screen.rasterization
         )
         offsets = torch.stack([pixels % width, pixels // width], 1) + 0.5 - means2d[0, ids]
-        alphas = (opacities[0, ids] * torch.exp(-0.5 * _squared_distance(offsets, conics[0, ids]))).clamp_max(
-            MAX_ALPHA
-        )
+        alphas = opacities[0, ids] * torch.exp(-0.5 * _squared_distance(offsets, conics[0, ids]))
+        alphas = alphas.clamp_max(MAX_ALPHA)
         reached = transmittances(alphas, pixels)
         weight.index_add_(0, ids, alphas * reached)
         largest.scatter_reduce_(0, ids, reached, "amax")

@@ -18,16 +18,16 @@ import numpy as np
 import pytest
 import torch
 
-from sc3d.errors import InputError, MissingPackageError
+from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.settings.train import TrainSettings
-from sc3d.splatting import device, gsplat_backend
-from sc3d.splatting.cpu.ssim import image_loss, image_loss_torch, ssim_loss
-from sc3d.splatting.gsplat_backend import Functions, render_gsplat, transmittances
-from sc3d.splatting.optimizer import RowAdam
+from sc3d.splatting import device
+from sc3d.splatting.gpu import gsplat_backend
+from sc3d.splatting.gpu.gsplat_backend import Functions, render_gpu, transmittances
+from sc3d.splatting.losses import image_loss
 from sc3d.splatting.rendering import render
 from sc3d.splatting.trainer import Trainer
-from tests.splatting.test_analytic import photographed, ring, valley
+from tests.splatting.scenes import photographed, ring, valley
 from tests.splatting.test_rendering import (
     BACKGROUND,
     NAMES,
@@ -160,8 +160,8 @@ def gsplat_images(reference, gaussians, view, sh_degree):
 
 
 @pytest.fixture
-def functions(reference):
-    """Twins of the functions that the backend calls, with the same arguments."""
+def functions(reference, monkeypatch):
+    """Twins of the functions that the backend calls, in their place."""
 
     def fully_fused_projection(
         means, covars, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, opacities
@@ -193,7 +193,7 @@ def functions(reference):
             *splats, torch.arange(len(chosen), device=chosen.device), pixels, views, width, height
         )
 
-    return Functions(
+    twins = Functions(
         fully_fused_projection,
         reference._spherical_harmonics,
         reference._isect_tiles,
@@ -201,6 +201,8 @@ def functions(reference):
         rasterize_to_pixels,
         list_fragments,
     )
+    monkeypatch.setattr(gsplat_backend, "cuda_functions", lambda: twins)
+    return twins
 
 
 @pytest.mark.parametrize(("count", "size", "sh_degree"), [(300, -1.9, 3), (2000, -3.0, 1)])
@@ -225,7 +227,7 @@ def test_backend_composes_the_same_rendering(functions, monkeypatch, geometry):
     gaussians, view = make_scene(400, 9, seed=1, size=-2.0), make_view()
     cpu, gpu = with_gradients(gaussians), with_gradients(gaussians)
     expected = render(cpu, view, 2, BACKGROUND, geometry)
-    found = render_gsplat(gpu, view, 2, BACKGROUND, geometry, functions)
+    found = render_gpu(gpu, view, 2, BACKGROUND, geometry)
     assert torch.equal(found.statistics.gradient, torch.zeros(400)) and torch.equal(
         found.statistics.absolute_gradient, torch.zeros(400)
     )
@@ -244,13 +246,14 @@ def test_backend_composes_the_same_rendering(functions, monkeypatch, geometry):
         assert (value - truth).norm() < 1e-3 * truth.norm(), name
 
 
-def test_backend_without_gradients_and_without_gaussians_in_view(functions):
+def test_backend_without_gradients_and_without_gaussians_in_view(functions, monkeypatch):
     gaussians, view = make_scene(50, 1, seed=2, size=-2.0), make_view()
     with torch.no_grad():
-        rendering = render_gsplat(gaussians, view, 0, None, True, functions)
+        rendering = render_gpu(gaussians, view, 0, None, True)
     assert not rendering.color.requires_grad and rendering.statistics.weight.sum() > 1
     gaussians.means[:, 2] = -20.0  # behind the camera
-    rendering = render_gsplat(with_gradients(gaussians), view, 0, BACKGROUND, True, empty_safe(functions))
+    monkeypatch.setattr(gsplat_backend, "cuda_functions", lambda: empty_safe(functions))
+    rendering = render_gpu(with_gradients(gaussians), view, 0, BACKGROUND, True)
     assert torch.allclose(rendering.color, BACKGROUND.expand(64, 96, 3))
     assert (
         not rendering.radii.any()
@@ -286,60 +289,19 @@ def test_missing_gsplat_says_what_to_install(monkeypatch):
         render(make_scene(3), make_view())
 
 
-def test_device_is_picked_by_what_is_there(monkeypatch):
-    precision = torch.backends.cudnn.allow_tf32
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert device.pick_device("cpu").type == device.pick_device("auto").type == "cpu"
-    with pytest.raises(InputError, match="no CUDA device"):
-        device.pick_device("cuda")
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: None)
-    assert device.pick_device("auto").type == "cpu"
-    with pytest.raises(MissingPackageError, match="gsplat"):
-        device.pick_device("cuda")
-    monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: name)
-    assert device.pick_device("auto").type == device.pick_device("cuda").type == "cuda"
-    torch.backends.cudnn.allow_tf32 = precision
-
-
 @pytest.mark.parametrize("size", [(37, 45), (3, 5), (65, 129)])
 def test_image_loss_in_torch_equals_the_kernel(size, monkeypatch):
     generator = torch.Generator().manual_seed(0)
     image, target = torch.rand(*size, 3, generator=generator), torch.rand(*size, 3, generator=generator)
     one, other = image.clone().requires_grad_(), image.clone().requires_grad_()
-    loss, expected = image_loss_torch(one, target, 0.3), image_loss(other, target, 0.3)
+    expected, kernel = image_loss(other, target, 0.3), image_loss(image, target, 1.0).item()
+    monkeypatch.setattr(device, "has_kernels", lambda tensor: False)
+    loss = image_loss(one, target, 0.3)
     assert loss.item() == pytest.approx(expected.item(), abs=1e-6)
     loss.backward()
     expected.backward()
     assert (one.grad - other.grad).norm() < 1e-4 * other.grad.norm()
-    kernel = ssim_loss(image, target).item()
-    monkeypatch.setattr(device, "has_kernels", lambda tensor: False)
-    assert ssim_loss(image, target).item() == pytest.approx(kernel, abs=1e-6)
-
-
-def test_adam_in_torch_equals_the_kernel(monkeypatch):
-    generator = torch.Generator().manual_seed(0)
-    start, rates = torch.randn(20, 2, 3, generator=generator), {"values": np.linspace(0.01, 0.06, 6)}
-    gradients = torch.randn(5, 20, 2, 3, generator=generator)
-    rows = [
-        None,
-        torch.rand(20, generator=generator) > 0.5,
-        None,
-        torch.rand(20, generator=generator) > 0.2,
-        None,
-    ]
-    results = []
-    for kernels in (True, False):
-        monkeypatch.setattr(device, "has_kernels", lambda tensor, answer=kernels: answer)
-        optimizer = RowAdam({"values": start.clone().requires_grad_()}, rates)
-        for gradient, chosen in zip(gradients, rows, strict=True):
-            optimizer.parameters["values"].grad = gradient.clone()
-            optimizer.step(chosen)
-        results.append(
-            (optimizer.parameters["values"].detach(), optimizer.means["values"], optimizer.squares["values"])
-        )
-    for one, other in zip(*results, strict=True):
-        assert torch.allclose(one, other, rtol=1e-5, atol=1e-7)
+    assert image_loss(image, target, 1.0).item() == pytest.approx(kernel, abs=1e-6)
 
 
 @pytest.mark.parametrize(("iterations", "weight"), [(1, 0.1), (5, 0.0)])
@@ -365,7 +327,6 @@ def test_training_without_kernels_is_the_same(functions, monkeypatch, iterations
     states = []
     for kernels in (True, False):
         monkeypatch.setattr(device, "has_kernels", lambda tensor, answer=kernels: answer)
-        monkeypatch.setattr(gsplat_backend, "cuda_functions", lambda: functions)
         trainer = Trainer(data, settings)
         for _ in range(iterations):
             trainer.step()

@@ -12,11 +12,13 @@ import torch
 from sc3d.cli import main
 from sc3d.geometry.cameras import local_origin, look_at, pinhole_view, project, undistorted
 from sc3d.io.images import read_image, write_image
+from sc3d.io.splats import origin_comment, write_splat_ply
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
+from sc3d.splatting.evaluation import compare, picture
 from sc3d.splatting.gaussians import SH_C0, Gaussians
 from sc3d.splatting.rendering import render
-from sc3d.splatting.train import TrainResult
+from sc3d.splatting.trainer import TrainResult
 from sc3d.view.contact_sheet import (
     contact_sheet,
     depth_colors,
@@ -24,10 +26,9 @@ from sc3d.view.contact_sheet import (
     half_of,
     normal_colors,
     side_by_side,
-    write_training_sheet,
 )
 from sc3d.view.flight_video import flight_path
-from sc3d.view.splat_images import chosen_views, compare, rendered, training_rows
+from sc3d.view.training_sheet import chosen_views, training_rows, write_training_sheet
 from tests.builders import ORIGIN, views, write_model
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -45,7 +46,7 @@ def make_gaussians(half: float = 4.0) -> Gaussians:
     scales = np.tile(np.float32([0.15, 0.15, 0.002]), (len(points), 1))
     scales[-1] = (0.08, 0.08, 0.002)
     quats = np.tile(np.float32([1, 0, 0, 0]), (len(points), 1))
-    sh = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32)
+    sh = ((colors - 0.5) / SH_C0).astype(np.float32)
     parts = [points.astype(np.float32), np.log(scales), quats, np.full(len(points), 6, np.float32), sh]
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(part)) for part in parts))
 
@@ -80,7 +81,7 @@ def trained(tmp_path_factory) -> Path:
     write_model(scene / "sparse" / "0", views())
     origin, gaussians = local_origin(views()), make_gaussians(7.0)
     gaussians.means += torch.from_numpy((ORIGIN - origin).astype(np.float32))
-    gaussians.save(scene / "gaussians.ply", [f"sc3d origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}"])
+    write_splat_ply(scene / "gaussians.ply", gaussians.arrays(), [origin_comment(origin)])
     for view in views():  # drawn by projection alone, not by the renderer under test
         photo = np.tile(np.uint8(GREEN), (view.height, view.width, 1))
         pixel = project(view, (ORIGIN + RED_POINT)[None])[0][0]
@@ -93,7 +94,7 @@ def trained(tmp_path_factory) -> Path:
 
 def test_panels_are_what_the_camera_sees(gaussians):
     view = view_of((1, -2, 9))
-    photo = rendered(gaussians, view)
+    photo = picture(gaussians, view)
     found = compare(gaussians, view, photo, exposure=(0.0, 0.0))
     expected = (render(gaussians, view).color.clamp(0, 1) * 255).round().byte().numpy()
     assert np.array_equal(found.rendered, expected) and np.array_equal(found.photo, photo) and found.psnr > 50
@@ -115,7 +116,7 @@ def test_panels_are_what_the_camera_sees(gaussians):
 
 def test_exposure_of_the_photo_is_fitted_or_applied(gaussians):
     view = view_of((1, -2, 9))
-    photo = np.round(0.8 * rendered(gaussians, view) + 10).astype(np.uint8)
+    photo = np.round(0.8 * picture(gaussians, view) + 10).astype(np.uint8)
     assert (
         compare(gaussians, view, photo).psnr
         > 45
@@ -150,7 +151,7 @@ def test_near_is_bright_up_is_blue_and_nothing_is_gray(gaussians):
 
 def test_sheet_holds_the_four_panels(gaussians):
     centers = [(0, -3, 7), (2, 2, 8)]
-    rows = [compare(gaussians, view, rendered(gaussians, view)) for view in map(view_of, centers)]
+    rows = [compare(gaussians, view, picture(gaussians, view)) for view in map(view_of, centers)]
     sheet = contact_sheet(rows, "a title " + "that is too long " * 20, width=560)
     assert sheet.shape[1] == 560 and sheet.dtype == np.uint8
     cell = (560 - 2 * 16 - 3 * 8) // 4
@@ -186,7 +187,7 @@ def test_chosen_photos_are_spread_and_held_out_ones_come_first():
 
 def test_training_sheet_uses_the_exposures_found(gaussians, tmp_path):
     cameras = [view_of(center) for center in [(0, -3, 7), (2, 2, 8), (-2, 1, 8), (0, 2, 9)]]
-    photos = [np.round(0.7 * rendered(gaussians, view)).astype(np.uint8) for view in cameras]
+    photos = [np.round(0.7 * picture(gaussians, view)).astype(np.uint8) for view in cameras]
     data = TrainingData(cameras, photos, np.zeros((10, 3)), np.zeros((10, 3), np.uint8))
     exposures = np.array([[np.log(0.7), 0], [0, 0], [np.log(0.7), 0], [0, 0]])
     settings = TrainSettings(iterations=30, test_every=4)

@@ -1,0 +1,26 @@
+"""The trained Gaussians of a scene, as plain arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sc3d.errors import InputError
+from sc3d.geometry.cameras import local_origin
+from sc3d.io.splats import origin_comment, read_splat_ply
+from sc3d.scene.scene import Scene
+
+
+def read_scene_splats(scene: Scene) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The arrays of `gaussians.ply` (`io.splats.read_splat_ply`) and the (3,) world position of their local origin.
+
+    Raises InputError that says what to run if there are none, or if they belong to other cameras than the scene's.
+    """
+    scene.require(scene.gaussians, hint=f"run `sc3d train {scene.path}` first")
+    arrays, comments = read_splat_ply(scene.gaussians)
+    origin = local_origin(scene.model.views)
+    if any(line.startswith("sc3d origin") for line in comments) and origin_comment(origin) not in comments:
+        raise InputError(
+            f"{scene.gaussians} was trained with other cameras than those in {scene.sparse}:"
+            f" run `sc3d train {scene.path} --overwrite`"
+        )
+    return arrays, origin
