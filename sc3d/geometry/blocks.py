@@ -62,7 +62,10 @@ def _cut(flat: np.ndarray, count: int, block: Block) -> list[Block]:
     # many points at one place
     if min(left.sum() // first, (~left).sum() // (count - first)) < MIN_POINTS // 2:
         raise InputError("the sparse points cannot be cut into so many blocks: lower --blocks")
-    other = block.low[1 - axis], block.high[1 - axis]
-    low, high = ((place, bound) if axis == 0 else (bound, place) for bound in other)
-    lower, upper = replace(block, high=high), replace(block, low=low)
+    lower = replace(block, high=_moved(block.high, axis, place))
+    upper = replace(block, low=_moved(block.low, axis, place))
     return _cut(flat[left], first, lower) + _cut(flat[~left], count - first, upper)
+
+
+def _moved(corner: tuple[float, float], axis: int, place: float) -> tuple[float, float]:
+    return (corner[0], place) if axis else (place, corner[1])

@@ -174,7 +174,7 @@ class LabelGrid(VoxelGrid):
         slots, positions = self.blocks()
         votes = self.grid.attribute(self.ATTRIBUTE).numpy()[slots]
         arrays = {"value_000": votes, "key": positions, **file_header(self.voxel_size)}
-        np.savez(path, **arrays)  # type: ignore[arg-type]  # the stub takes keywords for options
+        np.savez(path, **arrays)
 
 
 def file_header(voxel_size: float) -> dict[str, np.ndarray]:

@@ -228,7 +228,7 @@ def _to_local(
 ) -> tuple[list[View], Georeference | None]:
     """Views in local ENU and the georeference, if the chunk has a CRS on Earth; unchanged views otherwise."""
     crs = _crs(chunk, path)
-    if not views or crs is None:
+    if not views or crs is None or crs.ellipsoid is None:
         return views, None
     middle = np.median([view.center for view in views], axis=0)
     if np.linalg.norm(middle) < GEOCENTRIC:
@@ -238,7 +238,8 @@ def _to_local(
         return views, None
     # points that show how one frame lies in the other
     frame = middle + 1000 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
-    geodetic = _geodetic(frame, crs)
+    axes = crs.ellipsoid.semi_major_metre, crs.ellipsoid.semi_minor_metre
+    geodetic = _geodetic(frame, axes, crs.geodetic_crs)
     origin = triple(round(float(value), digits) for value, digits in zip(geodetic[0], (6, 6, 0)))
     enu = fit_similarity(frame - middle, geodetic_to_enu(geodetic, origin))
     centers = enu.apply(np.array([view.center for view in views]) - middle)
@@ -264,13 +265,13 @@ def _crs(chunk: ElementTree.Element, path: Path) -> pyproj.CRS | None:
     return pyproj.CRS.from_epsg(epsg) if epsg else crs
 
 
-def _geodetic(points: np.ndarray, crs: pyproj.CRS) -> np.ndarray:
-    """(N, 3) latitude, longitude, height on WGS 84 of geocentric coordinates on the datum of a CRS."""
-    ellipsoid, geographic = crs.ellipsoid, crs.geodetic_crs
-    if ellipsoid is None:
-        raise InputError(f"{crs.name} has no ellipsoid, which places on Earth need")
+def _geodetic(points: np.ndarray, axes: tuple[float, float], geographic: pyproj.CRS | None) -> np.ndarray:
+    """(N, 3) latitude, longitude, height on WGS 84 of geocentric coordinates on the datum of a CRS.
+
+    axes: major and minor of its ellipsoid, m; geographic: the CRS of its datum, None = WGS 84
+    """
     cart = pyproj.Transformer.from_pipeline(
-        f"+proj=pipeline +step +inv +proj=cart +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r} +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+        f"+proj=pipeline +step +inv +proj=cart +a={axes[0]!r} +b={axes[1]!r} +step +proj=unitconvert +xy_in=rad +xy_out=deg"
     )
     return crs_to_geodetic(
         np.stack(cart.transform(*points.T), axis=1),

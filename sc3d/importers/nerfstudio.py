@@ -67,10 +67,10 @@ def read(path: Path, settings: Import) -> Project:
 
 
 def _distortion_model(content: dict, frame: dict, photo: Path, where: str) -> DistortionModel:
-    """Parameters of a frame: those at the top of the file count first, as in nerfstudio."""
+    """Parameters of a frame: those at the top of the file count first, as in nerfstudio; null says nothing."""
 
     def stated(key: str) -> float | None:
-        value = content.get(key, frame.get(key))
+        value = next((table[key] for table in (content, frame) if table.get(key) is not None), None)
         try:
             return None if value is None else float(value)
         except (TypeError, ValueError):

@@ -182,6 +182,8 @@ def _points(points: dict, file: Path) -> tuple[np.ndarray, np.ndarray, dict[str,
         colors = np.array(
             [point.get("color", (128, 128, 128)) for point in points.values()], np.float64
         ).reshape(-1, 3)
+        if not len(positions) == len(colors) == len(points):
+            raise ValueError("three numbers each are expected")
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file} has points that cannot be used ({error!r})") from None
     kept, colors, names = (

@@ -46,10 +46,15 @@ class CloudFile:
             raise InputError(
                 f"{path} does not fit into --max-memory, and can be read in parts as binary PLY with the vertices first only: write it anew"
             )
-        num_points = header.elements[0].rows
-        if not num_points or not {"x", "y", "z"} <= set(record.names or ()):
+        cloud = cls(path, record, header.elements[0].rows, header.size)
+        if not cloud.num_points or not {"x", "y", "z"} <= set(cloud.names):
             raise InputError(f"{path} holds no points")
-        return cls(path, record, num_points, header.size)
+        return cloud
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the fields of a record."""
+        return self.dtype.names or ()
 
     def chunks(self) -> Iterator[tuple[int, np.ndarray]]:
         """First row and records of each chunk; InputError at positions that are not finite or too far away."""
@@ -80,7 +85,7 @@ def _read_las(cloud: CloudFile) -> Iterator[tuple[int, np.ndarray]]:
             records = np.empty(len(points), cloud.dtype)
             for axis in "xyz":
                 records[axis] = getattr(points, axis)
-            for name in (cloud.dtype.names or ())[3:]:
+            for name in cloud.names[3:]:
                 records[name] = np.asarray(points[name]) >> 8  # 16 bits, by the standard
             yield start, records
             start += len(records)

@@ -154,7 +154,7 @@ def find_points_in_tile(job: EvaluateJob, tile: int) -> None:
 def read_labels(cloud: CloudFile) -> Labels:
     """The labels of a cloud file, 10 bytes per point, without the rest; InputError if it has none."""
     names = {"label": np.uint8, "confidence": np.float32, "state": np.uint8, "num_views": np.int32}
-    missing = [name for name in names if name not in cloud.dtype.names]
+    missing = [name for name in names if name not in cloud.names]
     if missing:
         raise InputError(
             f"{cloud.path} has no attribute {missing[0]!r}: it was not written by `sc3d propagate`"

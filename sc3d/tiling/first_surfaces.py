@@ -19,7 +19,7 @@ from sc3d.geometry.cameras import View, camera_rays, may_see
 from sc3d.geometry.raycast import Surface, surfels
 from sc3d.io.atomic import atomic_path
 from sc3d.io.chunked_clouds import CHUNK, CloudFile, columns, positions
-from sc3d.io.ply import check_ply
+from sc3d.io.ply import Property, check_ply
 from sc3d.scene.scene import Scene
 from sc3d.tiling.executor import Executor
 from sc3d.tiling.memory import BASE, TRIANGLE
@@ -55,10 +55,10 @@ class MeshParts:
                 for tile in np.unique(tiles):
                     mine = local[tiles == tile]
                     box = np.stack([mine.min(axis=(0, 1)), mine.max(axis=(0, 1))]).astype(np.float64)
-                    old = boxes.get(int(tile), box)
-                    boxes[int(tile)] = np.stack([np.minimum(old[0], box[0]), np.maximum(old[1], box[1])])
+                    known = boxes.get(int(tile), box)
+                    boxes[int(tile)] = np.stack([np.minimum(known[0], box[0]), np.maximum(known[1], box[1])])
                     with (folder / f"{tile}.bin").open("ab") as file:
-                        file.write(np.ascontiguousarray(mine))
+                        file.write(np.ascontiguousarray(mine).data)
             with atomic_path(index) as temporary:
                 np.savez(
                     temporary,
@@ -88,11 +88,12 @@ def read_triangles(path: Path) -> Iterator[np.ndarray]:
     """
     header = check_ply(path)
     vertex, face = header.element("vertex"), header.element("face")
-    corners = next((entry for entry in face.properties if entry.count), None) if face is not None else None
+    corners = next((entry for entry in face.properties if entry.length), None) if face is not None else None
     if (
         not header.order
         or vertex is None
         or vertex.has_lists
+        or face is None
         or corners is None
         or [element.name for element in header.elements] != ["vertex", "face"]
     ):
@@ -115,10 +116,10 @@ def read_triangles(path: Path) -> Iterator[np.ndarray]:
         yield vertices[inverse.reshape(-1, 3)]
 
 
-def _fields(entry, corners, order: str) -> list[tuple]:
+def _fields(entry: Property, corners: Property, order: str) -> list[tuple]:
     if entry is corners:
-        return [("count", order + entry.count), ("corners", order + entry.dtype, (3,))]
-    if entry.count:
+        return [("count", order + entry.length), ("corners", order + entry.dtype, (3,))]
+    if entry.length:
         raise InputError("the faces of the mesh have more than one list: write it anew with triangles only")
     return [(entry.name, order + entry.dtype)]
 
@@ -196,7 +197,9 @@ def write_ranges(parts: MeshParts, views: list[View], maps: RangeMaps) -> None:
     rays_of = {view.name: np.full(view.height * view.width, np.inf, np.float32) for view in views}
     for part, (low, high) in parts.boxes.items():
         seeing = [view for view in views if may_see(view, low + parts.origin, high + parts.origin)]
-        surface = parts.surface(part) if seeing else None
+        if not seeing:
+            continue
+        surface = parts.surface(part)
         for view in seeing:
             _cast(parts, part, surface, view, camera_rays(view.camera), rays_of[view.name])
     for view in views:

@@ -122,7 +122,7 @@ def _ranges(
     origin = local_origin(masks.views)
     if scene.mesh.exists() and settings.surface == "auto":
         mesh = split_mesh(scene.mesh, parts.subfolder("surface"), origin, memory_of(settings))
-    elif {"nx", "ny", "nz"} <= set(store.dtype.names):
+    elif {"nx", "ny", "nz"} <= set(store.names):
         mesh = split_surfels(store, spacing, parts.subfolder("surface"), origin)
     else:
         raise InputError(
@@ -229,7 +229,7 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndar
     names = {name for name, _ in added} | {"nx", "ny", "nz"}
     kept = [
         (name, cloud.dtype[name].str[1:])
-        for name in cloud.dtype.names
+        for name in cloud.names
         if name not in names and not name.startswith(VOTES)
     ]
     dtype = np.dtype([*kept, ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), *added])

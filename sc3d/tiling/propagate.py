@@ -64,9 +64,10 @@ def propagate_fits(scene: Scene, settings: Propagate) -> bool:
 def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     """As `propagation.propagate.propagate_scene`, tile by tile, here or on the workers that the settings ask for."""
     cloud, output = CloudFile.open(settings.seeds or scene.seeds), settings.output or scene.labelled
-    num_ids = sum(name.startswith(VOTES) for name in cloud.dtype.names)
-    for name in ("nx", "label", "confidence", "state", "num_views", f"{VOTES}0"):
-        if name not in cloud.dtype.names:
+    num_ids = sum(name.startswith(VOTES) for name in cloud.names)
+    votes = [f"{VOTES}{label}" for label in range(max(num_ids, 1))]
+    for name in ("nx", "label", "confidence", "state", "num_views", *votes):
+        if name not in cloud.names:
             raise InputError(f"{cloud.path} has no attribute {name!r}: it was not written by `sc3d label`")
     folder, statistics = (
         WorkFolder(output, "propagate", [cloud.path], settings),
@@ -189,10 +190,11 @@ def _statistics_task(
         part.known.agreed_by(least) & part.core,
         folds_of(part.known.points, job.extent.low, job.extent.high),
     )
-    return tuple(
+    even, odd = (
         appearance.statistics(part.known.seed_labels, examples & (folds == fold), part.known.num_classes)
         for fold in (0, 1)
     )
+    return even, odd
 
 
 def _error_task(
@@ -204,7 +206,8 @@ def _error_task(
         part.known.agreed_by(least) & part.core,
         folds_of(part.known.points, job.extent.low, job.extent.high),
     )
-    return tuple(appearance.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1))
+    even, odd = (appearance.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1))
+    return even, odd
 
 
 def _turn_task(
@@ -215,9 +218,10 @@ def _turn_task(
     appearance, known = part.appearance(job), part.known
     if not job.results.has(tile, f"round{turn}_examples"):
         label = part.around(job, f"round{turn - 1}_label") if turn else known.seed_labels
-        evidence, marginals = appearance_marginals(
-            part.graph, known, offered, appearance.log_likelihood(statistics, label), job.settings
-        )
+        rating = appearance.log_likelihood(statistics, label)
+        if rating is None:
+            raise ValueError("a round needs examples of two classes")
+        evidence, marginals = appearance_marginals(part.graph, known, offered, rating, job.settings)
         examples = sure_examples(marginals, known)
         label, confidence = decided(part.graph, evidence, marginals)
         names = (f"round{turn}_label", f"round{turn}_confidence", f"round{turn}_examples")
@@ -328,7 +332,7 @@ def _state_task(
 
 
 def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
-    kept = [(name, cloud.dtype[name].str[1:]) for name in cloud.dtype.names if not name.startswith(VOTES)]
+    kept = [(name, cloud.dtype[name].str[1:]) for name in cloud.names if not name.startswith(VOTES)]
     counts, confidence = np.zeros(3, np.int64), [0.0]
 
     def chunks():
@@ -344,4 +348,5 @@ def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
             yield result
 
     write_records(path, chunks(), np.dtype(kept), cloud.num_points, ["sc3d"])
-    return PropagateSummary(*counts.tolist(), confidence[0])
+    num_points, labelled, propagated = counts.tolist()
+    return PropagateSummary(num_points, labelled, propagated, confidence[0])

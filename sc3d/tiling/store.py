@@ -208,6 +208,11 @@ class TileStore:
         )
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Of the fields of a record."""
+        return self.dtype.names or ()
+
+    @property
     def tiles(self) -> list[int]:
         return sorted(self.counts)
 

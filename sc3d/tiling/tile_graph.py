@@ -48,7 +48,7 @@ class PropagateJob:
 
     @property
     def colored(self) -> bool:
-        return {"red", "green", "blue"} <= set(self.store.dtype.names)
+        return {"red", "green", "blue"} <= set(self.store.names)
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def _build(job: PropagateJob, tile: int, halo: TileWithHalo) -> None:
     known = evidence.ordered(graph.order)
     values = (
         known.points,
-        known.votes,
+        known.known_votes,
         *(getattr(known.seeds, field.name) for field in fields(Labels)),
         known.colors if job.colored else np.empty(0),
     )
@@ -128,7 +128,7 @@ def _mapped(job: PropagateJob, tile: int, names: tuple[str, ...]) -> list[np.nda
     return [np.asarray(job.results.read(tile, f"part_{name}", mapped=True)) for name in names]
 
 
-def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np.ndarray]:
+def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np.ndarray | None]:
     """What is known of the window's points, by row, and their normals."""
     records = halo.gather(job.store.records)
     labels = Labels(

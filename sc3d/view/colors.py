@@ -69,8 +69,10 @@ def color_points(
         raise InputError(f"unknown coloring {by!r}: choose one of {', '.join(COLORINGS)}")
     if not can_color(cloud, by):
         raise InputError(_MAKERS[by])
-    votes = read_votes(cloud) if by == "disagreement" else None
-    if votes is not None:
+    if by == "disagreement":
+        votes = read_votes(cloud)
+        if votes is None:  # those of some class are missing
+            raise InputError(_MAKERS[by])
         return disagreement_colors(disagreement(votes))
     values = _attributes(cloud)[_ATTRIBUTES[by]].cpu().numpy()
     if by == "photo":

@@ -370,7 +370,14 @@ class TestRoundTrips:
             32615, (576600.0, 5188100.0, 150.0)
         )
 
-    def test_metashape_local(self, tmp_path):
+    @pytest.mark.parametrize(
+        "reference",
+        [
+            'LOCAL_CS["Local Coordinates (m)",UNIT["meter",1]]',
+            'ENGCRS["Site",EDATUM["Peg"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],AXIS["z",up],LENGTHUNIT["m",1]]',
+        ],
+    )
+    def test_metashape_local(self, tmp_path, caplog, reference):
         views = [
             replace(
                 view,
@@ -381,11 +388,7 @@ class TestRoundTrips:
             for view in fly()
         ]
         transform = (pycolmap.Rotation3d(np.array([0.3, -1.0, 0.5])).matrix(), np.array([3.0, 4, 5]), 12.354)
-        (tmp_path / "cameras.xml").write_text(
-            metashape_xml(
-                views, metashape_lens(), 'LOCAL_CS["Local Coordinates (m)",UNIT["meter",1]]', transform
-            )
-        )
+        (tmp_path / "cameras.xml").write_text(metashape_xml(views, metashape_lens(), reference, transform))
         run(
             "import",
             tmp_path / "cameras.xml",
@@ -395,6 +398,7 @@ class TestRoundTrips:
         )
         assert same_projections(Scene(tmp_path / "scene").model.views, views, probe()) < 1e-6
         assert read_georeference(Scene(tmp_path / "scene")) is None
+        assert "stays unknown" not in caplog.text
 
     @pytest.mark.parametrize("epsg, expected", [(4326, 32615), (32615, 32615), (26991, 26991)])
     def test_metashape_on_earth(self, tmp_path, epsg, expected):
@@ -463,6 +467,16 @@ class TestFilesOfTheToolsThemselves:
         np.testing.assert_allclose(found.points, truth.points, atol=1e-4)
         np.testing.assert_array_equal(found.colors, truth.colors)
         assert sum(map(len, found.tracks)) > 100  # guessed, so that train and extract can start
+
+    def test_null_in_transforms_json_says_nothing(self, tmp_path):
+        content = json.loads((FILES / "nerfstudio_opencv" / "transforms.json").read_text())
+        cameras = []
+        for name, value in (("without", {}), ("null", {"cx": None, "k1": None, "fl_y": None})):
+            some = {key: kept for key, kept in content.items() if key not in ("cx", "k1", "fl_y")} | value
+            (tmp_path / f"transforms_{name}.json").write_text(json.dumps(some))
+            project = read_project(tmp_path / f"transforms_{name}.json", Import())
+            cameras.append([view.camera.params for view in project.views])
+        np.testing.assert_array_equal(*cameras)
 
     @pytest.mark.parametrize("number", range(9))
     def test_lenses_of_opensfm(self, number):
@@ -655,6 +669,7 @@ class TestBadProjects:
             (lambda part: part["cameras"]["v2 dji"].pop("width"), "lacks"),
             (lambda part: part["shots"]["shot_0.jpg"].update(rotation=[1, 2]), "shot_0"),
             (lambda part: part["points"]["100"].pop("coordinates"), "points"),
+            (lambda part: [point.update(color=[9, 9, 9, 9]) for point in part["points"].values()], "points"),
             (lambda part: part.update(reference_lla={"latitude": 1}), "reference_lla"),
         ],
     )

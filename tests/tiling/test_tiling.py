@@ -189,6 +189,18 @@ def test_points_that_hang_on_a_seed_only_through_other_tiles_are_reached(site, s
         assert labelled[: -len(island)].all() and not labelled[-len(island) :].any()
 
 
+def test_votes_without_those_of_some_class_are_refused(site, small_tiles, tmp_path):
+    label.run(Scene(site), Label(output=tmp_path / "seeds.ply"))
+    seeds = read_cloud(tmp_path / "seeds.ply")
+    del seeds.point["votes_1"]
+    write_geometry(tmp_path / "seeds.ply", seeds)
+    with pytest.raises(InputError, match="votes_1"):
+        propagate.run(
+            Scene(site),
+            Propagate(seeds=tmp_path / "seeds.ply", output=tmp_path / "some.ply", max_memory="2G"),
+        )
+
+
 def test_evaluation_by_tile_judges_the_same_pixels(site, small_tiles):
     label.run(Scene(site), Label(output=site / "judged.ply"))
     figures = []

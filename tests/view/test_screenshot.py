@@ -257,6 +257,12 @@ def test_missing_attribute_names_the_stage(by):
         color_points(make_cloud(np.zeros((3, 3))), by, CLASSES)
 
 
+def test_votes_without_those_of_some_class_are_none():
+    cloud = make_cloud(np.zeros((3, 3)), votes_1=np.ones((3, 1), np.float32))
+    with pytest.raises(InputError, match="no votes"):
+        color_points(cloud, "disagreement", CLASSES)
+
+
 def test_unknown_ids_and_broken_confidences_do_not_fail():
     odd = {
         "state": np.uint8([[9], [255], [1]]),
