@@ -235,7 +235,7 @@ class TileStore:
                         self.grid.within(positions(self.records(other)), tile, margin)
                     ).astype(np.int32)
             with atomic_path(file) as temporary:
-                np.savez(temporary, **around)  # type: ignore[arg-type]  # as in `LabelGrid.save`
+                np.savez(temporary, **around)  # type: ignore[arg-type]  # the stub takes keywords for options
         with np.load(file, allow_pickle=False) as around:
             parts = [
                 (tile, slice(None)),
