@@ -5,7 +5,7 @@ import os
 __version__ = "0.1.0"
 
 # Read when torch and numba load, so they are set here, before either does; the user's own values win.
-# idle OpenMP threads of torch would spin and starve the kernels
+# Idle OpenMP threads of torch would spin and starve the kernels:
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-# numba's own order warns about every older TBB
+# Numba's own order warns about every older TBB
 os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")

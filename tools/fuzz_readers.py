@@ -2,9 +2,8 @@
 random and reads them.
 
 Allowed is a result or an InputError. Anything else is a finding: another exception, more than 2 s of
-processor time, more than 1 GiB above what the process
-takes without a file, the end of the process. A case is made from the name of its reader and its number alone,
-so that `--only ply-mesh:1234` repeats it.
+processor time, more than 1 GiB above what the process takes without a file, the end of the process. A case is
+made from the name of its reader and its number alone, so that `--only ply-mesh:1234` repeats it.
 One line of JSON per finding and per finished part goes to FOLDER/findings.jsonl and FOLDER/parts.jsonl; parts
 that are there are not repeated.
 

@@ -2,8 +2,8 @@
 points.
 
 The points are sorted along a Morton curve first: neighbors are then near in memory, and everything computed
-on the graph (nearest neighbors of
-equal distance, sums of floats) is the same whatever the order in which the points came.
+on the graph (nearest neighbors of equal distance, sums of floats) is the same whatever the order in which the
+points came.
 """
 
 from __future__ import annotations

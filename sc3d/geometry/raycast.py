@@ -230,10 +230,9 @@ def surfels(
         None = their own; wanted: (N,) bool, None = all
     returns: (4 K, 3) vertices and (2 K, 3) triangles of the K <= N points that have support
 
-    Half width: FLAT times the distance to the 8th neighbor, which leaves a hole at about 1 of 700 places of
-    a randomly sampled surface;
-    SCATTERED times it where the neighbors do not lie in a plane (leaves), so that crowns do not swell and
-    their gaps stay open.
+    Half width: FLAT times the distance to the 8th neighbor, which leaves a hole at about 1 of 700 places of a
+    randomly sampled surface; SCATTERED times it where the neighbors do not lie in a plane (leaves), so that
+    crowns do not swell and their gaps stay open.
     """
     neighbors, distances = NeighborIndex(points, np.zeros(3)).nearest(points, SURFEL_NEIGHBORS + 1)
     if normals is None:

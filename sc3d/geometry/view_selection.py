@@ -20,8 +20,8 @@ def neighbor_views(
     points: (N, 3) sparse points; centers: (V, 3) camera centers, the same frame
     count: how many to keep; angles: median triangulation angle allowed, degrees
     returns: per view (<= count,) int64 indices of other views. Ranked by the number of shared points among
-        those whose median angle is in
-        `angles`; a view with fewer than `count` of them is filled up by `nearest_views`.
+        those whose median angle is in `angles`; a view with fewer than `count` of them is filled up by
+        `nearest_views`.
     """
     centers = np.asarray(centers, np.float64)
     near = nearest_views(centers, count)

@@ -1,9 +1,8 @@
 """Focal length where photos alone do not tell it: a flight that looks straight down from one height.
 
 There a longer focal length and a higher flight make the same photos. Self-calibration then returns whatever
-absorbs the lens' and the shutter's
-small faults: on 18 photos flown at 40 m it was 20 % too long, and with it every height, at a reprojection
-error 1 % smaller. EXIF is better than that.
+absorbs the lens' and the shutter's small faults: on 18 photos flown at 40 m it was 20 % too long, and with it
+every height, at a reprojection error 1 % smaller. EXIF is better than that.
 """
 
 from __future__ import annotations

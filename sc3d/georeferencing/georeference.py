@@ -7,9 +7,8 @@ The world of a georeferenced scene is one of two things:
   turns against it (convergence) and stretches it (scale, curvature), so every point goes through geocentric
   coordinates;
 - the CRS itself minus `offset`, as COLMAP models of other tools in large coordinates are.
-`local_from_world` is a similarity in front of either, for scenes whose world is neither.
-Heights pass through unchanged (ellipsoidal as the GPS gives them; drones often give others, hence
-`altitude_offset`).
+`local_from_world` is a similarity in front of either, for scenes whose world is neither. Heights pass through
+unchanged (ellipsoidal as the GPS gives them; drones often give others, hence `altitude_offset`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Agisoft Metashape and PhotoScan: cameras exported as XML (File > Export > Export Cameras > Agisoft XML).
 
 A camera's `transform` is chunk from camera, axes as in COLMAP; the transform of its component (or of the
-chunk) is a similarity from there to geocentric coordinates, or to
-local ones without a CRS. Distortion (manual, appendix "Camera models"):
+chunk) is a similarity from there to geocentric coordinates, or to local ones without a CRS. Distortion
+(manual, appendix "Camera models"):
     x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 xy    u = w/2 + cx + x' f + x' b1 + y' b2
     y' = y (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p2 (r2 + 2 y2) + 2 p1 xy    v = h/2 + cy + y' f
 so p1 and p2 are OpenCV's p2 and p1. A fisheye has the angle from the axis in place of the radius.

@@ -33,8 +33,7 @@ STREAMED = -1  # the chunk table's position is at the end of the file
 
 class LasHeader(NamedTuple):
     """size: bytes, then num_vlrs records up to `offset`, where the points begin; form: point format, 128 more
-    if they are compressed; record: bytes of a point; evlrs: position and number of
-    extended records.
+    if they are compressed; record: bytes of a point; evlrs: position and number of extended records.
     """
 
     size: int

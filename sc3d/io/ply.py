@@ -1,9 +1,8 @@
 """PLY files: the header, whether the rest is what the header announces, and tables of records written.
 
 Open3D reads them with RPly, which writes beyond its buffer for long names, runs for ever over elements
-without properties, follows vertex numbers that
-do not exist, and leaves what it could not read uninitialized without an error. So everything is checked
-before.
+without properties, follows vertex numbers that do not exist, and leaves what it could not read uninitialized
+without an error. So everything is checked before.
 """
 
 from __future__ import annotations

@@ -19,8 +19,8 @@ def walk_bytes(
 
     data: (B,) uint8; start: position of the first record; count: number of records
     fields: (F, 5) int64 per field of a record: bytes of the count in front of a list, 0 for no list; bytes of
-        the field, or of an item of the list;
-        smallest and largest count that are allowed; items must be smaller than this, 0 = not looked at
+        the field, or of an item of the list; smallest and largest count that are allowed; items must be
+        smaller than this, 0 = not looked at
     returns: position behind the last record, or a negative code; number of whole records
     """
     position, size = start, len(data)

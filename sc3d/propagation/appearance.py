@@ -2,10 +2,9 @@
 joint histograms.
 
 The masks' errors are shared between views, so no voting removes them. Color and relief (height above the
-ground around, roughness, slope) err
-otherwise. Each rater alone is poor; their product is good, because the two hardly depend on one another once
-the class is known, and because
-neither can learn what only their combination would tell apart: errors of the masks such as "flat, low and
+ground around, roughness, slope) err otherwise. Each rater alone is poor; their product is good, because the
+two hardly depend on one another once the class is known, and because neither can learn what only their
+combination would tell apart: errors of the masks such as "flat, low and
 dark: tree".
 Counts are integers and bins are quantiles, so nothing depends on the order of points or the unit of length,
 and parts of a cloud add up to the whole.

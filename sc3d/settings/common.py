@@ -21,5 +21,5 @@ class Resources(Workers):
 
     max_memory: str = ""
     """Memory to stay below, such as 6G; what does not fit is worked on tile by tile, from disk. Half of this
-    machine's memory otherwise. Each worker of
-    a --cluster may use as much."""
+    machine's memory otherwise. Each worker of a --cluster may use as much.
+    """

@@ -21,8 +21,8 @@ class Reconstruct:
     """COLMAP camera model, shared by all photos of one size and EXIF camera."""
     focal: Literal["auto", "refine", "exif"] = "auto"
     """Estimate the focal length, or keep that of EXIF. auto: estimate, unless all photos look the same way
-    from one height (straight down), where
-    focal length and flight height cannot be told apart."""
+    from one height (straight down), where focal length and flight height cannot be told apart.
+    """
     max_size: int = 1600
     """Longest photo side for feature extraction, px."""
     max_features: int = 8192
@@ -75,9 +75,9 @@ class Extract:
     """Neighbor views that must confirm a depth (within 1 px)."""
     coverage: float | None = None
     """Holes of the confirmed surface are filled with the depth of single views, the surer first, until this
-    share of all pixels hits a surface: labels
-    need one. 0 = leave holes; None = 1 where all photos look the same way (straight down), 0.97 otherwise, as
-    oblique photos see the floaters that it costs."""
+    share of all pixels hits a surface: labels need one. 0 = leave holes; None = 1 where all photos look the
+    same way (straight down), 0.97 otherwise, as oblique photos see the floaters that it costs.
+    """
     min_opacity: float = 0.3
     """Smallest opacity of a Gaussian whose center becomes a point (centers)."""
 

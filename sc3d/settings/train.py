@@ -166,8 +166,9 @@ class Train(Workers, TrainSettings):
 
     blocks: int = 0
     """cut the ground into so many blocks, which are trained one by one, or side by side on --workers or
-    --cluster, in the memory of a block, and
-    merged; each takes its share of iterations and max_gaussians; 0 = train everything at once"""
+    --cluster, in the memory of a block, and merged; each takes its share of iterations and max_gaussians; 0 =
+    train everything at once
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -100,8 +100,8 @@ def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSet
 def depth_map(gaussians: Gaussians, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The surface a view sees.
 
-    returns: (H, W) float32 depth z, world units, 0 where alpha < 0.5; (H, W) alpha;
-        (H, W, 3) unit normals, camera frame, towards the camera, 0 where there is no depth
+    returns: (H, W) float32 depth z, world units, 0 where alpha < 0.5; (H, W) alpha; (H, W, 3) unit normals,
+        camera frame, towards the camera, 0 where there is no depth
     """
     rendering = render(gaussians, view)
     depth = unbiased_depth(rendering, view)

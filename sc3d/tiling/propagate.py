@@ -1,9 +1,8 @@
 """`propagate` for clouds that do not fit into memory, tile by tile, in passes.
 
 Mean field looks a few edges far in each round, so a tile with a margin as wide gives what the whole cloud
-would. What is learned of the classes, the
-ground below and which points hang together concern the whole: each pass ends with sums, minima or links over
-all tiles.
+would. What is learned of the classes, the ground below and which points hang together concern the whole: each
+pass ends with sums, minima or links over all tiles.
 `geometry` and `knn` see no farther than the margin, too; there a point farther from any seed may come out
 otherwise than in one piece.
 """

@@ -151,8 +151,8 @@ def _square_grid(extent: CloudExtent, axes: tuple[int, int], parts: int) -> Tile
 @dataclass(frozen=True)
 class TileWithHalo:
     """A tile and the points around it, by row. parts: (tile, which of its points) in turn; order: (N,) that
-    sorts them; rows: (N,) int64 sorted rows in the
-    cloud; core: (N,) bool, points of the tile itself."""
+    sorts them; rows: (N,) int64 sorted rows in the cloud; core: (N,) bool, points of the tile itself.
+    """
 
     parts: list[tuple[int, np.ndarray | slice]]
     order: np.ndarray

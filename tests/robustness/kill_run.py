@@ -2,9 +2,8 @@
 moments and runs it again.
 
 Each time the second run must complete, leave no hidden files, and write the bytes of an uninterrupted run. A
-moment is a share of the processor time
-of that run, so that a busy machine does not shift it. One line of JSON per kill goes to FOLDER/kills.jsonl;
-what is there already is not repeated.
+moment is a share of the processor time of that run, so that a busy machine does not shift it. One line of
+JSON per kill goes to FOLDER/kills.jsonl; what is there already is not repeated.
 `--signal INT` presses Ctrl-C instead: then the first run must also end with status 130 and one clear line.
 """
 

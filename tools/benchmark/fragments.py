@@ -29,8 +29,8 @@ def count_fragments(gaussians: Gaussians, view: View) -> tuple[float, float, flo
     """What the rasterizer has to do for a view.
 
     returns: fragments per pixel that contribute (alpha >= 1/255, transmittance in front >= 1e-4); slots per
-        pixel that are evaluated,
-        which are whole runs of 8 pixels; share of the Gaussians that can touch the image
+        pixel that are evaluated, which are whole runs of 8 pixels; share of the Gaussians that can touch the
+        image
     """
     records, depths, radii = project_view(gaussian_arrays(gaussians), 0, camera_array(view))
     tiles = sort_into_tiles((view.width, view.height), records, depths)

@@ -24,8 +24,8 @@ class Stopwatch:
     """Adds up seconds by stage.
 
     seconds: per stage a (3,) float64 array: CPU of the whole process, wall, CPU of the calling thread. At one
-        thread the last one is what
-        the work costs: the first also counts idle threads of OpenMP that still spin.
+        thread the last one is what the work costs: the first also counts idle threads of OpenMP that still
+        spin.
     """
 
     def __init__(self) -> None:

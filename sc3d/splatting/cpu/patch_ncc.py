@@ -1,9 +1,9 @@
-"""1 - NCC of patches warped by their planes, with its analytic gradient, as one kernel;
-`gpu.losses` has the slow twin.
+"""1 - NCC of patches warped by their planes, with its analytic gradient, as one kernel; `gpu.losses` has the
+slow twin.
 
 A patch pixel with ray r (z = 1) lands at q = d R r - t (n . r), projected. With gray values a_p of the photo
-and b_p sampled at q_p, and
-g_p = db_p / d(n, d), all sums that NCC and its gradient need are gathered in one pass:
+and b_p sampled at q_p, and g_p = db_p / d(n, d), all sums that NCC and its gradient need are gathered in one
+pass:
     d NCC = sum_p [(a_p - mean a) / (P s) - NCC (b_p - mean b) / (P (var b + e))] g_p,   s = sqrt((var a +
     e)(var b + e)).
 """

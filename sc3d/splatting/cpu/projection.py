@@ -7,9 +7,8 @@ which needs two multiplications per pixel, has no cancellation for thin diagonal
 interval of a row at once.
 
 Record of a Gaussian, 16 float32 (64 bytes): mean x, y (px); m; a and h in units of 2^-x (times log2(e) / 2);
-log2 opacity; half extents in x and y
-(px) of the ellipse where alpha falls to 1/255; color (3); normal (3) and plane distance, camera frame; dy of
-the right-most point of that ellipse.
+log2 opacity; half extents in x and y (px) of the ellipse where alpha falls to 1/255; color (3); normal (3)
+and plane distance, camera frame; dy of the right-most point of that ellipse.
 Arithmetic is float64 inside: far Gaussians of a large scene keep their place, and it costs nothing in scalar
 code.
 """

@@ -20,8 +20,8 @@ from sc3d.splatting.cpu.projection import (
 )
 
 # sums over pixels in one raster gradient record; s = d loss / d ln(alpha), w = weight, g = d loss / d output
-# channel
-# s, s u, s u^2, s dy, s u dy, s dy^2, |ds/dx|, |ds/dy|, w g (color 3, normal 3, plane distance), spare
+# channel s, s u, s u^2, s dy, s u dy, s dy^2, |ds/dx|, |ds/dy|, w g (color 3, normal 3, plane distance),
+# spare
 SUMS = 16
 
 

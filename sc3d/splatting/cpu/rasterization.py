@@ -71,8 +71,8 @@ def measure_rows(records, base, frame, lines, ends):
     """Where the ellipse of a record meets the 16 pixel rows of a tile; returns first and last row.
 
     frame: of `tile_frame`
-    lines (3 * 16,): dy, center - 0.5 (px, tile frame) and log2 alpha at the center of each row
-    ends (2 * 16,): first column and one past the last column of each row
+    lines (3 * 16,): dy, center - 0.5 (px, tile frame) and log2 alpha at the center of each row ends (2 *
+    16,): first column and one past the last column of each row
     """
     left, top, rows, columns = np.float32(frame[0]), np.float32(frame[1]), frame[2], frame[3]
     mean_y, half_y = records[base + 1] - top, records[base + 7]

@@ -1,9 +1,8 @@
 """Numba kernels that sort records into tiles of 16 x 16 px: which Gaussians touch which tile, front to back.
 
 An *instance* is a (Gaussian, tile) pair. Instances are numbered Gaussian by Gaussian, so that what each of
-them sums up can be added per Gaussian
-in a fixed order, whatever the number of threads. Only tiles that the ellipse of alpha >= 1/255 really touches
-are listed.
+them sums up can be added per Gaussian in a fixed order, whatever the number of threads. Only tiles that the
+ellipse of alpha >= 1/255 really touches are listed.
 """
 
 from __future__ import annotations

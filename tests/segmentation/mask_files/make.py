@@ -2,8 +2,8 @@
 test_mask_imports.py.
 
 Run once, by hand, in an environment of its own: pip install labelme==6.3.1 datumaro==1.13.12 cvat-sdk==2.80.0
-pycocotools==2.0.11, then
-python tests/mask_files/make.py. The files are committed so that the tests need none of these packages.
+pycocotools==2.0.11, then python tests/mask_files/make.py. The files are committed so that the tests need none
+of these packages.
 """
 
 import json

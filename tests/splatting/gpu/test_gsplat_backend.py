@@ -2,13 +2,11 @@
 gsplat's CUDA kernels.
 
 gsplat's image is put together here: its projection, spherical harmonics and tile lists; the fragments of each
-pixel by the rules of its CUDA kernels
-(listed below in torch, because gsplat lists them on a GPU only); its `accumulate`, with a stand-in for the
-two nerfacc functions that it calls.
+pixel by the rules of its CUDA kernels (listed below in torch, because gsplat lists them on a GPU only); its
+`accumulate`, with a stand-in for the two nerfacc functions that it calls.
 Both renderers keep every fragment with alpha >= 1/255: gsplat's boxes of 3.33 sigma hold them all, since 255
-exp(-3.33^2 / 2) < 1. They limit alpha
-differently (0.99 here, 0.999 there) and end a pixel one fragment apart, so opacities stay below 0.99 and
-transmittances above 1e-4.
+exp(-3.33^2 / 2) < 1. They limit alpha differently (0.99 here, 0.999 there) and end a pixel one fragment
+apart, so opacities stay below 0.99 and transmittances above 1e-4.
 """
 
 import sys
