@@ -89,7 +89,7 @@ def scene_command(record: type) -> type:
         "Command",
         [
             ("scene", Annotated[Positional[Path], tyro.conf.arg(help="Scene folder.")]),
-            ("settings", OmitArgPrefixes[record], dataclasses.field(default_factory=record)),  # type: ignore
+            ("settings", OmitArgPrefixes[record], dataclasses.field(default_factory=record)),  # type: ignore[valid-type, misc]  # made at run time
             (
                 "overwrite",
                 Annotated[bool, tyro.conf.arg(help="Run again even if the outputs are up to date.")],
