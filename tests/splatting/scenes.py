@@ -1,9 +1,11 @@
-"""Training data of scenes made of a few planes and spheres, with their exact depth."""
+"""Scenes made of a few planes and spheres: training data with exact depth, and Gaussians."""
 
 import numpy as np
+import torch
 
 from sc3d.geometry.cameras import look_at, pinhole_view, rays
 from sc3d.splatting.dataset import TrainingData
+from sc3d.splatting.gaussians import SH_C0, Gaussians
 
 SIZE = (96, 64)
 
@@ -80,3 +82,39 @@ def ring(calibration=(90.0, 90.0, 50.0, 31.0)):
 def valley():
     """z = 0.3 |x|, so that the space above both planes is convex."""
     return [plane([-0.3, 0, 1], 0.0), plane([0.3, 0, 1], 0.0)]
+
+
+RED_POINT = np.array([1.3, 0.8, 0.3])  # a lone red Gaussian above the ground; local frame
+GREEN, RED, UP = (60, 140, 50), (230, 20, 20), (128, 128, 255)
+
+
+def flat_ground(half: float = 4.0) -> Gaussians:
+    """A flat green ground, 2 `half` m wide, and one red Gaussian; both opaque."""
+    x, y = np.meshgrid(*[np.arange(-half, half + 0.01, 0.2)] * 2)
+    points = np.concatenate([np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1), RED_POINT[None]])
+    colors = np.tile(np.float32(GREEN) / 255, (len(points), 1))
+    colors[-1] = np.float32(RED) / 255
+    scales = np.tile(np.float32([0.15, 0.15, 0.002]), (len(points), 1))
+    scales[-1] = (0.08, 0.08, 0.002)
+    quats = np.tile(np.float32([1, 0, 0, 0]), (len(points), 1))
+    sh = ((colors - 0.5) / SH_C0).astype(np.float32)
+    parts = [points.astype(np.float32), np.log(scales), quats, np.full(len(points), 6, np.float32), sh]
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(part)) for part in parts))
+
+
+def view_of(center: tuple[float, float, float], size: tuple[int, int] = (120, 90)):
+    """A view whose principal point is not the middle, image top towards the north-east."""
+    calibration = (110, 114, size[0] / 2 + 5, size[1] / 2 - 3)
+    return pinhole_view(
+        "some photo.jpg",
+        size,
+        calibration,
+        look_at(np.array(center, float), np.array([0.3, 0.2, 0]), (0.4, 1, 0.3)),
+    )
+
+
+def center_of_red(image: np.ndarray) -> np.ndarray:
+    """(2,) pixel coordinates of what is red in (H, W, 3) uint8 RGB."""
+    weight = np.maximum(image[..., 0].astype(float) - 1.2 * image[..., 1] - 60, 0)
+    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    return np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()

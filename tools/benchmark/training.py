@@ -93,6 +93,7 @@ def measure_training(
     reset_peak_memory()
     for _ in range(repeats):
         ceilings.append([fma_gflops(), fma_gflops(threads)])
+        iteration.run()  # warm again after the loop above
         with use_threads(1):
             single.append(iteration.run())
         with use_threads(threads):
