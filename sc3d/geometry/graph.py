@@ -22,7 +22,7 @@ SPACING_NEIGHBOR = 4  # the local spacing is the distance to this neighbor
 COLOR_WIDTH = 0.1  # standard deviation of colors on one surface, of 1
 ORDER_BITS = 10  # per axis, of the curve that orders the points
 MORTON_BITS = 21  # per axis; three of them fit into 63 bits
-CHUNK = 200_000  # points whose neighbors are held twice at a time
+POINTS_AT_ONCE = 200_000  # points whose neighbors are held twice at a time
 
 
 @dataclass(frozen=True)
@@ -171,8 +171,8 @@ def _others(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     index, count = NeighborIndex(points, np.zeros(3)), min(count, len(points) - 1)
     kept = np.empty((len(points), count), np.int32)
     lengths = np.empty(kept.shape, np.float32)
-    for start in range(0, len(points), CHUNK):
-        part = slice(start, start + CHUNK)
+    for start in range(0, len(points), POINTS_AT_ONCE):
+        part = slice(start, start + POINTS_AT_ONCE)
         _drop_self(*index.nearest(points[part], count + 1), start, kept[part], lengths[part])
     return kept, lengths
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 
-CHUNK = 500_000  # queries per batch: bounds memory, not results
+QUERIES_AT_ONCE = 500_000  # queries per batch: bounds memory, not results
 
 
 class NeighborIndex:
@@ -39,8 +39,8 @@ class NeighborIndex:
         count = min(count, self.num_points)
         indices = np.empty((len(queries), count), np.int32)
         distances = np.empty((len(queries), count), np.float32)
-        for start in range(0, len(queries), CHUNK):
-            part = slice(start, start + CHUNK)
+        for start in range(0, len(queries), QUERIES_AT_ONCE):
+            part = slice(start, start + QUERIES_AT_ONCE)
             local = np.ascontiguousarray(np.asarray(queries[part], np.float64) - self._origin, np.float32)
             found, squared = self._search.knn_search(o3d.core.Tensor(local), count)
             indices[part] = found.numpy().reshape(-1, count)
@@ -68,8 +68,8 @@ def estimate_normals(points: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
     returns: (N, 3) float32
     """
     normals = np.empty((len(points), 3), np.float32)
-    for start in range(0, len(points), CHUNK // 4):
-        part = slice(start, start + CHUNK // 4)
+    for start in range(0, len(points), QUERIES_AT_ONCE // 4):
+        part = slice(start, start + QUERIES_AT_ONCE // 4)
         local = np.asarray(points, np.float64)[neighbors[part]]
         local -= local.mean(axis=1, keepdims=True)
         covariance = np.einsum("nki,nkj->nij", local, local) / local.shape[1]
@@ -104,8 +104,8 @@ def curvature(normals: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
     returns: (N,) float32, 0 = plane
     """
     result = np.empty(len(normals), np.float32)
-    for start in range(0, len(normals), CHUNK):
-        part = slice(start, start + CHUNK)
+    for start in range(0, len(normals), QUERIES_AT_ONCE):
+        part = slice(start, start + QUERIES_AT_ONCE)
         around = normals[neighbors[part]]
         signs = np.where(np.einsum("nki,ni->nk", around, normals[part]) < 0, np.float32(-1), np.float32(1))
         result[part] = np.linalg.norm(

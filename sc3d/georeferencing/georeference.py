@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 LARGEST = (90.0, 180.0, 1e6)  # latitude, longitude, degrees; height, m
-CHUNK = 1_000_000  # points per call of PROJ
+POINTS_AT_ONCE = 1_000_000  # points per call of PROJ
 IDENTITY = tuple(tuple(float(row == column) for column in range(4)) for row in range(4))
 
 
@@ -279,7 +279,7 @@ def _transformer(source: str, target: pyproj.CRS) -> pyproj.Transformer:
 
 
 def _chunks(points: np.ndarray) -> list[np.ndarray]:
-    return np.array_split(points, max(1, -(-len(points) // CHUNK)))
+    return np.array_split(points, max(1, -(-len(points) // POINTS_AT_ONCE)))
 
 
 def _numbers(values: object, shape: tuple[int, ...]) -> tuple[float, ...]:

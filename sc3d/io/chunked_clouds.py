@@ -13,7 +13,7 @@ from sc3d.io.las import check_las
 from sc3d.io.limits import FARTHEST
 from sc3d.io.ply import check_ply
 
-CHUNK = 1_000_000  # rows held at a time
+RECORDS_AT_ONCE = 1_000_000  # rows held at a time
 LAS_FIELDS = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
 LAS_COLORS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 
@@ -72,8 +72,8 @@ class CloudFile:
             return
         with self.path.open("rb") as file:
             file.seek(self.offset)
-            for start in range(0, self.num_points, CHUNK):
-                yield start, np.fromfile(file, self.dtype, min(CHUNK, self.num_points - start))
+            for start in range(0, self.num_points, RECORDS_AT_ONCE):
+                yield start, np.fromfile(file, self.dtype, min(RECORDS_AT_ONCE, self.num_points - start))
 
 
 def _read_las(cloud: CloudFile) -> Iterator[tuple[int, np.ndarray]]:
@@ -81,7 +81,7 @@ def _read_las(cloud: CloudFile) -> Iterator[tuple[int, np.ndarray]]:
 
     start = 0
     with laspy.open(cloud.path) as file:
-        for points in file.chunk_iterator(CHUNK):
+        for points in file.chunk_iterator(RECORDS_AT_ONCE):
             records = np.empty(len(points), cloud.dtype)
             for axis in "xyz":
                 records[axis] = getattr(points, axis)

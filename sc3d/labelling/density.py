@@ -16,7 +16,7 @@ from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.voxels import VoxelOrder, sort_by_voxel
 
 NEAREST = 12  # Gaussians that count at a point
-CHUNK = 200_000
+POINTS_AT_ONCE = 200_000
 FULL = 1023  # fixed point of the densest point of a voxel
 
 
@@ -49,8 +49,8 @@ def gaussian_density(points: np.ndarray, gaussians: GaussianField, voxel_size: f
     """
     index = NeighborIndex(gaussians.means)
     result = np.empty(len(points), np.float32)
-    for start in range(0, len(points), CHUNK):
-        part = slice(start, start + CHUNK)
+    for start in range(0, len(points), POINTS_AT_ONCE):
+        part = slice(start, start + POINTS_AT_ONCE)
         near, _ = index.nearest(points[part], NEAREST)
         local = (points[part, None] - gaussians.means[near]).astype(np.float32)
         along = np.einsum("nkij,nki->nkj", gaussians.rotations[near], local) / np.maximum(

@@ -18,7 +18,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, camera_rays, may_see
 from sc3d.geometry.raycast import Surface, surfels
 from sc3d.io.atomic import atomic_path
-from sc3d.io.chunked_clouds import CHUNK, CloudFile, columns, positions
+from sc3d.io.chunked_clouds import RECORDS_AT_ONCE, CloudFile, columns, positions
 from sc3d.io.ply import Property, check_ply
 from sc3d.scene.scene import Scene
 from sc3d.tiling.executor import Executor
@@ -103,8 +103,8 @@ def read_triangles(path: Path) -> Iterator[np.ndarray]:
     table = np.dtype([(entry.name, header.order + entry.dtype) for entry in vertex.properties])
     row = np.dtype([field for entry in face.properties for field in _fields(entry, corners, header.order)])
     start = header.size + table.itemsize * vertex.rows
-    for first in range(0, face.rows, CHUNK):
-        count = min(CHUNK, face.rows - first)
+    for first in range(0, face.rows, RECORDS_AT_ONCE):
+        count = min(RECORDS_AT_ONCE, face.rows - first)
         faces = np.fromfile(path, row, count, offset=start + first * row.itemsize)
         if len(faces) < count or (faces["count"] != 3).any():
             raise InputError(

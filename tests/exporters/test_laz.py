@@ -200,7 +200,7 @@ def test_laz_in_parts_holds_what_the_whole_does(tmp_path, monkeypatch):
         whole = laz.outputs(scene, settings)[0].read_bytes()
         with monkeypatch.context() as patch:
             patch.setattr("sc3d.exporters.projected_cloud.fits", lambda *_: False)
-            patch.setattr("sc3d.io.chunked_clouds.CHUNK", 300)
+            patch.setattr("sc3d.io.chunked_clouds.RECORDS_AT_ONCE", 300)
             figures = laz.write(scene, settings)
         las, again = (laspy.read(source) for source in (io.BytesIO(whole), laz.outputs(scene, settings)[0]))
         assert len(las.points) == figures["points"] == len(again.points)

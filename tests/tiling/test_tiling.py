@@ -352,7 +352,7 @@ def test_parts_of_other_inputs_are_not_taken(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_las_is_read_in_chunks(tmp_path, monkeypatch, suffix):
-    monkeypatch.setattr("sc3d.io.chunked_clouds.CHUNK", 700)
+    monkeypatch.setattr("sc3d.io.chunked_clouds.RECORDS_AT_ONCE", 700)
     points = np.random.default_rng(0).uniform(0, 100, (3000, 3)) + [5e5, 5e6, 0]
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.offsets, header.scales = np.floor(points.min(axis=0)), [1e-3] * 3
