@@ -1,6 +1,4 @@
-"""Gaussians to a surface: depth of every view, checked against its neighbors, fused into a TSDF (METHOD
-section 1, Surface).
-"""
+"""Gaussians to a surface: depth of every view, checked against its neighbors, fused into a TSDF."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stages: each reads files of a scene folder, calls one function of the package and writes files.
+"""The stages: each reads files of a scene folder, has the packages below compute, and writes files.
 
 A stage module `sc3d/stages/<name>.py` offers three functions of (scene, settings):
     inputs   -> paths whose content decides whether the stage must run again

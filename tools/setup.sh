@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes .venv with everything sc3d needs, at the versions of tools/constraints.txt; sourced by demo.sh and test.sh.
+# Makes .venv with everything sc3d needs, at the versions of tools/constraints.txt; sourced by demo.sh, test.sh and lint.sh.
 # SC3D_PYTHON chooses the interpreter, SC3D_TORCH_INDEX a package index with CPU-only torch (otherwise pip's own default).
 set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)

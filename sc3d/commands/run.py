@@ -64,7 +64,7 @@ def check(command: Run, segment: Segment) -> None:
         masks = segment.masks or Scene(command.scene).masks
         if not masks.exists():
             raise InputError(
-                "--masks PATH is needed (or --segment.backend strokes or grounded-sam, which make masks)"
+                "--masks PATH is needed (or --segment.backend strokes, grounded-sam or sam3, which make masks)"
             )
         source = (
             MaskFiles(masks, segment.format, segment.mapping) if segment.masks else MaskFiles(masks, "index")

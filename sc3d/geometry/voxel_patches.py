@@ -1,5 +1,5 @@
-"""What a ray hits inside a voxel: the plane of the voxel's own points, so that ranges are finer than voxels
-(METHOD section 3).
+"""What a ray hits inside a voxel: the plane of the voxel's own points, so that ranges are finer than
+voxels.
 
 A voxel with few points and few around it is a floater and blocks nothing; an empty one amid the points of a plane
 is a gap and gets that plane. Sums are integers relative to the voxel, so patches depend neither on the order of

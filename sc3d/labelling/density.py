@@ -1,6 +1,4 @@
-"""How much matter there is at a point: weights inside a voxel, so that floaters have next to no say (METHOD
-3.5).
-"""
+"""How much matter there is at a point: weights inside a voxel, so that floaters have next to no say."""
 
 from __future__ import annotations
 

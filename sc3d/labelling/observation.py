@@ -1,5 +1,5 @@
 """What a view says: its mask at the size at which it votes, how much each pixel weighs, and the first surface that
-each pixel sees (METHOD 3.1 and 3.4).
+each pixel sees.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Two-way verification: what the fused labels say is held against what each view said, place by place (METHOD
-3.8).
+"""Two-way verification: what the fused labels say is held against what each view said, place by
+place.
 
 A segmenter errs by whole segments, so a view that contradicts the fused labels around a place is doubted in
-all it says there.
-The votes of each view and cell wait in a temporary file: memory does not grow with the number of views, and
+all it says there. The votes of each view and cell wait in a temporary file: memory does not grow with the number of views, and
 no ray is cast again.
 """
 

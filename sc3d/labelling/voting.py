@@ -1,4 +1,4 @@
-"""Semantic confidence voting (METHOD 3.4): one pass per view over all points, with projection, visibility, weights and
+"""Semantic confidence voting: one pass per view over all points, with projection, visibility, weights and
 votes fused (slow twin: tests/labelling/test_voting.py).
 
 Points are sorted by cell once; a cell is one side of a voxel that holds points. A thread owns whole blocks of cells,

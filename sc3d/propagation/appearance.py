@@ -1,5 +1,5 @@
-"""Color and relief of the classes as two more voters (METHOD section 6): what agreed points of each class look like, as
-joint histograms.
+"""Color and relief of the classes as two more voters: what agreed points of each class look like, as joint
+histograms.
 
 The masks' errors are shared between views, so no voting removes them. Color and relief (height above the
 ground around, roughness, slope) err otherwise. Each rater alone is poor; their product is good, because the

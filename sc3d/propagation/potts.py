@@ -1,6 +1,4 @@
-"""Potts energy on a neighbor graph, minimized by mean field (METHOD 0.1): one fused pass over the edges per
-step.
-"""
+"""Potts energy on a neighbor graph, minimized by mean field: one fused pass over the edges per step."""
 
 from __future__ import annotations
 

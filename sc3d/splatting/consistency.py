@@ -1,6 +1,4 @@
-"""Does the depth of one view agree with another's? Round trip of pixels through both depth maps (METHOD,
-multi-view terms and surface).
-"""
+"""Does the depth of one view agree with another's? Round trip of pixels through both depth maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The terms of the training loss (METHOD section 1): functions on tensors, each a scalar.
+"""The terms of the training loss: functions on tensors, each a scalar.
 
 Rendered maps are sums over a pixel's Gaussians: N = sum w n (camera frame, towards the camera), D = sum w d,
 A = sum w. The plane of a pixel is N . x + D = 0, whose scale cancels. Where tensors are on the CPU, kernels

@@ -1,1 +1,1 @@
-"""The stages: each names its input and output files and calls one function of the package."""
+"""The stages: each names its input and output files and leaves the method to the packages below."""

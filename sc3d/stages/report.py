@@ -12,13 +12,17 @@ from sc3d.settings.outputs import Report
 def inputs(scene: Scene, settings: Report) -> list[Path]:
     return [
         scene.labelled,
+        scene.seeds,
+        scene.cloud,
         scene.metrics,
         scene.sparse,
         scene.masks,
         scene.classes,
         scene.mesh,
         scene.images,
+        scene.truth,
         scene.path / "train.jpg",
+        *sorted(scene.export.glob("*.geojson")),  # not the folder: the report may be written there
     ]
 
 

@@ -242,7 +242,7 @@ def test_ranges_are_finer_than_voxels(noise):
 
 
 def test_pixel_to_surface_and_point_to_pixel_agree_on_a_sphere():
-    """A pixel binds only points that face it (METHOD 3.3): beyond the horizon, planes stand out a little,
+    """A pixel binds only points that face it: beyond the horizon, planes stand out a little,
     next to points that face away.
     """
     points, normals = sphere(20_000)

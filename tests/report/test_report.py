@@ -32,8 +32,10 @@ from sc3d.report.sections import (
     quality_section,
     summary_line,
 )
+from sc3d.runner import execute
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.scene.scene import Scene
+from sc3d.settings.outputs import Report
 
 UTM = np.array([500_000.0, 4_500_000.0, 100.0])
 GRASS, BUILDING = 1, 2
@@ -314,6 +316,21 @@ def test_labels_without_truth_give_no_accuracy(toy, tmp_path):
     assert quality_section(data) == "" and processing_section(data) == ""
     assert "IoU" not in found_section(data) and "8,000 points in 2 classes." in summary_line(data)
     assert "seed" in certainty_section(data)
+
+
+def test_page_is_made_again_when_objects_were_exported_since(toy, tmp_path):
+    scene = Scene(tmp_path)
+    for path in (toy.labelled, toy.classes):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    execute("report", scene, Report())
+    scene.report.unlink()
+    scene.report.write_text("finished")
+    execute("report", scene, Report())
+    assert scene.report.read_text() == "finished"  # up to date
+    scene.export.mkdir()
+    (scene.export / "buildings.geojson").write_text('{"type": "FeatureCollection", "features": []}')
+    execute("report", scene, Report())
+    assert "<html" in scene.report.read_text(encoding="utf-8")
 
 
 def test_scene_that_does_not_exist(tmp_path):

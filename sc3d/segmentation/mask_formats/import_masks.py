@@ -28,7 +28,7 @@ def import_scene_masks(scene: Scene, settings: Segment, class_table: ClassTable)
             raise InputError("--mapping and --format say how to read --masks, which is missing")
         if not scene.masks.is_dir():
             raise InputError(
-                "--masks FOLDER is needed (or --backend grounded-sam, which makes masks from the prompts in classes.json)"
+                "--masks FOLDER is needed (or --backend strokes, grounded-sam or sam3, which make masks)"
             )
         return {"masks": len(scene.mask_files(scene.masks, class_table)), "source": "already in the scene"}
     source, sizes = MaskFiles(settings.masks, settings.format, settings.mapping), photo_sizes(scene.images)
