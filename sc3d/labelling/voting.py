@@ -349,23 +349,23 @@ def cast_votes(cloud, camera, observation, weighting, votes, strict, overlay, vi
                     sums[1, label] += fixed
                     strict_count += share
             if strict_count:
-                _add_mean(sums, 1, strict_count, strict[cell])
+                _add_mean(sums, 1, strict_count, strict, cell)
             if count:
-                labels[cell], weights[cell] = _add_mean(sums, 0, count, votes[cloud.rows[cell]])
+                labels[cell], weights[cell] = _add_mean(sums, 0, count, votes, cloud.rows[cell])
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _add_mean(sums, which, count, votes):
-    """Add a view's mean sighting, row `which` of the sums, to a cell's votes (num_ids,) and clear it; returns the label
-    with the most weight, and that weight.
+def _add_mean(sums, which, count, votes, target):
+    """Add a view's mean sighting, row `which` of the sums, to row `target` of votes and clear it;
+    returns the label with the most weight, and that weight. (A slice for the row would count references.)
     """
-    votes[0] += 1
+    votes[target, 0] += 1
     best = most = 0
     for label in range(1, sums.shape[1]):
         total = sums[which, label]
         if total > 0:
             mean = total // count
-            votes[label] += mean
+            votes[target, label] += mean
             sums[which, label] = 0
             if mean > most or best == 0:
                 best, most = label, mean
