@@ -144,8 +144,8 @@ def similarity(
 
 
 def morton_codes(cells: np.ndarray) -> np.ndarray:
-    """(N,) uint64 interleaved bits of (N, 3) whole numbers of at most MORTON_BITS bits, the first of each three from the
-    first column: positions on a Z-order curve.
+    """(N,) uint64 interleaved bits of (N, 3) whole numbers of at most MORTON_BITS bits, the first of each three
+    from the first column: positions on a Z-order curve.
     """
     x, y, z = (_spread_bits(column) for column in cells.T.astype(np.uint64))
     return x | y << np.uint64(1) | z << np.uint64(2)
@@ -216,7 +216,7 @@ def _shape(points, normals, neighbors, distances):
 
 @numba.njit(cache=True)
 def _edge(normals, bend, i, j, oriented):
-    """Eq. 7."""
+    """Eq. 7, for one edge: alpha (1 - angle / pi) + beta exp(-gamma |difference of curvature|)."""
     cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
     cosine = min(max(cosine, np.float32(-1)), np.float32(1))
     angle = np.arccos(cosine) if oriented else 2 * np.arccos(abs(cosine))
@@ -275,7 +275,7 @@ def _link(neighbors):
 
 @numba.njit(cache=True, parallel=True)
 def _weigh(starts, columns, normals, bend, shades, oriented, weights):
-    """Eq. 7 is symmetric to the bit: each end computes the same."""
+    """Eq. 7 times the likeness of colors; symmetric to the bit, since each end computes the same."""
     for i in numba.prange(len(starts) - 1):
         for edge in range(starts[i], starts[i + 1]):
             j, squared = columns[edge], 0.0

@@ -15,8 +15,8 @@ class NeighborIndex:
     """A KD-tree over (N, 3) points, world; N >= 1.
 
     origin: (3,) what the points are shifted by, so that UTM positions keep their precision; None = their
-        first point. The parts of a cloud find the
-    same distances, to the last bit, if their origin is the same.
+        first point. The parts of a cloud find the same distances, to the last bit, if their origin is the
+        same.
     """
 
     def __init__(self, points: np.ndarray, origin: np.ndarray | None = None) -> None:

@@ -80,7 +80,7 @@ class Raster:
 
 
 def spacing_of_all(points: np.ndarray) -> float:
-    """Sampling distance of (N, 3) points, their unit, to three digits: like `labelled.spacing_of`, from a
+    """Sampling distance of (N, 3) points, their unit, to three digits: like `spacing_of` of a labelled cloud, from a
     sample that does not depend on their order.
     """
     bits = np.ascontiguousarray(points, np.float64).view(np.uint64).reshape(len(points), -1)

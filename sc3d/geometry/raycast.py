@@ -26,7 +26,7 @@ MIN_SUPPORT = 4  # points around a surfel, itself not counted; fewer: a floater,
 
 
 class RayTarget(Protocol):
-    """What rays can hit: `Surface` here, `traversal.VoxelSurface`."""
+    """What rays can hit: `Surface` here, `voxel_traversal.VoxelSurface`."""
 
     def cast(self, view: View, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rays from the center of `view` along (K, 3) float32 unit directions in its camera frame, NaN = no

@@ -55,7 +55,7 @@ class EvaluateJob:
 
 @dataclass(frozen=True)
 class TiledSurface:
-    """Stands for `labelled.LabelledSurface` where only pixels with truth are asked for."""
+    """Stands for `labelled_cloud.LabelledSurface` where only pixels with truth are asked for."""
 
     job: EvaluateJob
 

@@ -1,9 +1,8 @@
 """Where the work on tiles and views runs: in this process, or on Dask workers.
 
 A task is a function at the top of a module and an item; both go to the workers, and what they need beside
-lies in files that all of them see.
-Its result is small; what is large it writes to a file of its own. A task that is run twice writes the same,
-so a lost worker costs time only.
+lies in files that all of them see. Its result is small; what is large it writes to a file of its own. A task
+that is run twice writes the same, so a lost worker costs time only.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ def _ranges(
 
 
 def sample_spacing(store: TileStore, statistics: CloudStatistics) -> tuple[float, np.ndarray]:
-    """Sampling distance as `labelled.spacing_of` has it, and the points (S, 3) by which `default_voxel_size`
+    """Sampling distance as `labelled_cloud.spacing_of` has it, and the points (S, 3) by which `default_voxel_size`
     measures mask pixels.
     """
     rows, distances, footprint_rows, footprints = [], [], [], []

@@ -1,4 +1,4 @@
-"""How much fits into memory, and the folder in which a stage's finished parts wait."""
+"""How much fits into memory."""
 
 from __future__ import annotations
 
