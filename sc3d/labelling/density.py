@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy.spatial.transform import Rotation
-from scipy.special import expit
 
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.voxels import VoxelOrder, sort_by_voxel
@@ -34,6 +32,9 @@ class GaussianField:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray], origin: np.ndarray) -> GaussianField:
         """From what `io.splats` reads; origin: (3,) world position of the local frame's zero."""
+        from scipy.spatial.transform import Rotation  # here: every `sc3d label` would wait 0.2 s for it
+        from scipy.special import expit
+
         rotations = Rotation.from_quat(arrays["quats"][:, [1, 2, 3, 0]]).as_matrix().astype(np.float32)
         means, scales = arrays["means"].astype(np.float64) + origin, np.exp(arrays["log_scales"])
         return cls(means, rotations, scales, expit(arrays["opacity_logits"]))
