@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sc3d.cli import main
+from sc3d.georeferencing.alignment import fit_similarity
 from sc3d.scene.scene import read_sparse_model
 
 
@@ -24,13 +25,9 @@ def center_error(found, truth) -> tuple[int, float, float]:
     names = [view.name for view in found.views if view.name in true_centers]
     source = np.array([view.center for view in found.views if view.name in true_centers])
     target = np.array([true_centers[name] for name in names])
-    centered_source, centered_target = source - source.mean(axis=0), target - target.mean(axis=0)
-    left, values, right = np.linalg.svd(centered_target.T @ centered_source)
-    flip = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
-    rotation = left @ flip @ right
-    scale = (values * np.diag(flip)).sum() / (centered_source**2).sum()
-    error = np.linalg.norm(centered_target - scale * centered_source @ rotation.T, axis=1).max()
-    return len(names), float(error / np.linalg.norm(np.ptp(target, axis=0))), float(scale)
+    fit = fit_similarity(source, target)
+    error = np.linalg.norm(target - fit.apply(source), axis=1).max()
+    return len(names), float(error / np.linalg.norm(np.ptp(target, axis=0))), fit.scale
 
 
 @pytest.fixture(scope="module")
@@ -53,31 +50,27 @@ def site(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
-def scene(site):
-    path = site.parent / "scene"
-    run(
+def chain(site) -> list:
+    """The arguments of `sc3d run` for the scene beside the site."""
+    return [
         "run",
         site / "images",
-        path,
-        "--masks",
-        site / "masks",
-        "--confidence",
-        site / "confidence",
-        "--classes",
-        site / "classes.json",
-        "--truth",
-        site / "truth",
-        "--train.iterations",
-        250,
-        "--train.max-size",
-        400,
-        "--train.max-gaussians",
-        40000,
-        "--extract.max-size",
-        400,
-    )
-    return path
+        site.parent / "scene",
+        *("--masks", site / "masks"),
+        *("--confidence", site / "confidence"),
+        *("--classes", site / "classes.json"),
+        *("--truth", site / "truth"),
+        *("--train.iterations", 250),
+        *("--train.max-size", 400),
+        *("--train.max-gaussians", 40000),
+        *("--extract.max-size", 400),
+    ]
+
+
+@pytest.fixture(scope="module")
+def scene(site):
+    run(*chain(site))
+    return site.parent / "scene"
 
 
 def test_cameras_are_metric_and_right(site, scene):
@@ -102,35 +95,14 @@ def test_report_is_one_page_with_pictures_and_nothing_from_outside(scene):
     assert "building" in page and "mIoU" in page
 
 
-def test_second_run_does_nothing_and_a_changed_option_reruns_what_follows(scene, caplog):
-    arguments = [
-        "run",
-        scene.parent / "site" / "images",
-        scene,
-        "--masks",
-        scene.parent / "site" / "masks",
-        "--confidence",
-        scene.parent / "site" / "confidence",
-        "--classes",
-        scene.parent / "site" / "classes.json",
-        "--truth",
-        scene.parent / "site" / "truth",
-        "--train.iterations",
-        250,
-        "--train.max-size",
-        400,
-        "--train.max-gaussians",
-        40000,
-        "--extract.max-size",
-        400,
-    ]
+def test_second_run_does_nothing_and_a_changed_option_reruns_what_follows(site, scene, caplog):
     before = {
         name: (scene / name).stat().st_mtime_ns
         for name in ("gaussians.ply", "cloud.ply", "seeds.ply", "labelled.ply", "metrics.json", "report.html")
     }
-    run(*arguments)
+    run(*chain(site))
     assert before == {name: (scene / name).stat().st_mtime_ns for name in before}
-    run(*arguments, "--propagate.method", "knn")
+    run(*chain(site), "--propagate.method", "knn")
     after = {name: (scene / name).stat().st_mtime_ns for name in before}
     assert [name for name in before if after[name] != before[name]] == [
         "labelled.ply",
