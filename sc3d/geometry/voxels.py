@@ -262,8 +262,7 @@ def _key_of(points, origin, voxel_size):
         if min(x, y, z) < 0 or max(x, y, z) >= limit:
             keys[row] = -1
             continue
-        block = (((x // BLOCK) << AXIS_BITS | y // BLOCK) << AXIS_BITS) | z // BLOCK
-        keys[row] = block * VOXELS + ((z % BLOCK) * BLOCK + y % BLOCK) * BLOCK + x % BLOCK
+        keys[row] = voxel_key(x, y, z)
     return keys
 
 

@@ -1,4 +1,4 @@
-"""The Gaussians themselves: parameters, what follows from them, initialization from sparse points."""
+"""The Gaussians themselves: parameters, and what follows from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A classifier of feature vectors: small neural networks and randomised trees, which err in different places,
+"""A classifier of feature vectors: small neural networks and randomized trees, which err in different places,
 trained crosswise.
 
 Strokes are dealt out to as many folds as there are members; each member learns from all folds but its own. So
