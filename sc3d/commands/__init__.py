@@ -8,6 +8,7 @@ from sc3d.settings import labels, outputs, reconstruction, synthesize, train
 STAGES: dict[str, type] = {
     "synthesize": synthesize.Synthesize,
     "georeference": reconstruction.GeoreferenceOptions,
+    "depth": reconstruction.Depth,
     "train": train.Train,
     "extract": reconstruction.Extract,
     "segment": labels.Segment,

@@ -29,6 +29,10 @@ class Scene:
         return self.path / "sparse" / "0"
 
     @property
+    def depth(self) -> Path:
+        return self.path / "depth"
+
+    @property
     def gaussians(self) -> Path:
         return self.path / "gaussians.ply"
 

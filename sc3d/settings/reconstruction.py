@@ -8,6 +8,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, Suppress, arg
 
+from sc3d.errors import InputError
+from sc3d.settings.common import Workers
+
 
 @dataclass(frozen=True)
 class Reconstruct:
@@ -57,6 +60,20 @@ class GeoreferenceOptions:
     """
     from_gps: bool = False
     """Replace the present georeference by one from GPS."""
+
+
+@dataclass(frozen=True)
+class Depth(Workers):
+    """Photos and cameras to a depth map per photo (PatchMatch stereo)."""
+
+    max_size: int = 800
+    """Longest side of the depth maps, px."""
+    num_sources: int = 6
+    """Other photos that each is compared with."""
+
+    def __post_init__(self) -> None:
+        if self.max_size < 32 or self.num_sources < 1:
+            raise InputError("max_size must be at least 32, num_sources at least 1")
 
 
 @dataclass(frozen=True)

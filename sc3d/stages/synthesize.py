@@ -18,7 +18,7 @@ def inputs(scene: Scene, settings: Synthesize) -> list[Path]:
 def outputs(scene: Scene, settings: Synthesize) -> list[Path]:
     return [
         scene.images,
-        scene.path / "depth",
+        scene.path / "truth_depth",
         scene.truth,
         scene.masks,
         scene.confidence,

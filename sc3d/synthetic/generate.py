@@ -39,7 +39,7 @@ CLASSES = [
     {"id": 4, "name": "grass", "color": [170, 220, 110], "prompts": ["grass", "lawn"], "asprs": 3},
 ]
 # fmt: on
-FOLDERS = ("images", "depth", "truth", "masks", "confidence")
+FOLDERS = ("images", "truth_depth", "truth", "masks", "confidence")
 NUM_SPARSE = 16_000  # candidates for sparse points; those seen by three views are kept
 
 
@@ -48,7 +48,7 @@ def synthesize(
 ) -> dict:
     """Write a complete scene folder.
 
-    Writes images/, depth/<stem>.npy (float32 z, m), truth/, masks/, confidence/, sparse/0, truth.ply,
+    Writes images/, truth_depth/<stem>.npy (float32 z, m), truth/, masks/, confidence/, sparse/0, truth.ply,
     truth_mesh.ply and classes.json.
     progress: called with the finished share (0..1) and what is being done; None = silent
     returns: summary: num_views, num_triangles, num_buildings, mask_accuracy (over pixels with truth != 0),
@@ -117,7 +117,7 @@ def _write_view(
 ) -> None:
     with atomic_path(scene_path / "images" / name) as temporary:
         Image.fromarray(photo.color).save(temporary, quality=95, subsampling=0, exif=exif)
-    with atomic_path(scene_path / "depth" / f"{name.stem}.npy") as temporary:
+    with atomic_path(scene_path / "truth_depth" / f"{name.stem}.npy") as temporary:
         np.save(temporary, photo.depth)
     for folder, image in (("truth", photo.label), ("masks", segmented[0]), ("confidence", segmented[1])):
         write_image(scene_path / folder / f"{name.stem}.png", image)

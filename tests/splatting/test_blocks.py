@@ -78,7 +78,7 @@ def test_masks_show_core_and_border_as_the_exact_depth_does(site):
                 ],
             )
             directions, along = rays(view)
-            depth = np.load(site / "depth" / f"{Path(view.name).stem}.npy").ravel()
+            depth = np.load(site / "truth_depth" / f"{Path(view.name).stem}.npy").ravel()
             known = depth > 0
             surface = view.center + directions * (depth / along)[:, None]
             truth = block.holds(surface, border=True)

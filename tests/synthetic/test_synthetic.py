@@ -222,7 +222,7 @@ def test_truth_cloud_has_only_outer_surfaces(world):
 def test_scene_folder_is_complete_and_readable(scene):
     path, settings, summary = scene
     stems = {f"view_{i:03d}" for i in range(settings.views)}
-    for folder in ("images", "depth", "truth", "masks", "confidence"):
+    for folder in ("images", "truth_depth", "truth", "masks", "confidence"):
         assert {file.stem for file in (path / folder).iterdir()} == stems
     assert [entry["id"] for entry in json.loads((path / "classes.json").read_text())] == [1, 2, 3, 4]
     cloud = o3d.t.io.read_point_cloud(str(path / "truth.ply"))

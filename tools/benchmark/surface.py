@@ -66,7 +66,7 @@ def _depth_errors(
     for view in tqdm(views, desc="depth", unit="view", disable=None):
         stem = view.name.rsplit(".", 1)[0]
         exact, label = (
-            np.load(truth.path / "depth" / f"{stem}.npy"),
+            np.load(truth.path / "truth_depth" / f"{stem}.npy"),
             read_index_image(truth.truth / f"{stem}.png"),
         )
         small = undistorted(view, max(exact.shape))

@@ -20,7 +20,7 @@ def run_surface(command: BenchmarkSurface) -> None:
     scene, truth = Scene(command.scene), Scene(command.truth)
     scene.require(scene.gaussians, scene.mesh, hint="run `sc3d train` and `sc3d extract` first")
     exact = (
-        truth.path / "depth",
+        truth.path / "truth_depth",
         truth.truth,
         truth.path / "truth.ply",
         truth.path / "truth_mesh.ply",

@@ -1,0 +1,77 @@
+"""Photos + cameras + sparse points -> depth/, one map per photo with how many others confirm it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sc3d.errors import InputError
+from sc3d.geometry.cameras import undistorted
+from sc3d.geometry.view_selection import neighbor_views
+from sc3d.io.atomic import atomic_path
+from sc3d.scene.scene import Scene, check_photos
+from sc3d.settings.reconstruction import Depth
+from sc3d.stereo.multi_view import MIN_SPARSE, StereoJob, estimate_depths, inverse_range, sparse_seeds
+from sc3d.tiling.executor import open_executor
+from sc3d.tiling.work_folder import WorkFolder
+
+
+def inputs(scene: Scene, settings: Depth) -> list[Path]:
+    return [scene.images, scene.sparse]
+
+
+def outputs(scene: Scene, settings: Depth) -> list[Path]:
+    return [scene.depth]
+
+
+def run(scene: Scene, settings: Depth) -> dict[str, object]:
+    model = scene.model
+    check_photos(scene, [view.name for view in model.views])
+    work = WorkFolder(scene.depth, "depth", [scene.images, scene.sparse], settings)
+    job, left_out = _job(scene, settings, work)
+    with open_executor(settings) as tasks, atomic_path(scene.depth) as folder:
+        folder.mkdir()
+        shares = estimate_depths(replace(job, output=folder), tasks)
+    work.remove()
+    one, two = np.mean(shares, axis=0)
+    return {
+        "photos": len(job.views),
+        **({"left_out": left_out} if left_out else {}),
+        "size": f"{job.views[0].width}x{job.views[0].height}",
+        "confirmed": f"{one:.1%} of the pixels by another view, {two:.1%} by two",
+    }
+
+
+def _job(scene: Scene, settings: Depth, work: WorkFolder) -> tuple[StereoJob, list[str]]:
+    """What there is to do; names of the photos that see too few sparse points to begin with."""
+    model = scene.model
+    seeds = [
+        sparse_seeds(undistorted(view, settings.max_size), model.points[track])
+        for view, track in zip(model.views, model.tracks, strict=True)
+    ]
+    kept = [row for row, seed in enumerate(seeds) if seed is not None]
+    if len(kept) < 2:
+        raise InputError(
+            f"{scene.sparse}: depth needs two photos with at least {MIN_SPARSE} sparse points each; {len(kept)} of {len(model.views)} have them: run `sc3d reconstruct` with more overlap"
+        )
+    photo_views = [model.views[row] for row in kept]
+    used = [seed for seed in seeds if seed is not None]
+    job = StereoJob(
+        scene.images.absolute(),
+        photo_views,
+        [undistorted(view, settings.max_size) for view in photo_views],
+        neighbor_views(
+            [model.tracks[row] for row in kept],
+            model.points,
+            np.array([view.center for view in photo_views]),
+            settings.num_sources,
+        ),
+        [inverse_range(seed) for seed in used],
+        used,
+        settings.max_size,
+        work.subfolder("passes"),
+        scene.depth,
+    )
+    return job, [view.name for view, seed in zip(model.views, seeds, strict=True) if seed is None]

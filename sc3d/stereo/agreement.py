@@ -1,0 +1,60 @@
+"""Which depths other views confirm: there and back through both maps."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from sc3d.geometry.cameras import View
+from sc3d.stereo.pinhole_pairs import stacked, transfers
+
+TOLERANCE = 1.0  # px, there and back
+RELATIVE = 0.01  # of the depth
+
+
+def count_agreements(
+    inverse: np.ndarray, view: View, others: list[np.ndarray], other_views: list[View]
+) -> np.ndarray:
+    """(H, W) uint8: how many other views land back within TOLERANCE px of a pixel, at the same depth within
+    RELATIVE.
+
+    inverse: (H, W) float32 inverse depths of `view`, 0 = none; others: those of the other views, any sizes
+    """
+    counts = np.zeros(inverse.shape, np.uint8)
+    if others:
+        forth = transfers([view] * len(others), other_views)
+        back = transfers(other_views, [view] * len(others))
+        sizes = np.array([other.shape[::-1] for other in others], np.int64)
+        _count(inverse, stacked(others), sizes, *forth, *back, counts)
+    return counts
+
+
+@numba.njit(cache=True)
+def moved(A, B, x, y, q):
+    """(column, row, third component) of a pixel in another view."""
+    w = A[2, 0] * x + A[2, 1] * y + A[2, 2] + B[2] * q
+    if w <= 1e-6:
+        return np.float32(-1), np.float32(-1), w
+    u = (A[0, 0] * x + A[0, 1] * y + A[0, 2] + B[0] * q) / w
+    v = (A[1, 0] * x + A[1, 1] * y + A[1, 2] + B[1] * q) / w
+    return u, v, w
+
+
+@numba.njit(cache=True, parallel=True)
+def _count(inverse, others, sizes, A, B, back_A, back_B, counts):
+    height, width = inverse.shape
+    for row in numba.prange(height):
+        for column in range(width):
+            x, y, q = np.float32(column + 0.5), np.float32(row + 0.5), inverse[row, column]
+            if q <= 0:
+                continue
+            for s in range(len(sizes)):
+                u, v, w = moved(A[s], B[s], x, y, q)
+                if not (u >= 0 and v >= 0 and u < sizes[s, 0] and v < sizes[s, 1]):
+                    continue
+                found = others[s, int(v), int(u)]
+                if found <= 0 or abs(found * w / q - 1) > RELATIVE:
+                    continue
+                u, v, w = moved(back_A[s], back_B[s], u, v, found)
+                if w > 1e-6 and (u - x) ** 2 + (v - y) ** 2 < TOLERANCE * TOLERANCE:
+                    counts[row, column] += 1

@@ -1,0 +1,283 @@
+"""Depth of all views of a scene, from coarse to fine.
+
+A pass works on every view by itself and reads what the pass before found for it and its sources, so passes run
+on any number of workers and an interrupted one goes on photo by photo. The first pass compares photos only; in
+the others a source whose own depth contradicts adds to the cost (Xu and Tao, Multi-Scale Geometric Consistency
+Guided Multi-View Stereo, 2019), which settles what little texture leaves open.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sc3d.geometry.cameras import View, in_image, project, resample
+from sc3d.io.atomic import atomic_path
+from sc3d.io.images import read_image, write_image
+from sc3d.scene.depth_map import DepthMap, depth_file, write_depth_map
+from sc3d.stereo.agreement import count_agreements
+from sc3d.stereo.patch_match import Stereo, evaluate, sweep
+from sc3d.stereo.pinhole_pairs import GrayView, smaller, stacked, transfers
+from sc3d.tiling.executor import Executor
+
+COARSEST = 200  # px, longest side of the first level is below twice that
+NEAREST, FARTHEST = 0.35, 10.0  # of the depths of the sparse points that a view sees: 1st and 99th percentile
+MIN_SPARSE = 8
+CELL = 8  # px, side of the cells that start at the depth of the nearest sparse point
+MAX_COST = 0.6  # 1 - NCC; more is no match, whatever depths agree
+REACH = 5  # px, from how far a pixel takes planes
+FROM_SPARSE = 0.7  # share of the pixels that start there; the others start anywhere
+
+
+class Pass(NamedTuple):
+    """size: longest side, px; spread: largest random change of the inverse depth, share of its range
+    tilt: largest random slope, as tangent of the angle to the image plane
+    trials: random changes per pixel and iteration; geometric: whether contradictions cost
+    """
+
+    size: int
+    iterations: int
+    trials: int
+    spread: float
+    tilt: float
+    geometric: bool
+
+
+def passes(longest: int) -> list[Pass]:
+    """All of them, for maps with a longest side of `longest` px."""
+    sizes = [longest]
+    while sizes[0] >= 2 * COARSEST:
+        sizes.insert(0, -(-sizes[0] // 2))
+    found = [Pass(sizes[0], 8, 3, 0.5, 1.5, False), Pass(sizes[0], 4, 2, 0.1, 0.7, True)]
+    for size in sizes[1:-1]:
+        found += [Pass(size, 2, 2, 0.05, 0.5, True), Pass(size, 2, 2, 0.02, 0.3, True)]
+    if len(sizes) > 1:
+        found.append(Pass(sizes[-1], 2, 1, 0.01, 0.2, True))
+    return found
+
+
+@dataclass(frozen=True)
+class StereoJob:
+    """What every task needs.
+
+    images: folder of the photos; photo_views: their cameras, by whose names they are found
+    views: the same, undistorted
+    sources: per view, rows of those it is compared with
+    ranges: per view, farthest and nearest inverse depth; seeds: per view, (n, 3) column, row and inverse depth of
+        the sparse points that it sees
+    longest: side of the maps, px; work: folder of what passes leave; output: folder of the depth maps
+    """
+
+    images: Path
+    photo_views: list[View]
+    views: list[View]
+    sources: list[np.ndarray]
+    ranges: list[tuple[float, float]]
+    seeds: list[np.ndarray]
+    longest: int
+    work: Path
+    output: Path
+
+    def file(self, number: int, row: int) -> Path:
+        """Planes and cost of a view after a pass: (H, W, 4) float32 q, a, b, cost."""
+        return self.work / f"{number}-{row}.npy"
+
+    def gray_file(self, row: int) -> Path:
+        """The gray photo, (H, W) uint8, of the size of its view."""
+        return self.work / f"gray-{row}.npy"
+
+    def gray(self, row: int) -> GrayView:
+        return GrayView(self.views[row], np.load(self.gray_file(row)).astype(np.float32) / np.float32(255))
+
+    def view(self, number: int, row: int) -> View:
+        """The view as large as in a pass."""
+        size = passes(self.longest)[number].size
+        own = max(self.views[row].width, self.views[row].height)
+        return smaller(self.views[row], max(1, round(own * size / self.longest)))
+
+
+def sparse_seeds(view: View, points: np.ndarray) -> np.ndarray | None:
+    """(n, 3) column, row and inverse depth of the (N, 3) points in a view; None for fewer than MIN_SPARSE."""
+    pixels, depths = project(view, points)
+    usable = in_image(view, pixels) & (depths > 0)
+    if usable.sum() < MIN_SPARSE:
+        return None
+    return np.column_stack([pixels[usable], 1 / depths[usable]])
+
+
+def inverse_range(seeds: np.ndarray) -> tuple[float, float]:
+    """Farthest and nearest inverse depth to look at."""
+    far, near = np.quantile(seeds[:, 2], [0.01, 0.99])
+    return float(far / FARTHEST), float(near / NEAREST)
+
+
+def estimate_depths(job: StereoJob, tasks: Executor) -> list[tuple[float, float]]:
+    """Write the depth map of every view; returns per view the shares of its pixels that one and that two other
+    views confirm.
+    """
+    rows = range(len(job.views))
+    tasks.run("photos", partial(write_gray, job), rows)
+    for number, each in enumerate(passes(job.longest)):
+        tasks.run(f"{each.size} px", partial(run_pass, job, number), rows)
+        for row in rows if number >= 2 else ():
+            job.file(number - 2, row).unlink(missing_ok=True)
+    return tasks.run("confirming", partial(finish_view, job), rows)
+
+
+def write_gray(job: StereoJob, row: int) -> None:
+    """The photo as all passes need it, unless it is already there."""
+    if not job.gray_file(row).exists():
+        view = job.photo_views[row]
+        image = resample(read_image(job.images / view.name), view, job.views[row])
+        save(job.gray_file(row), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+
+
+def save(path: Path, array: np.ndarray) -> None:
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.save(file, array)
+
+
+def run_pass(job: StereoJob, number: int, row: int) -> None:
+    """One pass over one view, unless it is already there."""
+    target, settings = job.file(number, row), passes(job.longest)[number]
+    if target.exists() or job.file(number + 1, row).exists():
+        return
+    view = job.view(number, row)
+    stereo = _problem(job, number, row, settings.geometric)
+    if number == 0:
+        planes = _start(
+            stereo,
+            job.seeds[row] * [view.width / job.views[row].width, view.height / job.views[row].height, 1],
+        )
+    else:
+        planes = upsampled(np.load(job.file(number - 1, row))[..., :3], stereo.gray.shape)
+    costs = np.empty(stereo.gray.shape, np.float32)
+    evaluate(stereo, planes, costs)
+    for half in range(2 * settings.iterations):
+        done = half // 2
+        sweep(
+            stereo,
+            planes,
+            costs,
+            half % 2,
+            100 * number + half,
+            settings.spread * 0.5**done,
+            settings.tilt / view.focal * 0.7**done,
+            settings.trials,
+            REACH,
+        )
+    save(target, np.concatenate([planes, costs[..., None]], axis=2))
+
+
+def _problem(job: StereoJob, number: int, row: int, geometric: bool) -> Stereo:
+    """The arrays of one view and its sources as large as in a pass; geometric: with what the pass before found."""
+    own, views = job.view(number, row), [job.view(number, source) for source in job.sources[row]]
+    grays = [
+        job.gray(source).at(max(view.width, view.height)).gray
+        for source, view in zip(job.sources[row], views, strict=True)
+    ]
+    others = np.zeros((len(views), 0, 0), np.float32)
+    if geometric:
+        before = [np.load(job.file(number - 1, source))[..., :3] for source in job.sources[row]]
+        others = stacked(
+            [upsampled(planes, gray.shape)[..., 0] for planes, gray in zip(before, grays, strict=True)]
+        )
+    far, near = job.ranges[row]
+    return Stereo(
+        np.ascontiguousarray(job.gray(row).at(max(own.width, own.height)).gray),
+        stacked(grays),
+        np.array([gray.shape[::-1] for gray in grays], np.int64),
+        *transfers([own] * len(views), views),
+        np.float32(far),
+        np.float32(near),
+        others,
+        *transfers(views, [own] * len(views)),
+    )
+
+
+def _start(stereo: Stereo, seeds: np.ndarray) -> np.ndarray:
+    """(H, W, 3) planes that face the camera: most at the inverse depth of the nearest sparse point, the rest
+    anywhere in the range.
+    """
+    height, width = stereo.gray.shape
+    random = np.random.default_rng(0)
+    columns, rows = np.meshgrid(np.arange(0, width, CELL) + CELL / 2, np.arange(0, height, CELL) + CELL / 2)
+    nearest = cKDTree(seeds[:, :2]).query(np.column_stack([columns.ravel(), rows.ravel()]))[1]
+    known = seeds[nearest, 2].reshape(rows.shape).repeat(CELL, axis=0).repeat(CELL, axis=1)[:height, :width]
+    anywhere = random.uniform(stereo.farthest, stereo.nearest, (height, width))
+    planes = np.zeros((height, width, 3), np.float32)
+    planes[..., 0] = np.where(random.random((height, width)) < FROM_SPARSE, known, anywhere)
+    np.clip(planes[..., 0], stereo.farthest, stereo.nearest, planes[..., 0])
+    return planes
+
+
+def upsampled(planes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """(H, W, 3) planes of a coarser map at the pixels of a finer one of the same view."""
+    height, width = planes.shape[:2]
+    if (height, width) == shape:
+        return planes.copy()
+    y, x = (np.arange(shape[0]) + 0.5) * height / shape[0], (np.arange(shape[1]) + 0.5) * width / shape[1]
+    rows, columns = np.minimum(y.astype(int), height - 1), np.minimum(x.astype(int), width - 1)
+    finer = planes[rows[:, None], columns[None]]
+    dy, dx = (y - rows - 0.5).astype(np.float32), (x - columns - 0.5).astype(np.float32)
+    finer[..., 0] += finer[..., 1] * dx + finer[..., 2] * dy[:, None]
+    finer[..., 1] *= width / shape[1]
+    finer[..., 2] *= height / shape[0]
+    return finer
+
+
+def finish_view(job: StereoJob, row: int) -> tuple[float, float]:
+    """Check a view against its sources and write its depth map.
+
+    Views can also agree on chance, as they have looked at each other's maps, so the photos must agree too.
+    """
+    last = len(passes(job.longest)) - 1
+    planes, view, sources = np.load(job.file(last, row)), job.view(last, row), job.sources[row]
+    inverse = np.ascontiguousarray(planes[..., 0])
+    counts = count_agreements(
+        inverse,
+        view,
+        [np.load(job.file(last, source))[..., 0] for source in sources],
+        [job.view(last, source) for source in sources],
+    )
+    costs = np.empty(inverse.shape, np.float32)
+    evaluate(_problem(job, last, row, geometric=False), planes, costs)
+    counts[costs > MAX_COST] = 0
+    file = depth_file(job.output, view.name)
+    depth = np.where(inverse > 0, 1 / np.maximum(inverse, 1e-30), 0).astype(np.float32)
+    write_depth_map(file, DepthMap(depth, plane_normals(view, planes), counts))
+    write_image(file.with_suffix(".jpg"), preview(np.where(counts > 0, inverse, 0)))
+    return float((counts >= 1).mean()), float((counts >= 2).mean())
+
+
+def plane_normals(view: View, planes: np.ndarray) -> np.ndarray:
+    """(H, W, 3) int8, 127 times the normals towards the camera of (H, W, 3+) planes of a pinhole view.
+
+    With x = (u - cx) / fx: q = A x + B y + C and n . (x, y, 1) = d q, so n is along (A, B, C).
+    """
+    matrix = view.matrix
+    columns, rows = (
+        np.arange(view.width) + 0.5 - matrix[0, 2],
+        np.arange(view.height)[:, None] + 0.5 - matrix[1, 2],
+    )
+    q, a, b = np.moveaxis(planes[..., :3].astype(np.float64), 2, 0)
+    away = np.stack([a * matrix[0, 0], b * matrix[1, 1], q - a * columns - b * rows], axis=2)
+    length = np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-30)
+    return np.round(-127 * away / length).astype(np.int8)
+
+
+def preview(inverse: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 picture of inverse depths: red is near, blue far, black unknown (0)."""
+    known = inverse > 0
+    if not known.any():
+        return np.zeros((*inverse.shape, 3), np.uint8)
+    low, high = np.quantile(inverse[known], [0.01, 0.99])
+    scaled = np.clip((inverse - low) / max(high - low, 1e-12), 0, 1) * 255
+    colored = cv2.cvtColor(cv2.applyColorMap(scaled.astype(np.uint8), cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
+    return np.where(known[..., None], colored, 0).astype(np.uint8)

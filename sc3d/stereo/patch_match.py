@@ -1,0 +1,292 @@
+"""PatchMatch stereo: a slanted plane for every pixel, found by trying the planes of the pixels around it.
+
+The inverse depth 1 / z of a plane is linear in the pixel, so a plane is (q, a, b): the inverse depth at the
+pixel and its slopes along columns and rows; it goes on at an offset (i, j) with q + i a + j b. A pixel p of the
+reference lands in a source at A (p, 1) + q(p) B, projected, A = K_s R K_r^-1 and B = K_s t. Its patch is compared
+by normalized cross-correlation (NCC), weighted with the color difference to the middle (bilateral weights), and
+warped by the derivative of that map, which is exact up to second order in the patch radius.
+
+After Bleyer et al., PatchMatch Stereo (2011), with the red-black updates of Galliani et al., Massively Parallel
+Multiview Stereopsis (2015). Written from the papers.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from sc3d.stereo.agreement import moved
+
+RADIUS = 4  # px, of the patch
+STEP = 2  # every second pixel of it
+SIDE = 2 * RADIUS // STEP + 1
+SAMPLES = SIDE * SIDE
+NOISE = (1.5 / 255) ** 2  # variance of gray values that counts as noise
+SPATIAL = 3.0  # px, standard deviation of the weights
+COLOR = 0.06  # gray value, standard deviation of the weights
+WORST = 2.0  # the cost where nothing can be compared
+BEST = 2  # sources whose costs are averaged: the others may not see the pixel
+AGREEMENT = 0.2  # cost per px by which a source's own depth contradicts
+CONTRADICTION = 3.0  # px; more does not count
+
+
+class Stereo(NamedTuple):
+    """One reference and its sources, all undistorted.
+
+    gray: (H, W) float32, 0 to 1; sources: (S, h, w) float32, filled up with 0; sizes: (S, 2) width, height px
+    A: (S, 3, 3), B: (S, 3) float32 of `pinhole_pairs.transfer`
+    farthest, nearest: inverse depths allowed, farthest <= q <= nearest
+    others: (S, h, w) float32 inverse depths that the sources have found, 0 = none; without any (S, 0, 0)
+    back_A, back_B: A and B from each source to the reference
+    """
+
+    gray: np.ndarray
+    sources: np.ndarray
+    sizes: np.ndarray
+    A: np.ndarray
+    B: np.ndarray
+    farthest: float
+    nearest: float
+    others: np.ndarray
+    back_A: np.ndarray
+    back_B: np.ndarray
+
+
+@numba.njit(cache=True, fastmath=True, inline="always")
+def _hash(state):
+    """Next state of a 32-bit generator (PCG's output function on an LCG)."""
+    return np.uint32(state * np.uint32(747796405) + np.uint32(2891336453))
+
+
+@numba.njit(cache=True, fastmath=True)
+def _uniform(state):
+    word = np.uint32(
+        ((state >> np.uint32((state >> np.uint32(28)) + np.uint32(4))) ^ state) * np.uint32(277803737)
+    )
+    word = np.uint32((word >> np.uint32(22)) ^ word)
+    return np.float32(word) * np.float32(2.3283064e-10)
+
+
+@numba.njit(cache=True, fastmath=True)
+def _patch(gray, row, column, weights, values):
+    """Fill (SAMPLES,) weights (sum 1) and weighted centered values of a reference patch; returns its
+    variance.
+    """
+    height, width = gray.shape
+    middle = gray[row, column]
+    total = np.float32(0)
+    mean = np.float32(0)
+    k = 0
+    for j in range(-RADIUS, RADIUS + 1, STEP):
+        y = min(max(row + j, 0), height - 1)
+        for i in range(-RADIUS, RADIUS + 1, STEP):
+            x = min(max(column + i, 0), width - 1)
+            value = gray[y, x]
+            difference = (value - middle) / np.float32(COLOR)
+            weight = np.exp(
+                np.float32(-0.5)
+                * (difference * difference + np.float32((i * i + j * j) / (SPATIAL * SPATIAL)))
+            )
+            weights[k] = weight
+            values[k] = value
+            total += weight
+            mean += weight * value
+            k += 1
+    mean /= total
+    variance = np.float32(0)
+    for k in range(SAMPLES):
+        weights[k] /= total
+        centered = values[k] - mean
+        variance += weights[k] * centered * centered
+        values[k] = weights[k] * centered
+    return variance
+
+
+@numba.njit(cache=True, fastmath=True)
+def _dissimilarity(source, width, height, A, B, row, column, q, a, b, weights, values, variance):
+    """1 - NCC of a reference patch and its image in one source; WORST where it lies outside."""
+    x, y = np.float32(column + 0.5), np.float32(row + 0.5)
+    w = A[2, 0] * x + A[2, 1] * y + A[2, 2] + B[2] * q
+    if w <= np.float32(1e-6):
+        return np.float32(WORST)
+    inverse = np.float32(1) / w
+    u = (A[0, 0] * x + A[0, 1] * y + A[0, 2] + B[0] * q) * inverse
+    v = (A[1, 0] * x + A[1, 1] * y + A[1, 2] + B[1] * q) * inverse
+    u_x = (A[0, 0] + B[0] * a - u * (A[2, 0] + B[2] * a)) * inverse
+    u_y = (A[0, 1] + B[0] * b - u * (A[2, 1] + B[2] * b)) * inverse
+    v_x = (A[1, 0] + B[1] * a - v * (A[2, 0] + B[2] * a)) * inverse
+    v_y = (A[1, 1] + B[1] * b - v * (A[2, 1] + B[2] * b)) * inverse
+    u -= np.float32(0.5)
+    v -= np.float32(0.5)
+    reach_u = np.float32(RADIUS) * (abs(u_x) + abs(u_y))
+    reach_v = np.float32(RADIUS) * (abs(v_x) + abs(v_y))
+    if not (
+        u - reach_u >= 0
+        and v - reach_v >= 0
+        and u + reach_u < width - 1
+        and v + reach_v < height - 1
+        and reach_u < 4 * RADIUS
+        and reach_v < 4 * RADIUS
+    ):
+        return np.float32(WORST)
+    first, second, product = np.float32(0), np.float32(0), np.float32(0)
+    k = 0
+    for j in range(SIDE):
+        dy = np.float32(STEP * j - RADIUS)
+        u_row, v_row = u + u_y * dy, v + v_y * dy
+        for i in range(SIDE):
+            dx = np.float32(STEP * i - RADIUS)
+            su, sv = u_row + u_x * dx, v_row + v_x * dx
+            cu, cv = int(su), int(sv)
+            fu, fv = su - np.float32(cu), sv - np.float32(cv)
+            upper = source[cv, cu] + fu * (source[cv, cu + 1] - source[cv, cu])
+            lower = source[cv + 1, cu] + fu * (source[cv + 1, cu + 1] - source[cv + 1, cu])
+            sample = upper + fv * (lower - upper)
+            weighted = weights[k] * sample
+            first += weighted
+            second += weighted * sample
+            product += values[k] * sample
+            k += 1
+    other = second - first * first
+    if other < 0:
+        other = np.float32(0)
+    noise = np.float32(NOISE)
+    return np.float32(1) - product / np.sqrt((variance + noise) * (other + noise))
+
+
+@numba.njit(cache=True, fastmath=True)
+def _contradiction(other, width, height, A, B, back_A, back_B, row, column, q):
+    """Cost of a depth that a source's own map contradicts: by how far the pixel lands from itself, there and
+    back."""
+    x, y, worst = np.float32(column + 0.5), np.float32(row + 0.5), np.float32(AGREEMENT * CONTRADICTION)
+    u, v, _ = moved(A, B, x, y, q)
+    if not (u >= 0 and v >= 0 and u < width and v < height):
+        return worst
+    found = other[int(v), int(u)]
+    if found <= 0:
+        return worst
+    u, v, w = moved(back_A, back_B, u, v, found)
+    if w <= np.float32(1e-6):
+        return worst
+    gap = np.sqrt((u - x) * (u - x) + (v - y) * (v - y))
+    return np.float32(AGREEMENT) * min(gap, np.float32(CONTRADICTION))
+
+
+@numba.njit(cache=True, fastmath=True)
+def _cost(stereo, row, column, q, a, b, weights, values, variance):
+    """Mean dissimilarity of the BEST sources for one plane; WORST counts for sources that do not see it."""
+    best, next_best = np.float32(WORST), np.float32(WORST)
+    for s in range(len(stereo.sizes)):
+        cost = _dissimilarity(
+            stereo.sources[s],
+            stereo.sizes[s, 0],
+            stereo.sizes[s, 1],
+            stereo.A[s],
+            stereo.B[s],
+            row,
+            column,
+            q,
+            a,
+            b,
+            weights,
+            values,
+            variance,
+        )
+        if stereo.others.shape[1]:
+            cost += _contradiction(
+                stereo.others[s],
+                stereo.sizes[s, 0],
+                stereo.sizes[s, 1],
+                stereo.A[s],
+                stereo.B[s],
+                stereo.back_A[s],
+                stereo.back_B[s],
+                row,
+                column,
+                q,
+            )
+        if cost < best:
+            next_best = best
+            best = cost
+        elif cost < next_best:
+            next_best = cost
+    if len(stereo.sizes) == 1:
+        return best
+    return np.float32(0.5) * (best + next_best)
+
+
+@numba.njit(cache=True, parallel=True, fastmath=True)
+def evaluate(stereo, planes, costs):
+    """Costs of given planes: (H, W, 3 or more) q, a, b to (H, W)."""
+    height, width = stereo.gray.shape
+    for row in numba.prange(height):
+        weights, values = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
+        for column in range(width):
+            variance = _patch(stereo.gray, row, column, weights, values)
+            q, a, b = planes[row, column, 0], planes[row, column, 1], planes[row, column, 2]
+            costs[row, column] = _cost(stereo, row, column, q, a, b, weights, values, variance)
+
+
+@numba.njit(cache=True, parallel=True, fastmath=True)
+def sweep(stereo, planes, costs, color, round_number, spread, tilt, num_trials, reach):
+    """One half of an iteration: pixels of one color of a checkerboard try the planes of pixels of the other,
+    then random changes of their own.
+
+    planes: (H, W, 3) float32 q, a, b, changed in place; costs: (H, W) float32
+    color: 0 or 1; round_number: seeds the random numbers
+    spread: largest change of q, share of the range; tilt: largest change of a and b, share of q
+    num_trials: random changes tried per pixel; reach: how far the planes come from, px
+    """
+    height, width = stereo.gray.shape
+    for row in numba.prange(height):
+        weights, values = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
+        for column in range((row + color) % 2, width, 2):
+            variance = _patch(stereo.gray, row, column, weights, values)
+            q, a, b = planes[row, column, 0], planes[row, column, 1], planes[row, column, 2]
+            best = costs[row, column]
+            for arm in range(4):
+                # the surest of the arm's pixels; odd distances are of the other color
+                chosen_row, chosen_column, surest = -1, -1, np.float32(1e9)
+                for distance in range(1, reach + 1, 2):
+                    r = row + (distance if arm == 0 else -distance if arm == 1 else 0)
+                    c = column + (distance if arm == 2 else -distance if arm == 3 else 0)
+                    if 0 <= r < height and 0 <= c < width and costs[r, c] < surest:
+                        chosen_row, chosen_column, surest = r, c, costs[r, c]
+                if chosen_row < 0:
+                    continue
+                ta, tb = planes[chosen_row, chosen_column, 1], planes[chosen_row, chosen_column, 2]
+                tq = (
+                    planes[chosen_row, chosen_column, 0]
+                    + ta * np.float32(column - chosen_column)
+                    + tb * np.float32(row - chosen_row)
+                )
+                if tq < stereo.farthest or tq > stereo.nearest:
+                    continue
+                if abs(tq - q) < 1e-5 * q and ta == a and tb == b:
+                    continue
+                cost = _cost(stereo, row, column, tq, ta, tb, weights, values, variance)
+                if cost < best:
+                    best, q, a, b = cost, tq, ta, tb
+            state = np.uint32(row * 9781 + column * 6271 + round_number * 26699 + 1)
+            amplitude = np.float32(spread)
+            for _ in range(num_trials):
+                state = _hash(state)
+                change = (_uniform(state) * 2 - 1) * amplitude * np.float32(stereo.nearest - stereo.farthest)
+                state = _hash(state)
+                slope = np.float32(tilt) * amplitude / np.float32(spread) * q
+                da = (_uniform(state) * 2 - 1) * slope
+                state = _hash(state)
+                db = (_uniform(state) * 2 - 1) * slope
+                tq, ta, tb = q + change, a + da, b + db
+                amplitude *= np.float32(0.35)
+                if tq < stereo.farthest or tq > stereo.nearest:
+                    continue
+                cost = _cost(stereo, row, column, tq, ta, tb, weights, values, variance)
+                if cost < best:
+                    best, q, a, b = cost, tq, ta, tb
+            planes[row, column, 0] = q
+            planes[row, column, 1] = a
+            planes[row, column, 2] = b
+            costs[row, column] = best
