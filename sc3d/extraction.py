@@ -69,16 +69,8 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
     with tempfile.TemporaryDirectory(prefix=temporary_name("sc3d-depth")) as folder:
         maps = _DepthMaps(Path(folder), data)
         footprint = maps.render(gaussians)
-        voxel_size = settings.voxel_size or _default_voxel_size(gaussians, footprint)
-        fusion, confirmed, pixels = (
-            DepthFusion(voxel_size),
-            0,
-            sum(view.width * view.height for view in data.views),
-        )
-        for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
-            depth = maps.confirmed(row, settings.min_views)
-            fusion.integrate(view, depth, data.image(row), data.depth_range[1])
-            confirmed += int((depth > 0).sum())
+        voxel_size = settings.voxel_size or _default_voxel_size(gaussians.means.detach().numpy(), footprint)
+        fusion, confirmed = _fused(data, lambda row: maps.confirmed(row, settings.min_views), voxel_size)
         if not confirmed:
             raise Sc3dError("the views' depths do not agree anywhere: train longer, or lower --min-views")
         parts = [_part(fusion)]
@@ -94,7 +86,40 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
                     )
                 )
     mesh, cloud = _joined(parts)
-    return Surfaces(mesh, cloud, voxel_size, confirmed / pixels, _coverage(mesh, data.views))
+    return Surfaces(mesh, cloud, voxel_size, confirmed, _coverage(mesh, data.views))
+
+
+def surface_from_depth(
+    data: DepthViews, depth: Callable[[int], np.ndarray], points: np.ndarray, voxel_size: float
+) -> Surfaces:
+    """Fuse depth maps, without Gaussians; nothing is added that they do not hold.
+
+    depth: index to (H, W) float32 depth that others confirm, 0 = none, of the view's size
+    points: (N, 3) sparse points, for the size of the scene; voxel_size: world units, 0 = as for `extract_surface`
+    """
+    footprints = [
+        float(np.median(known)) / view.focal
+        for row, view in enumerate(data.views)
+        if len(known := depth(row)[depth(row) > 0])
+    ]
+    if not footprints:
+        raise Sc3dError("no depth is confirmed by other photos: more overlap is needed, or lower --min-views")
+    voxel_size = voxel_size or _default_voxel_size(points, float(np.median(footprints)))
+    fusion, confirmed = _fused(data, depth, voxel_size)
+    mesh, cloud = _part(fusion)
+    return Surfaces(mesh, cloud, voxel_size, confirmed, _coverage(mesh, data.views))
+
+
+def _fused(
+    data: DepthViews, depth: Callable[[int], np.ndarray], voxel_size: float
+) -> tuple[DepthFusion, float]:
+    """The field of all views' depth, and the share of all pixels that have one."""
+    fusion, num_known = DepthFusion(voxel_size), 0
+    for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
+        known = depth(row)
+        fusion.integrate(view, known, data.image(row), data.depth_range[1])
+        num_known += int((known > 0).sum())
+    return fusion, num_known / sum(view.width * view.height for view in data.views)
 
 
 def _part(fusion: DepthFusion) -> Part:
@@ -326,8 +351,8 @@ def center_cloud(gaussians: Gaussians, centers: np.ndarray, min_opacity: float) 
     return cloud
 
 
-def _default_voxel_size(gaussians: Gaussians, footprint: float) -> float:
-    low, high = np.quantile(gaussians.means.detach().numpy(), [0.01, 0.99], axis=0)
+def _default_voxel_size(points: np.ndarray, footprint: float) -> float:
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)
     return max(1.5 * footprint, float((high - low).max()) / 2048)
 
 

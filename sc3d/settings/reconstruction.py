@@ -78,11 +78,12 @@ class Depth(Workers):
 
 @dataclass(frozen=True)
 class Extract:
-    """Gaussians to mesh and cloud."""
+    """Gaussians or depth maps to mesh and cloud."""
 
-    method: Annotated[Literal["tsdf", "centers"], arg(name="from")] = "tsdf"
-    """Fuse rendered depth into a truncated signed distance field, or take the Gaussians' centers as the
-    cloud.
+    method: Annotated[Literal["tsdf", "depth", "centers"], arg(name="from")] = "tsdf"
+    """Fuse depth into a truncated signed distance field: that which the Gaussians render, or that of `sc3d
+    depth`, which needs no training and adds nothing that one photo alone says. Or take the Gaussians' centers
+    as the cloud.
     """
     max_size: int = 800
     """Longest side of the depth maps, px."""

@@ -1,4 +1,4 @@
-"""gaussians.ply + cameras + photos -> mesh.ply and cloud.ply, in the world of the cameras."""
+"""gaussians.ply or depth/ + cameras + photos -> mesh.ply and cloud.ply, in the world of the cameras."""
 
 from __future__ import annotations
 
@@ -8,25 +8,28 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.extraction import DepthViews, center_cloud, extract_surface
-from sc3d.geometry.cameras import project, resample, undistorted
+from sc3d.extraction import DepthViews, Surfaces, center_cloud, extract_surface, surface_from_depth
+from sc3d.geometry.cameras import View, local_origin, project, resample, undistorted
 from sc3d.geometry.view_selection import neighbor_views
 from sc3d.io.clouds import write_geometry
 from sc3d.io.images import read_image
+from sc3d.scene.depth_map import depth_file, read_depth_map
 from sc3d.scene.scene import Scene, check_photos
 from sc3d.settings.reconstruction import Extract
 from sc3d.splatting.dataset import load_gaussians
 
 
 def inputs(scene: Scene, settings: Extract) -> list[Path]:
-    return [scene.gaussians, scene.sparse, scene.images]
+    return [scene.depth if settings.method == "depth" else scene.gaussians, scene.sparse, scene.images]
 
 
 def outputs(scene: Scene, settings: Extract) -> list[Path]:
-    return [scene.cloud, scene.mesh] if settings.method == "tsdf" else [scene.cloud]
+    return [scene.cloud] if settings.method == "centers" else [scene.cloud, scene.mesh]
 
 
 def run(scene: Scene, settings: Extract) -> dict[str, object]:
+    if settings.method == "depth":
+        return _from_depth(scene, settings)
     gaussians, origin = load_gaussians(scene)
     model = scene.model
     centers = np.array([view.center for view in model.views])
@@ -43,7 +46,35 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
         )
 
     data = DepthViews(views, image, neighbor_views(model.tracks, model.points, centers), _depth_range(model))
-    surfaces = extract_surface(gaussians, data, settings)
+    return _written(scene, extract_surface(gaussians, data, settings), origin)
+
+
+def _from_depth(scene: Scene, settings: Extract) -> dict[str, object]:
+    """Mesh and cloud of the maps of `sc3d depth`."""
+    scene.require(scene.depth, hint="run `sc3d depth` first")
+    model, origin = scene.model, local_origin(scene.model.views)
+    photo_views = [view for view in model.views if depth_file(scene.depth, view.name).exists()]
+    check_photos(scene, [view.name for view in photo_views])
+    views = [undistorted(view.shifted(origin), _size(scene, view)) for view in photo_views]
+
+    def image(row: int) -> np.ndarray:
+        view = photo_views[row]
+        return resample(read_image(scene.photo(view.name)), view.shifted(origin), views[row])
+
+    def depth(row: int) -> np.ndarray:
+        return read_depth_map(depth_file(scene.depth, views[row].name)).confirmed(settings.min_views)
+
+    data = DepthViews(views, image, [], _depth_range(model))
+    surfaces = surface_from_depth(data, depth, model.points - origin, settings.voxel_size)
+    return _written(scene, surfaces, origin)
+
+
+def _size(scene: Scene, view: View) -> int:
+    return max(read_depth_map(depth_file(scene.depth, view.name)).depth.shape)
+
+
+def _written(scene: Scene, surfaces: Surfaces, origin: np.ndarray) -> dict[str, object]:
+    """Write mesh and cloud; returns the figures."""
     write_geometry(scene.mesh, _placed(surfaces.mesh, origin))
     write_geometry(scene.cloud, _placed(surfaces.cloud, origin))
     return {
