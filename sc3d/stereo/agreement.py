@@ -29,14 +29,15 @@ def count_agreements(
     return counts
 
 
-@numba.njit(cache=True)
-def moved(A, B, x, y, q):
-    """(column, row, third component) of a pixel in another view."""
-    w = A[2, 0] * x + A[2, 1] * y + A[2, 2] + B[2] * q
-    if w <= 1e-6:
+@numba.njit(cache=True, inline="always")
+def moved(A, B, s, x, y, q):
+    """(column, row, third component) of a pixel (x, y) with inverse depth q in view s; column -1 behind it."""
+    w = A[s, 2, 0] * x + A[s, 2, 1] * y + A[s, 2, 2] + B[s, 2] * q
+    if w <= np.float32(1e-6):
         return np.float32(-1), np.float32(-1), w
-    u = (A[0, 0] * x + A[0, 1] * y + A[0, 2] + B[0] * q) / w
-    v = (A[1, 0] * x + A[1, 1] * y + A[1, 2] + B[1] * q) / w
+    inverse = np.float32(1) / w
+    u = (A[s, 0, 0] * x + A[s, 0, 1] * y + A[s, 0, 2] + B[s, 0] * q) * inverse
+    v = (A[s, 1, 0] * x + A[s, 1, 1] * y + A[s, 1, 2] + B[s, 1] * q) * inverse
     return u, v, w
 
 
@@ -49,12 +50,12 @@ def _count(inverse, others, sizes, A, B, back_A, back_B, counts):
             if q <= 0:
                 continue
             for s in range(len(sizes)):
-                u, v, w = moved(A[s], B[s], x, y, q)
+                u, v, w = moved(A, B, s, x, y, q)
                 if not (u >= 0 and v >= 0 and u < sizes[s, 0] and v < sizes[s, 1]):
                     continue
                 found = others[s, int(v), int(u)]
                 if found <= 0 or abs(found * w / q - 1) > RELATIVE:
                     continue
-                u, v, w = moved(back_A[s], back_B[s], u, v, found)
+                u, v, w = moved(back_A, back_B, s, u, v, found)
                 if w > 1e-6 and (u - x) ** 2 + (v - y) ** 2 < TOLERANCE * TOLERANCE:
                     counts[row, column] += 1

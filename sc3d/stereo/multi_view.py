@@ -32,7 +32,8 @@ MIN_SPARSE = 8
 CELL = 8  # px, side of the cells that start at the depth of the nearest sparse point
 MAX_COST = 0.6  # 1 - NCC; more is no match, whatever depths agree
 REACH = 5  # px, from how far a pixel takes planes
-FROM_SPARSE = 0.7  # share of the pixels that start there; the others start anywhere
+AROUND = 8  # sparse points through which a plane is laid
+BEGIN = (0.4, 0.3, 0.3)  # shares of pixels that start on such a plane, at the nearest sparse point, anywhere
 
 
 class Pass(NamedTuple):
@@ -202,19 +203,43 @@ def _problem(job: StereoJob, number: int, row: int, geometric: bool) -> Stereo:
 
 
 def _start(stereo: Stereo, seeds: np.ndarray) -> np.ndarray:
-    """(H, W, 3) planes that face the camera: most at the inverse depth of the nearest sparse point, the rest
-    anywhere in the range.
+    """(H, W, 3) planes: most through the sparse points around the pixel, or facing the camera at the depth of the
+    nearest; the rest anywhere in the range.
     """
     height, width = stereo.gray.shape
     random = np.random.default_rng(0)
     columns, rows = np.meshgrid(np.arange(0, width, CELL) + CELL / 2, np.arange(0, height, CELL) + CELL / 2)
-    nearest = cKDTree(seeds[:, :2]).query(np.column_stack([columns.ravel(), rows.ravel()]))[1]
-    known = seeds[nearest, 2].reshape(rows.shape).repeat(CELL, axis=0).repeat(CELL, axis=1)[:height, :width]
-    anywhere = random.uniform(stereo.farthest, stereo.nearest, (height, width))
-    planes = np.zeros((height, width, 3), np.float32)
-    planes[..., 0] = np.where(random.random((height, width)) < FROM_SPARSE, known, anywhere)
+    cells = np.column_stack([columns.ravel(), rows.ravel()])
+    fitted, nearest = (_spread(part, rows.shape)[:height, :width] for part in _planes_through(seeds, cells))
+    x, y = np.meshgrid(np.arange(width) % CELL + 0.5 - CELL / 2, np.arange(height) % CELL + 0.5 - CELL / 2)
+    fitted[..., 0] += fitted[..., 1] * x + fitted[..., 2] * y
+    anywhere = np.zeros_like(fitted)
+    anywhere[..., 0] = random.uniform(stereo.farthest, stereo.nearest, (height, width))
+    choice = random.choice(3, (height, width, 1), p=BEGIN)
+    planes = np.choose(choice, [fitted, nearest, anywhere]).astype(np.float32)
     np.clip(planes[..., 0], stereo.farthest, stereo.nearest, planes[..., 0])
     return planes
+
+
+def _planes_through(seeds: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(C, 3) least squares plane through the AROUND nearest seeds of each (C, 2) cell center, and (C, 3) that of
+    the nearest seed, which faces the camera.
+    """
+    near = cKDTree(seeds[:, :2]).query(cells, k=min(AROUND, len(seeds)))[1]
+    offsets = seeds[near, :2] - cells[:, None]
+    matrix = np.concatenate([np.ones((*near.shape, 1)), offsets], axis=2)
+    normal = matrix.transpose(0, 2, 1) @ matrix + np.diag(
+        [0, 1.0, 1.0]
+    )  # px^2: points in a line fix one slope only
+    fitted = np.linalg.solve(normal, matrix.transpose(0, 2, 1) @ seeds[near, 2][..., None])[..., 0]
+    facing = np.zeros_like(fitted)
+    facing[:, 0] = seeds[near[:, 0], 2]
+    return fitted, facing
+
+
+def _spread(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """(C, 3) values of cells at their pixels."""
+    return values.reshape(*shape, 3).repeat(CELL, axis=0).repeat(CELL, axis=1)
 
 
 def upsampled(planes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -23,6 +23,12 @@ RADIUS = 4  # px, of the patch
 STEP = 2  # every second pixel of it
 SIDE = 2 * RADIUS // STEP + 1
 SAMPLES = SIDE * SIDE
+LANES = 32  # SAMPLES filled up with such of weight 0, so that they fill vector registers
+_OFFSETS = np.zeros((LANES, 2), np.float32)
+_OFFSETS[:SAMPLES] = np.stack(
+    np.meshgrid(*[np.arange(-RADIUS, RADIUS + 1, STEP)] * 2, indexing="ij"), 2
+).reshape(-1, 2)
+ROWS, COLUMNS = np.ascontiguousarray(_OFFSETS.T)
 NOISE = (1.5 / 255) ** 2  # variance of gray values that counts as noise
 SPATIAL = 3.0  # px, standard deviation of the weights
 COLOR = 0.06  # gray value, standard deviation of the weights
@@ -71,7 +77,7 @@ def _uniform(state):
 
 @numba.njit(cache=True, fastmath=True)
 def _patch(gray, row, column, weights, values):
-    """Fill (SAMPLES,) weights (sum 1) and weighted centered values of a reference patch; returns its
+    """Fill (LANES,) weights (sum 1) and weighted centered values of a reference patch; returns its
     variance.
     """
     height, width = gray.shape
@@ -104,20 +110,21 @@ def _patch(gray, row, column, weights, values):
     return variance
 
 
-@numba.njit(cache=True, fastmath=True)
-def _dissimilarity(source, width, height, A, B, row, column, q, a, b, weights, values, variance):
-    """1 - NCC of a reference patch and its image in one source; WORST where it lies outside."""
-    x, y = np.float32(column + 0.5), np.float32(row + 0.5)
-    w = A[2, 0] * x + A[2, 1] * y + A[2, 2] + B[2] * q
+@numba.njit(cache=True, fastmath=True, inline="always")
+def _dissimilarity(flat, start, stride, width, height, A, B, s, x, y, q, a, b, weights, values, variance):
+    """1 - NCC of a reference patch and its image in source s; WORST where it lies outside. x, y: the pixel's
+    center; flat: all sources; start, stride: of source s in it
+    """
+    w = A[s, 2, 0] * x + A[s, 2, 1] * y + A[s, 2, 2] + B[s, 2] * q
     if w <= np.float32(1e-6):
         return np.float32(WORST)
     inverse = np.float32(1) / w
-    u = (A[0, 0] * x + A[0, 1] * y + A[0, 2] + B[0] * q) * inverse
-    v = (A[1, 0] * x + A[1, 1] * y + A[1, 2] + B[1] * q) * inverse
-    u_x = (A[0, 0] + B[0] * a - u * (A[2, 0] + B[2] * a)) * inverse
-    u_y = (A[0, 1] + B[0] * b - u * (A[2, 1] + B[2] * b)) * inverse
-    v_x = (A[1, 0] + B[1] * a - v * (A[2, 0] + B[2] * a)) * inverse
-    v_y = (A[1, 1] + B[1] * b - v * (A[2, 1] + B[2] * b)) * inverse
+    u = (A[s, 0, 0] * x + A[s, 0, 1] * y + A[s, 0, 2] + B[s, 0] * q) * inverse
+    v = (A[s, 1, 0] * x + A[s, 1, 1] * y + A[s, 1, 2] + B[s, 1] * q) * inverse
+    u_x = (A[s, 0, 0] + B[s, 0] * a - u * (A[s, 2, 0] + B[s, 2] * a)) * inverse
+    u_y = (A[s, 0, 1] + B[s, 0] * b - u * (A[s, 2, 1] + B[s, 2] * b)) * inverse
+    v_x = (A[s, 1, 0] + B[s, 1] * a - v * (A[s, 2, 0] + B[s, 2] * a)) * inverse
+    v_y = (A[s, 1, 1] + B[s, 1] * b - v * (A[s, 2, 1] + B[s, 2] * b)) * inverse
     u -= np.float32(0.5)
     v -= np.float32(0.5)
     reach_u = np.float32(RADIUS) * (abs(u_x) + abs(u_y))
@@ -132,42 +139,37 @@ def _dissimilarity(source, width, height, A, B, row, column, q, a, b, weights, v
     ):
         return np.float32(WORST)
     first, second, product = np.float32(0), np.float32(0), np.float32(0)
-    k = 0
-    for j in range(SIDE):
-        dy = np.float32(STEP * j - RADIUS)
-        u_row, v_row = u + u_y * dy, v + v_y * dy
-        for i in range(SIDE):
-            dx = np.float32(STEP * i - RADIUS)
-            su, sv = u_row + u_x * dx, v_row + v_x * dx
-            cu, cv = int(su), int(sv)
-            fu, fv = su - np.float32(cu), sv - np.float32(cv)
-            upper = source[cv, cu] + fu * (source[cv, cu + 1] - source[cv, cu])
-            lower = source[cv + 1, cu] + fu * (source[cv + 1, cu + 1] - source[cv + 1, cu])
-            sample = upper + fv * (lower - upper)
-            weighted = weights[k] * sample
-            first += weighted
-            second += weighted * sample
-            product += values[k] * sample
-            k += 1
-    other = second - first * first
-    if other < 0:
-        other = np.float32(0)
+    one, below = np.uintp(1), np.uintp(stride)
+    for k in range(LANES):
+        su, sv = u + u_x * COLUMNS[k] + u_y * ROWS[k], v + v_x * COLUMNS[k] + v_y * ROWS[k]
+        cu, cv = np.int32(su), np.int32(sv)
+        fu, fv = su - np.float32(cu), sv - np.float32(cv)
+        corner = np.uintp(np.uint32(start + cv * stride + cu))
+        upper = flat[corner] + fu * (flat[corner + one] - flat[corner])
+        lower = flat[corner + below] + fu * (flat[corner + below + one] - flat[corner + below])
+        sample = upper + fv * (lower - upper)
+        weighted = weights[k] * sample
+        first += weighted
+        second += weighted * sample
+        product += values[k] * sample
+    other = max(second - first * first, np.float32(0))
     noise = np.float32(NOISE)
     return np.float32(1) - product / np.sqrt((variance + noise) * (other + noise))
 
 
-@numba.njit(cache=True, fastmath=True)
-def _contradiction(other, width, height, A, B, back_A, back_B, row, column, q):
-    """Cost of a depth that a source's own map contradicts: by how far the pixel lands from itself, there and
-    back."""
-    x, y, worst = np.float32(column + 0.5), np.float32(row + 0.5), np.float32(AGREEMENT * CONTRADICTION)
-    u, v, _ = moved(A, B, x, y, q)
+@numba.njit(cache=True, fastmath=True, inline="always")
+def _contradiction(others, width, height, A, B, back_A, back_B, s, x, y, q):
+    """Cost of a depth that the own map of source s contradicts: by how far the pixel lands from itself, there and
+    back.
+    """
+    worst = np.float32(AGREEMENT * CONTRADICTION)
+    u, v, w = moved(A, B, s, x, y, q)
     if not (u >= 0 and v >= 0 and u < width and v < height):
         return worst
-    found = other[int(v), int(u)]
+    found = others[s, np.uintp(v), np.uintp(u)]
     if found <= 0:
         return worst
-    u, v, w = moved(back_A, back_B, u, v, found)
+    u, v, w = moved(back_A, back_B, s, u, v, found)
     if w <= np.float32(1e-6):
         return worst
     gap = np.sqrt((u - x) * (u - x) + (v - y) * (v - y))
@@ -175,38 +177,23 @@ def _contradiction(other, width, height, A, B, back_A, back_B, row, column, q):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _cost(stereo, row, column, q, a, b, weights, values, variance):
-    """Mean dissimilarity of the BEST sources for one plane; WORST counts for sources that do not see it."""
+def _cost(stereo, flat, row, column, q, a, b, weights, values, variance):
+    """Mean cost of the BEST sources for one plane; WORST counts for sources that do not see it."""
     best, next_best = np.float32(WORST), np.float32(WORST)
+    x, y = np.float32(column + 0.5), np.float32(row + 0.5)
+    stride, size = stereo.sources.shape[2], stereo.sources.shape[1] * stereo.sources.shape[2]
     for s in range(len(stereo.sizes)):
-        cost = _dissimilarity(
-            stereo.sources[s],
-            stereo.sizes[s, 0],
-            stereo.sizes[s, 1],
-            stereo.A[s],
-            stereo.B[s],
-            row,
-            column,
-            q,
-            a,
-            b,
-            weights,
-            values,
-            variance,
-        )
+        width, height = stereo.sizes[s, 0], stereo.sizes[s, 1]
+        cost = np.float32(0)
         if stereo.others.shape[1]:
-            cost += _contradiction(
-                stereo.others[s],
-                stereo.sizes[s, 0],
-                stereo.sizes[s, 1],
-                stereo.A[s],
-                stereo.B[s],
-                stereo.back_A[s],
-                stereo.back_B[s],
-                row,
-                column,
-                q,
+            cost = _contradiction(
+                stereo.others, width, height, stereo.A, stereo.B, stereo.back_A, stereo.back_B, s, x, y, q
             )
+        if cost < next_best:
+            cost += _dissimilarity(
+                flat, np.int32(s * size), np.int32(stride), width, height, stereo.A, stereo.B, s,
+                x, y, q, a, b, weights, values, variance,
+            )  # fmt: skip
         if cost < best:
             next_best = best
             best = cost
@@ -221,12 +208,13 @@ def _cost(stereo, row, column, q, a, b, weights, values, variance):
 def evaluate(stereo, planes, costs):
     """Costs of given planes: (H, W, 3 or more) q, a, b to (H, W)."""
     height, width = stereo.gray.shape
+    flat = stereo.sources.ravel()
     for row in numba.prange(height):
-        weights, values = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
+        weights, values = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
         for column in range(width):
             variance = _patch(stereo.gray, row, column, weights, values)
             q, a, b = planes[row, column, 0], planes[row, column, 1], planes[row, column, 2]
-            costs[row, column] = _cost(stereo, row, column, q, a, b, weights, values, variance)
+            costs[row, column] = _cost(stereo, flat, row, column, q, a, b, weights, values, variance)
 
 
 @numba.njit(cache=True, parallel=True, fastmath=True)
@@ -240,8 +228,9 @@ def sweep(stereo, planes, costs, color, round_number, spread, tilt, num_trials, 
     num_trials: random changes tried per pixel; reach: how far the planes come from, px
     """
     height, width = stereo.gray.shape
+    flat = stereo.sources.ravel()
     for row in numba.prange(height):
-        weights, values = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
+        weights, values = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
         for column in range((row + color) % 2, width, 2):
             variance = _patch(stereo.gray, row, column, weights, values)
             q, a, b = planes[row, column, 0], planes[row, column, 1], planes[row, column, 2]
@@ -266,7 +255,7 @@ def sweep(stereo, planes, costs, color, round_number, spread, tilt, num_trials, 
                     continue
                 if abs(tq - q) < 1e-5 * q and ta == a and tb == b:
                     continue
-                cost = _cost(stereo, row, column, tq, ta, tb, weights, values, variance)
+                cost = _cost(stereo, flat, row, column, tq, ta, tb, weights, values, variance)
                 if cost < best:
                     best, q, a, b = cost, tq, ta, tb
             state = np.uint32(row * 9781 + column * 6271 + round_number * 26699 + 1)
@@ -283,7 +272,7 @@ def sweep(stereo, planes, costs, color, round_number, spread, tilt, num_trials, 
                 amplitude *= np.float32(0.35)
                 if tq < stereo.farthest or tq > stereo.nearest:
                     continue
-                cost = _cost(stereo, row, column, tq, ta, tb, weights, values, variance)
+                cost = _cost(stereo, flat, row, column, tq, ta, tb, weights, values, variance)
                 if cost < best:
                     best, q, a, b = cost, tq, ta, tb
             planes[row, column, 0] = q

@@ -1,0 +1,122 @@
+"""`sc3d depth` and `sc3d extract --from depth` on a small synthetic flight with exact depth."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pycolmap
+import pytest
+
+from sc3d.errors import InputError
+from sc3d.geometry.cameras import resample, undistorted
+from sc3d.runner import execute
+from sc3d.scene.depth_map import depth_file, read_depth_map
+from sc3d.scene.scene import Scene
+from sc3d.settings.reconstruction import Depth, Extract
+from sc3d.settings.synthesize import Synthesize
+from sc3d.stereo import multi_view
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Scene:
+    scene = Scene(tmp_path_factory.mktemp("site"))
+    execute("synthesize", scene, Synthesize(views=8, width=320, num_points=20_000, altitude=60, extent=60))
+    return scene
+
+
+@pytest.fixture(scope="module")
+def scene(site, tmp_path_factory) -> Scene:
+    scene = copy_of(site, tmp_path_factory.mktemp("scene"))
+    execute("depth", scene, Depth(max_size=240))
+    return scene
+
+
+def copy_of(site: Scene, folder: Path) -> Scene:
+    (folder / "images").symlink_to(site.images)
+    shutil.copytree(site.path / "sparse", folder / "sparse")
+    return Scene(folder)
+
+
+def test_confirmed_depth_is_right(scene, site):
+    errors, shares = [], []
+    for view in scene.model.views:
+        found = read_depth_map(depth_file(scene.depth, view.name))
+        target = undistorted(view, max(found.depth.shape))
+        true = np.load(site.path / "truth_depth" / f"{Path(view.name).stem}.npy")
+        true = resample(true.astype(np.float32), view, target, labels=True)
+        sure = (found.num_views >= 2) & (true > 0)
+        errors.append(np.abs(found.depth / np.maximum(true, 1e-6) - 1)[sure])
+        shares.append(sure.mean())
+    errors = np.concatenate(errors)
+    assert np.median(errors) < 0.002 and np.quantile(errors, 0.9) < 0.01
+    assert np.mean(shares) > 0.5
+
+
+def test_surface_from_depth_lies_on_the_true_one(scene, site):
+    figures = execute("extract", scene, Extract(method="depth"))
+    mesh = o3d.t.io.read_triangle_mesh(str(scene.mesh))
+    true = o3d.t.io.read_triangle_mesh(str(site.path / "truth_mesh.ply"))
+    rays = o3d.t.geometry.RaycastingScene()
+    true.vertex.positions = true.vertex.positions.to(o3d.core.float32)
+    rays.add_triangles(true)
+    points = mesh.vertex.positions.to(o3d.core.float32)
+    distance = rays.compute_distance(points).numpy() / figures["voxel_size"]
+    assert np.quantile(distance, 0.9) < 2 and (distance > 5).mean() < 0.01
+    assert len(points) > 5000 and scene.cloud.exists()
+
+
+def test_second_run_is_up_to_date_and_previews_are_there(scene, caplog):
+    with caplog.at_level("INFO"):
+        execute("depth", scene, Depth(max_size=240))
+    assert "up to date" in caplog.text
+    assert len(list(scene.depth.glob("*.jpg"))) == len(list(scene.depth.glob("*.npz"))) == 8
+    assert not list(scene.path.glob(".depth.*.parts"))
+
+
+def test_an_interrupted_run_goes_on_and_gives_the_same(scene, site, tmp_path, monkeypatch):
+    again, calls = copy_of(site, tmp_path), []
+    run_pass = multi_view.run_pass
+
+    def dying(job, number, row):
+        calls.append((number, row))
+        if number == 1 and row == 3 and calls.count((1, 3)) == 1:
+            raise KeyboardInterrupt
+        run_pass(job, number, row)
+
+    monkeypatch.setattr(multi_view, "run_pass", dying)
+    with pytest.raises(KeyboardInterrupt):
+        execute("depth", again, Depth(max_size=240))
+    assert not again.depth.exists()
+    kept = {file.name: file.stat().st_mtime_ns for file in again.path.glob(".depth.*.parts/passes/1-*.npy")}
+    assert len(kept) == 3
+    execute("depth", again, Depth(max_size=240))
+    for view in scene.model.views:
+        one, other = (read_depth_map(depth_file(each.depth, view.name)) for each in (scene, again))
+        np.testing.assert_array_equal(one.depth, other.depth)
+        np.testing.assert_array_equal(one.num_views, other.num_views)
+
+
+def test_photos_that_see_no_sparse_points_are_named(site, tmp_path):
+    scene = copy_of(site, tmp_path)
+    model = pycolmap.Reconstruction(str(scene.sparse))
+    image = next(iter(model.images.values()))
+    for point in {p.point3D_id for p in image.points2D if p.has_point3D()}:
+        model.delete_point3D(point)
+    model.write_binary(str(scene.sparse))
+    figures = execute("depth", scene, Depth(max_size=64))
+    assert figures["left_out"] == [image.name] and figures["photos"] == 7
+
+
+def test_what_is_missing_or_damaged_is_said(site, tmp_path):
+    scene = copy_of(site, tmp_path)
+    with pytest.raises(InputError, match="sc3d depth"):
+        execute("extract", scene, Extract(method="depth"))
+    file = tmp_path / "a.npz"
+    file.write_bytes(b"nothing")
+    with pytest.raises(InputError, match="damaged"):
+        read_depth_map(file)
+    with pytest.raises(InputError, match="at least 32"):
+        Depth(max_size=3)
