@@ -69,6 +69,6 @@ def check(command: Run, segment: Segment) -> None:
         source = (
             MaskFiles(masks, segment.format, segment.mapping) if segment.masks else MaskFiles(masks, "index")
         )
-        check_masks(source, sizes, class_table, segment.confidence)
+        check_masks(source, sizes, class_table, segment.confidence, command.photos)
     if command.truth is not None:
-        match_masks(command.truth, sizes, class_table)
+        match_masks(command.truth, sizes, class_table, command.photos)

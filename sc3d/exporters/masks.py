@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
-from sc3d.io.images import read_image, read_index_image, write_image
+from sc3d.io.images import read_orientation, write_image
 from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
@@ -38,8 +38,9 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
         for view in tqdm(views, desc="rendering masks", unit="photo", disable=None):
             mask, confidence = render_mask(surface, labels.confidence, view, settings.max_size)
             name = f"{Path(view.name).stem}.png"
-            write_image(mask_folder / name, mask)
-            write_image(confidence_folder / name, confidence)
+            orientation = read_orientation(scene.photo(view.name))
+            write_image(mask_folder / name, mask, orientation)
+            write_image(confidence_folder / name, confidence, orientation)
             covered.append(float((mask > 0).mean()))
     write_image(sheet, _comparison(scene, views))
     return {"photos": len(views), "labelled_pixels": f"{np.mean(covered):.1%}"}
@@ -57,13 +58,11 @@ def _comparison(scene: Scene, views: list[View]) -> np.ndarray:
         size, stem = (PANEL, round(PANEL * view.height / view.width)), Path(view.name).stem
         pictures, captions = [], []
         if scene.photo(view.name).exists():
-            pictures.append(
-                cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA)
-            )
+            pictures.append(cv2.resize(scene.read_photo(view.name), size, interpolation=cv2.INTER_AREA))
             captions.append(view.name)
         for folder, caption in ((scene.masks, "mask in"), (scene.export / "masks", "mask back")):
             file = folder / f"{stem}.png"
-            mask = read_index_image(file) if file.exists() else np.zeros((1, 1), np.uint8)
+            mask = scene.read_mask(file, view.name) if file.exists() else np.zeros((1, 1), np.uint8)
             pictures.append(palette[cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)])
             captions.append(caption)
         rows.append(side_by_side(pictures, captions))

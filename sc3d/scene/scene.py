@@ -2,16 +2,35 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import check_photo, find_photos, image_size, read_index_image, require_within
+from sc3d.io.images import (
+    check_photo,
+    find_photos,
+    image_size,
+    index_image_size,
+    mask_orientation,
+    read_image,
+    read_opaque,
+    require_within,
+    turned_onto,
+)
 from sc3d.io.limits import FARTHEST, MAX_MASK_PIXELS
+from sc3d.io.orientation import turned_size
 from sc3d.scene.class_table import CONTROL, ClassTable, read_classes
+from sc3d.scene.mask_values import Meanings, meanings_of, read_confidence, read_labels
+
+if TYPE_CHECKING:
+    from sc3d.geometry.cameras import View
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -126,6 +145,50 @@ class Scene:
         """Path of the photo that a view is named after."""
         return self.images / name
 
+    def read_photo(self, name: str) -> np.ndarray:
+        """(H, W, 3) uint8 RGB pixels of a photo as stored."""
+        return read_image(self.photo(name), self.images)
+
+    def read_mask(self, file: Path, name: str) -> np.ndarray:
+        """(H, W) uint8 class ids of a mask or truth mask of a photo, in the photo's frame as stored, 0 where the
+        photo is transparent.
+        """
+        return self._onto_photo(read_labels(file, self._meanings), file, name)
+
+    def read_confidence(self, file: Path, name: str) -> np.ndarray:
+        """(H, W) uint8 of a confidence map, as `read_mask`."""
+        return self._onto_photo(read_confidence(file), file, name)
+
+    @cached_property
+    def _meanings(self) -> Meanings:
+        return meanings_of(self.class_table())
+
+    def _onto_photo(self, pixels: np.ndarray, file: Path, name: str) -> np.ndarray:
+        mask, opaque = turned_onto(pixels, file, self.photo(name)), self._opaque(name)
+        if opaque is None:
+            return mask
+        rows, columns = (
+            (np.arange(size) * whole) // size for size, whole in zip(mask.shape, opaque.shape, strict=True)
+        )
+        return np.where(opaque[np.ix_(rows, columns)], mask, 0).astype(np.uint8)
+
+    def mask_size(self, file: Path, name: str) -> tuple[int, int]:
+        """(width, height) of what `read_mask` gives, from the header."""
+        return index_image_size(file, self.photo(name))
+
+    def opaque_pixels(self, view: View, target: View) -> np.ndarray | None:
+        """(H, W) bool pixels of `target`, a view of the same pose, that lie in the photo of `view` and are opaque
+        there; None if the photo has no transparent pixels.
+        """
+        from sc3d.geometry.cameras import resample
+
+        opaque = self._opaque(view.name)
+        return None if opaque is None else resample(opaque.astype(np.uint8), view, target, labels=True) > 0
+
+    def _opaque(self, name: str) -> np.ndarray | None:
+        photo = self.photo(name)
+        return read_opaque(photo) if photo.is_file() else None
+
     def mask_files(self, folder: Path, class_table: ClassTable | None = None) -> dict[str, Path]:
         """Masks (or truth masks, or confidence maps) of the views, by view name; all checked.
 
@@ -133,7 +196,10 @@ class Scene:
         outside the class table.
         """
         return match_masks(
-            folder, {view.name: (view.width, view.height) for view in self.model.views}, class_table
+            folder,
+            {view.name: (view.width, view.height) for view in self.model.views},
+            class_table,
+            self.images,
         )
 
 
@@ -181,11 +247,14 @@ def read_sparse_model(path: Path) -> SparseModel:
 
 
 def match_masks(
-    folder: Path, photo_sizes: dict[str, tuple[int, int]], class_table: ClassTable | None
+    folder: Path,
+    photo_sizes: dict[str, tuple[int, int]],
+    class_table: ClassTable | None,
+    photos: Path | None = None,
 ) -> dict[str, Path]:
     """Match `<photo stem>.png` files of a folder to photos and check them.
 
-    photo_sizes: (width, height) px by photo name
+    photo_sizes: (width, height) px by photo name; photos: their folder, for their EXIF orientation
     returns: path of the mask by photo name, for photos that have one
     """
     files = (
@@ -200,7 +269,9 @@ def match_masks(
     if not files:
         raise InputError(f"no masks in {folder}: PNG files named like the photos are expected")
     names = {Path(name).stem: name for name in photo_sizes}
+    meanings = None if class_table is None else meanings_of(class_table)
     matched: dict[str, Path] = {}
+    turns: list[str] = []
     for file in files:
         name = names.get(file.stem)
         if name is None:
@@ -208,15 +279,35 @@ def match_masks(
                 f"{file} belongs to no photo: {len(names)} photos are known, such as {next(iter(photo_sizes))}"
             )
         require_within(file, folder)
-        check_mask_aspect(file, image_size(file), photo_sizes[name])
-        if class_table is not None:
-            unknown = class_table.unknown(read_index_image(file))
+        turn, assumed = mask_orientation(file, None if photos is None else photos / name)
+        if assumed:
+            turns.append(name)
+        check_mask_aspect(file, turned_size(image_size(file), turn), photo_sizes[name])
+        if class_table is not None and meanings is not None:
+            unknown = class_table.unknown(read_labels(file, meanings))
             if unknown:
                 raise InputError(
                     f"{file} has class id {unknown[0]}, which is not in the class table (ids {[entry.id for entry in class_table]})"
                 )
         matched[name] = file
+    if class_table is not None:
+        tell_of_turned(folder, len(turns), *turns[:1])
     return matched
+
+
+@cache  # tiles look at the same masks again and again
+def tell_of_turned(source: Path, count: int, example: str = "") -> None:
+    """Warn of masks that lie as their photos are shown by a rule alone (`sc3d.io.orientation`), and name one of the
+    photos.
+    """
+    if count:
+        logger.warning(
+            "%s: %d masks (such as that of %s) are of photos that EXIF turns, and are read as drawn on the photo as it is shown; "
+            "if they lie on the pixels as stored, give them the EXIF orientation of their photo",
+            source,
+            count,
+            example,
+        )
 
 
 def check_mask_aspect(file: Path | str, mask_size: tuple[int, int], photo_size: tuple[int, int]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -13,8 +14,17 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import discard, remove_leftovers
-from sc3d.io.images import find_photos, image_size, read_image, write_image
+from sc3d.io.images import (
+    find_photos,
+    image_size,
+    index_image_size,
+    read_image,
+    read_opaque,
+    read_orientation,
+    write_image,
+)
 from sc3d.io.json_files import read_json, write_json
+from sc3d.io.orientation import inverse, turned
 from sc3d.io.provenance import digest
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene, check_mask_aspect
@@ -38,7 +48,7 @@ class Segmenter(Protocol):
     """What a backend offers."""
 
     def segment(self, image: np.ndarray) -> Segmentation:
-        """Segment an (H, W, 3) uint8 RGB photo."""
+        """Segment an (H, W, 3) uint8 RGB photo as shown, the right way up."""
         ...
 
 
@@ -142,17 +152,17 @@ def segment_photos(
     """
     from tqdm import tqdm
 
-    todo = _check_photos(photos, folders.masks, overwrite)
+    todo, folder = _check_photos(photos, folders.masks, overwrite), _common(photos)
     pending, num_pixels, num_instances = set(todo), np.zeros(256, np.int64), 0
     for photo in tqdm(todo, desc="segment", unit="photo", disable=None):
-        image = read_image(photo)
+        image = read_image(photo, folder, shown=True)
         result = Segmentation(*segmenter.segment(image))
         for array in (result.labels, result.confidence):
             if array.shape != image.shape[:2] or array.dtype != np.uint8:
                 raise ValueError(
                     f"the segmenter returned {array.shape} {array.dtype} for a photo of {image.shape[:2]}"
                 )
-        _write(photo, folders, result, class_table)
+        _write(photo, folders, _as_stored(photo, result), class_table)
         num_pixels += np.bincount(result.labels.ravel(), minlength=256)
         num_instances += len(result.instances or ())
     return SegmentSummary(
@@ -163,15 +173,34 @@ def segment_photos(
     )
 
 
+def _common(photos: list[Path]) -> Path | None:
+    """The folder that all photos lie in."""
+    return Path(os.path.commonpath([photo.parent for photo in photos])) if photos else None
+
+
+def _as_stored(photo: Path, result: Segmentation) -> Segmentation:
+    """Labels and confidence turned from the photo as shown to that as stored, nothing where it is transparent;
+    instances stay as shown.
+    """
+    back, opaque = inverse(read_orientation(photo)), read_opaque(photo)
+    labels, confidence = (
+        np.ascontiguousarray(turned(values, back)) for values in (result.labels, result.confidence)
+    )
+    if opaque is not None:
+        labels, confidence = np.where(opaque, labels, np.uint8(0)), np.where(opaque, confidence, np.uint8(0))
+    return Segmentation(labels, confidence, result.instances)
+
+
 def _write(photo: Path, folders: Folders, result: Segmentation, class_table: ClassTable) -> None:
     """The mask comes last: that it exists says that the photo is finished."""
-    objects = folders.instances / f"{photo.stem}.json"
+    objects, orientation = folders.instances / f"{photo.stem}.json", read_orientation(photo)
     if result.instances is not None:
-        write_instances(objects, photo.name, result.labels.shape, result.instances, class_table)
+        size = turned(result.labels, orientation).shape  # instances lie in the photo as shown
+        write_instances(objects, photo.name, size, result.instances, class_table)
     else:
         objects.unlink(missing_ok=True)  # of masks that are replaced
-    write_image(folders.confidence / f"{photo.stem}.png", result.confidence)
-    write_image(folders.masks / f"{photo.stem}.png", result.labels)
+    write_image(folders.confidence / f"{photo.stem}.png", result.confidence, orientation)
+    write_image(folders.masks / f"{photo.stem}.png", result.labels, orientation)
 
 
 def _check_photos(photos: list[Path], out_masks: Path, overwrite: bool) -> list[Path]:
@@ -189,5 +218,5 @@ def _check_photos(photos: list[Path], out_masks: Path, overwrite: bool) -> list[
         if overwrite or not mask.exists():
             todo.append(photo)
         else:
-            check_mask_aspect(mask, image_size(mask), size)
+            check_mask_aspect(mask, index_image_size(mask, photo), size)
     return todo

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.scene import tell_of_turned
 from sc3d.segmentation.mask_formats.annotations import to_mask
 from sc3d.segmentation.mask_formats.checks import CheckedMask, Checks
 from sc3d.segmentation.mask_formats.coco import read_coco
@@ -40,19 +41,23 @@ class MaskFiles:
 
 
 def read_masks(
-    source: MaskFiles, photo_sizes: dict[str, tuple[int, int]], class_table: ClassTable
+    source: MaskFiles,
+    photo_sizes: dict[str, tuple[int, int]],
+    class_table: ClassTable,
+    photos: Path | None = None,
 ) -> dict[str, CheckedMask]:
     """Masks by photo name, all checked and none drawn yet.
 
-    photo_sizes: (width, height) px by photo name
+    photo_sizes: (width, height) px as stored by photo name; photos: their folder, for their EXIF orientation
     Raises InputError, in one line, for everything that does not fit.
     """
     kind = detect(source.path) if source.format == "auto" else source.format
-    checks = Checks(photo_sizes, read_mapping(source.mapping, class_table))
+    checks = Checks(photo_sizes, read_mapping(source.mapping, class_table), photos)
+    automatic = source.format == "auto"
     masks: dict[str, CheckedMask] = {}
     for file in _files(source.path, kind):
         try:
-            for name, mask in _read(file, kind, checks):
+            for name, mask in _read(file, "auto" if automatic and SUFFIXES[kind] == ".png" else kind, checks):
                 if name in masks:
                     checks.add(
                         "double", f"{name} has a mask in {masks[name].origin} and another in {mask.origin}"
@@ -63,13 +68,28 @@ def read_masks(
     checks.finish(source.path)
     if not masks:
         raise InputError(f"no masks in {source.path}: no annotation with an area is there")
+    if checks.by_palette:
+        logger.info(
+            "%s: %d masks are read by the colors of their palette, which are those of the class table; --format index takes the ids",
+            source.path,
+            checks.by_palette,
+        )
+    if checks.turned and SUFFIXES[kind] == ".png":
+        tell_of_turned(source.path, len(checks.turned), checks.turned[0])
+    elif checks.turned:
+        logger.info(
+            "%s: %d photos (such as %s) are turned by EXIF: annotations are read as made on the photo as it is shown",
+            source.path,
+            len(checks.turned),
+            checks.turned[0],
+        )
     logger.info("%s: %s masks for %d of %d photos", source.path, kind, len(masks), len(photo_sizes))
     return dict(sorted(masks.items()))
 
 
 def _read(file: Path, kind: str, checks: Checks) -> Iterator[tuple[str, CheckedMask]]:
-    if kind in ("index", "color"):
-        yield from check_png(file, kind == "color", checks)
+    if kind not in READERS:
+        yield from check_png(file, kind, checks)
         return
     for photo in READERS[kind](file):
         found = to_mask(photo, checks)
