@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import find_photos, image_size, read_image
+from sc3d.io.images import find_photos, read_image
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.provenance import digest
 from sc3d.scene.scene import Scene
 from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, shrink
-from sc3d.segmentation.strokes.files import BACKGROUND, parse_shapes
+from sc3d.segmentation.strokes.files import BACKGROUND, read_shapes, shown_size
 
 DISPLAY_SIZE = 4096  # px, longest side of the photo in the browser
 TRIAL_SIZE = 2048  # px, longest side of the mask that is tried out
@@ -44,7 +44,7 @@ class Session:
         self._settings = settings
         self.class_table = scene.class_table()
         self.photos = {photo.stem: photo for photo in find_photos(scene.images)}
-        self.sizes = {stem: image_size(photo) for stem, photo in self.photos.items()}
+        self.sizes = {stem: shown_size(photo) for stem, photo in self.photos.items()}
         self._start = next(iter(self.photos)) if start is None else Path(start).stem
         if self._start not in self.photos:
             raise InputError(
@@ -119,7 +119,7 @@ class Session:
     def _plain(self, content: object, origin: Path | str, stem: str) -> list[dict[str, object]]:
         """The shapes of a LabelMe file, checked, in px of the photo."""
         names = {entry.id: entry.name for entry in self.class_table} | {0: BACKGROUND}
-        shapes = parse_shapes(content, origin, self.sizes[stem], self.class_table)
+        shapes = read_shapes(content, origin, self.photos[stem], self.class_table)
         return [
             {"label": names[shape.label], "shape_type": shape.kind, "points": shape.points.tolist()}
             | ({"width": shape.width} if shape.width else {})
@@ -127,9 +127,7 @@ class Session:
         ]
 
     def photo(self, stem: str) -> bytes:
-        """The photo as JPEG, as it is stored: LabelMe and browsers would turn it by its EXIF orientation, the
-        cameras do not.
-        """
+        """The photo as JPEG, as shown: turned by its EXIF orientation, as in LabelMe; strokes lie in this frame."""
         return self._jpeg(stem)
 
     def try_out(self, stem: str) -> bytes:
@@ -149,7 +147,7 @@ class Session:
                     state,
                     Strokes.fit(self._scene.strokes, self._scene.images, self.class_table, self._settings),
                 )
-            labels = self._learned[1].segment(shrink(read_image(photo), TRIAL_SIZE)).labels
+            labels = self._learned[1].segment(shrink(self._pixels(photo), TRIAL_SIZE)).labels
         finally:
             self._trying.release()
         return _png(
@@ -158,8 +156,11 @@ class Session:
             )
         )
 
+    def _pixels(self, photo: Path) -> np.ndarray:
+        return read_image(photo, self._scene.images, shown=True)
+
     def _encode(self, stem: str) -> bytes:
-        shown = np.ascontiguousarray(shrink(read_image(self.photos[stem]), DISPLAY_SIZE)[..., ::-1])
+        shown = np.ascontiguousarray(shrink(self._pixels(self.photos[stem]), DISPLAY_SIZE)[..., ::-1])
         return cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
 

@@ -28,7 +28,7 @@ from sc3d.io.orientation import (
     turned_size,
     with_orientation,
 )
-from sc3d.io.photo_depth import FLOAT, bits_of, stretch, value_range
+from sc3d.io.photo_depth import FLOAT, bits_of, raw_mode, stretch, value_range
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -351,7 +351,7 @@ def read_samples(path: Path) -> IndexImage:
             raise InputError(
                 f"{path} has colors ({image.mode}): an 8-bit PNG with one id per pixel is expected"
             )
-        raw = str(image.tile[0].args) if image.tile else ""
+        raw = raw_mode(image)
         bits = 1 if image.mode == "1" else next((bits for bits in (2, 4) if raw == f"L;{bits}"), 8)
         if image.mode == "LA":
             gray, alpha = np.moveaxis(np.array(image), -1, 0)
@@ -376,7 +376,7 @@ def turned_onto(pixels: np.ndarray, path: Path, photo: Path | None) -> np.ndarra
     return np.ascontiguousarray(turned(pixels, mask_orientation(path, photo)[0]))
 
 
-def index_image_size(path: Path, photo: Path) -> tuple[int, int]:
+def index_image_size(path: Path, photo: Path | None) -> tuple[int, int]:
     """(width, height) of a mask in the frame of its photo as stored, from the header."""
     return turned_size(image_size(path), mask_orientation(path, photo)[0])
 

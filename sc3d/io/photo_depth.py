@@ -23,8 +23,13 @@ def bits_of(image: Image.Image) -> int:
         return FLOAT
     if image.format == "TIFF":
         return max(8, *_values(tags.get(BITS_PER_SAMPLE, 8)))
-    raw = str(image.tile[0].args) if image.tile else ""
-    return 16 if image.mode.startswith("I") or "16B" in raw else 8
+    return 16 if image.mode.startswith("I") or "16B" in raw_mode(image) else 8
+
+
+def raw_mode(image: Image.Image) -> str:
+    """How the pixels of an opened Pillow image are stored, such as "RGB;16B" or "L;4"; before they are read."""
+    tile = getattr(image, "tile", [])
+    return str(tile[0].args) if tile else ""
 
 
 def _values(tag: int | Sequence[int]) -> tuple[int, ...]:

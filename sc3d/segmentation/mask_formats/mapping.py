@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -95,13 +94,12 @@ class ClassMapping:
         """What the values and the palettes of PNGs may stand for; without ids or colors where the mapping has none."""
         if self.mapping is None:
             return meanings_of(self.table)
-        by_id, by_color = np.full(256, UNKNOWN, np.int16), dict[int, int]()
-        with suppress(InputError):
-            by_id = self.by_id
-        with suppress(InputError):
+        try:
             known = np.flatnonzero(self.by_color != UNKNOWN)
-            by_color = dict(zip(known.tolist(), self.by_color[known].tolist(), strict=True))
-        return Meanings(by_id, by_color)
+        except InputError:  # its keys are no colors
+            return Meanings(self.by_id, {})
+        by_color = dict(zip(known.tolist(), self.by_color[known].tolist(), strict=True))
+        return Meanings(np.full(256, UNKNOWN, np.int16), by_color)
 
     def _color(self, key: str) -> tuple[int, int, int]:
         code = re.fullmatch(r"#([0-9a-fA-F]{6})", key)

@@ -16,9 +16,9 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.images import image_size, open_image, read_orientation, read_samples
 from sc3d.io.orientation import turned, turned_size
-from sc3d.scene.mask_values import read_values
+from sc3d.scene.mask_values import UNKNOWN, read_values
 from sc3d.segmentation.mask_formats.checks import CheckedMask, Checks
-from sc3d.segmentation.mask_formats.mapping import UNKNOWN, ClassMapping
+from sc3d.segmentation.mask_formats.mapping import ClassMapping
 
 SIXTEEN_BIT = {"I", "I;16", "I;16B"}
 COLORED = {"RGB", "RGBA"}
