@@ -190,13 +190,15 @@ def _distortion_model(camera: dict, where: str) -> DistortionModel:
         tangential,
         kind in FISHEYE,
         prism=(prism[0], prism[2]) if kind == "fisheye624" else (0.0, 0.0),
-        left_out=_prism_cost(prism, size / 2 / focal[0], focal[0]) if kind == "fisheye624" else (),
+        left_out=_prism_cost(prism, float(np.hypot(width, height)) / 2, focal[0])
+        if kind == "fisheye624"
+        else (),
     )
 
 
 def _prism_cost(prism: list[float], reach: float, focal: float) -> tuple[tuple[str, float], ...]:
-    """What it costs to leave out a thin prism of the fourth order, px; reach: largest angle, radians."""
-    cost = float(np.hypot(prism[1], prism[3]) * (2 * reach) ** 4 * focal)
+    """What it costs to leave out a thin prism of the fourth order; reach: from the middle to a corner, px."""
+    cost = float(np.hypot(prism[1], prism[3])) * (reach / focal) ** 4 * focal
     return (("a thin prism of the fourth order", cost),) if cost else ()
 
 

@@ -633,7 +633,7 @@ class TestBadProjects:
             (('type="frame"', 'type="spherical"'), "spherical"),
             (("</chunk>", ""), "not valid XML"),
             (("<k1>", "<b2>4</b2><k1>"), "skew"),
-            (("<k1>", "<p3>0.4</p3><k1>"), "p3"),
+            (("<k1>", "<p3>4</p3><k1>"), "p3"),
             (("<transform>", "<transform>x "), "16 finite numbers"),
         ],
     )
