@@ -1,5 +1,7 @@
 """COLMAP models, read by pycolmap after a look at them, taken apart, put together and written.
 
+Photo names of text models are read here, to the end of their line: pycolmap stops at a blank.
+
 pycolmap believes the counts in binary files: one that is too large makes it fill the memory, or read on
 behind the end for ever. In text files a count never leads beyond its line. Cameras and poses are not checked
 by pycolmap at all.
@@ -9,9 +11,13 @@ Layout: https://colmap.github.io/format.html; rigs.bin and frames.bin as COLMAP 
 
 from __future__ import annotations
 
+import codecs
 import mmap
+import shutil
 import struct
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Protocol
@@ -30,6 +36,7 @@ POINT = np.array([[0, 43, 0, 0, 0], [8, 8, 0, LARGEST, 0]])
 # id, rig, rotation, translation; sensor and photo
 FRAME = np.array([[0, 64, 0, 0, 0], [4, 16, 0, LARGEST, 0]])
 MAX_NAME = 4096  # bytes of a photo name
+POSE_FIELDS = 9  # words in front of the name in images.txt
 NO_POINTS, NO_ROWS, NO_PIXELS = np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2))
 NOT_RIGID = 0.01  # largest error of R R^T: text models are rounded
 
@@ -38,14 +45,19 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a model, binary or text; InputError if it is missing, damaged, without photos, or has cameras or
     poses that are none.
     """
-    if not any((folder / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+    if not is_model(folder):
         raise InputError(
             f"no cameras in {folder}: run `sc3d reconstruct PHOTOS SCENE`, or put a COLMAP model there"
         )
     check_counts(folder)
     try:
-        model = pycolmap.Reconstruction(str(folder))
+        with _as_pycolmap_reads(folder) as readable:
+            model = pycolmap.Reconstruction(str(readable))
         images = [model.image(image_id) for image_id in model.reg_image_ids()]
+        if not _is_binary(folder):
+            full_names = _text_names(folder)
+            for image in images:
+                image.name = full_names[image.image_id]
         names = [image.name for image in images]
         poses = [image.cam_from_world() for image in images]
     # pycolmap raises bare RuntimeError, ValueError, IndexError, MemoryError and UnicodeDecodeError for broken
@@ -60,6 +72,66 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
         _check_camera(model.camera(camera_id), folder)
     _check_poses(poses, names, folder)
     return model
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder holds the cameras of a model, binary or text."""
+    return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+
+def photo_names(folder: Path) -> list[str]:
+    """Names of the photos of a model, of which nothing else is read; InputError if it is damaged."""
+    if not _is_binary(folder):
+        try:
+            return list(_text_names(folder).values())
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot read the COLMAP model in {folder}: {error}") from None
+    names: list[str] = []
+    _check_part(folder, "images", lambda data, count: _walk_images(data, count, names))
+    return names
+
+
+def _is_binary(folder: Path) -> bool:
+    """As pycolmap decides it."""
+    return all((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D"))
+
+
+def _text_names(folder: Path) -> dict[int, str]:
+    """Name by id of the photos in images.txt, blanks included; a line of keypoints follows each."""
+    names = {}
+    with (folder / "images.txt").open(encoding="utf-8-sig") as lines:
+        for line in lines:
+            words = line.strip().split(maxsplit=POSE_FIELDS)
+            if not words or words[0].startswith("#"):
+                continue
+            names[int(words[0])] = words[POSE_FIELDS] if len(words) > POSE_FIELDS else ""
+            next(lines, None)
+    return names
+
+
+@contextmanager
+def _as_pycolmap_reads(folder: Path) -> Iterator[Path]:
+    """The folder itself, or for the time of the block a copy of a text model without what pycolmap does not
+    bear: byte order marks, and no file of points.
+    """
+    files = [folder / f"{name}.txt" for name in FILES]
+    marked = [file.is_file() and _starts_with_mark(file) for file in files]
+    if _is_binary(folder) or not (any(marked) or not files[-1].exists()):
+        yield folder
+        return
+    with tempfile.TemporaryDirectory(prefix="sc3d-colmap-") as name:
+        copy = Path(name)
+        (copy / files[-1].name).touch()
+        for file in filter(Path.is_file, files):
+            with file.open("rb") as source, (copy / file.name).open("wb") as target:
+                source.seek(len(codecs.BOM_UTF8) if _starts_with_mark(file) else 0)
+                shutil.copyfileobj(source, target)
+        yield copy
+
+
+def _starts_with_mark(file: Path) -> bool:
+    with file.open("rb") as stream:
+        return stream.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8
 
 
 class PosedCamera(Protocol):
@@ -153,6 +225,10 @@ def write_model(path: Path, model: pycolmap.Reconstruction) -> None:
 
 def _check_camera(camera: pycolmap.Camera, folder: Path) -> None:
     where = f"{folder}: camera {camera.camera_id}"
+    if camera.model_name == "EQUIRECTANGULAR":
+        raise InputError(
+            f"{where} is spherical (EQUIRECTANGULAR), which has no image plane: cut its photos into perspective ones first"
+        )
     if not (
         0 < camera.width <= MAX_SIDE
         and 0 < camera.height <= MAX_SIDE
@@ -187,7 +263,7 @@ def check_counts(folder: Path) -> None:
     """InputError if a file of a binary model is not as long as its counts say, or an id is used twice; a text
     model is left to pycolmap.
     """
-    if not all((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D")):
+    if not _is_binary(folder):
         return
     walks = {
         "cameras": _walk_cameras,
@@ -197,16 +273,19 @@ def check_counts(folder: Path) -> None:
         "points3D": _walk_points,
     }
     for name in FILES:
-        file = folder / f"{name}.bin"
-        if not file.exists():
-            continue
-        try:
-            _check_file(file, walks[name])
-        except (DamagedFileError, struct.error) as error:
-            what = str(error) if isinstance(error, DamagedFileError) else "is cut off"
-            raise InputError(
-                f"{file.name} of the COLMAP model in {folder} {what}: it is damaged, write or copy it again"
-            ) from None
+        if (folder / f"{name}.bin").exists():
+            _check_part(folder, name, walks[name])
+
+
+def _check_part(folder: Path, name: str, walk: Callable[[mmap.mmap, int], int]) -> None:
+    file = folder / f"{name}.bin"
+    try:
+        _check_file(file, walk)
+    except (DamagedFileError, struct.error) as error:
+        what = str(error) if isinstance(error, DamagedFileError) else "is cut off"
+        raise InputError(
+            f"{file.name} of the COLMAP model in {folder} {what}: it is damaged, write or copy it again"
+        ) from None
 
 
 def _check_file(file: Path, walk: Callable[[mmap.mmap, int], int]) -> None:
@@ -281,7 +360,8 @@ def _walk_records(data: mmap.mmap, count: int, fields: np.ndarray) -> int:
     return end
 
 
-def _walk_images(data: mmap.mmap, count: int) -> int:
+def _walk_images(data: mmap.mmap, count: int, names: list[str] | None = None) -> int:
+    """names: gets the names of the photos."""
     position: int = 8
     ids: set[int] = set()
     for _ in range(count):
@@ -289,6 +369,8 @@ def _walk_images(data: mmap.mmap, count: int) -> int:
         end = data.find(b"\0", position + 64, position + 64 + MAX_NAME)
         if end < 0:
             raise DamagedFileError(f"has a photo whose name does not end within {MAX_NAME} bytes")
+        if names is not None:
+            names.append(data[position + 64 : end].decode(errors="replace"))
         points = _read("<Q", data, end + 1)[0]
         position = end + 9 + 24 * points
         if position > len(data):

@@ -11,7 +11,7 @@ from sc3d.importers.clouds import CLOUDS, MESHES, is_mesh, read_geometry, to_ope
 from sc3d.importers.frames import frame_of_scene, near_origin, place_geometries
 from sc3d.importers.model import write_project
 from sc3d.importers.photos import locate_photos
-from sc3d.importers.project import project_files, read_project
+from sc3d.importers.project import project_files, read_project, warn_of_left_out
 from sc3d.io.atomic import require_writable
 from sc3d.io.clouds import write_geometry
 from sc3d.io.images import require_place
@@ -67,6 +67,7 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
         project, photos = locate_photos(
             near_origin(read_project(settings.project, settings), settings.epsg), settings.images
         )
+        warn_of_left_out(project, settings.project)
         views, georeference = project.views, project.georeference
         if photos is not None:
             require_place(photos, scene.images)

@@ -1,4 +1,4 @@
-"""PNGs with one id or one color per pixel, `<photo stem>.png`; values are taken exactly, nothing is guessed.
+"""PNGs with one id or one color per pixel, named like the photos; values are taken exactly, nothing is guessed.
 
 Ids are those of the class table, or those of a mapping: then also 16-bit, such as ADE20K's and Cityscapes'.
 Colors are those of the class table or of a mapping; a color between two classes, as JPEG and smooth scaling
@@ -30,7 +30,9 @@ def check_png(file: Path, format: str, checks: Checks) -> Iterator[tuple[str, Ch
     format: "color", "index", or "auto" for ids unless the file has colors, or a palette that holds the colors of the
         classes
     """
-    name = checks.photo((file.name,), str(file))
+    if not checks.fits(file):
+        return
+    name = checks.photo((str(file),), str(file))
     own = 1 if name is None else read_orientation(file)
     found = None if name is None else checks.size(name, image_size(file), str(file), own)
     if name is None or found is None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -22,6 +22,7 @@ from sc3d.io.images import find_photos, image_size, mask_orientation, open_image
 from sc3d.io.json_files import read_json
 from sc3d.io.orientation import mask_turn, turned, turned_points, turned_size
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.photo_names import PhotoNames, files_of_photos, photo_name
 from sc3d.scene.scene import check_mask_aspect
 
 logger = logging.getLogger(__name__)
@@ -90,25 +91,17 @@ def read_strokes(folder: Path, photos_folder: Path, class_table: ClassTable) -> 
     Raises InputError for a folder without strokes, files that belong to no photo, cannot be read or name
     unknown classes or colors.
     """
-    files = (
-        sorted(
-            file
-            for file in folder.iterdir()
-            if file.suffix.lower() in (".json", ".png") and file.name[0] != "."
-        )
-        if folder.is_dir()
-        else []
-    )
+    names = PhotoNames(photo_name(photo, photos_folder) for photo in find_photos(photos_folder))
+    files = files_of_photos(folder, names, (".json", ".png"))
     if not files:
         raise InputError(
             f"no strokes in {folder}: draw some with `sc3d annotate SCENE`, or put LabelMe JSON or PNG files there"
         )
-    photos = {photo.stem: photo for photo in find_photos(photos_folder)}
     found: dict[Path, PhotoStrokes] = {}
     outside: list[str] = []
     for file in files:
         content = read_json(file) if file.suffix.lower() == ".json" else None
-        photo = _photo_of(file, content, photos)
+        photo = photos_folder / _photo_of(file, folder, content, names)
         size = shown_size(photo)
         shapes = () if content is None else read_shapes(content, file, photo, class_table)
         outside += [f"{file.name}: shape {index + 1}" for index in _outside(shapes, size)]
@@ -150,10 +143,10 @@ def read_shapes(
     """`parse_shapes` for a photo as shown; shapes whose file states the size of the photo as stored, and not as
     shown, are turned.
     """
-    stated = [content.get(key) for key in ("imageWidth", "imageHeight")] if isinstance(content, dict) else []
     orientation, size = read_orientation(photo), image_size(photo)
-    whole = len(stated) == 2 and all(isinstance(side, int) and 0 < side < _MAX_COORDINATE for side in stated)
-    if not whole or mask_turn(1, (stated[0], stated[1]), orientation, size)[0] != 1:
+    sides = [content.get(key) for key in ("imageWidth", "imageHeight")] if isinstance(content, dict) else []
+    stated = [side for side in sides if isinstance(side, int) and 0 < side < _MAX_COORDINATE]
+    if len(stated) < 2 or mask_turn(1, (stated[0], stated[1]), orientation, size)[0] != 1:
         return parse_shapes(content, origin, turned_size(size, orientation), class_table)
     return tuple(
         replace(shape, points=turned_points(shape.points, size, orientation))
@@ -217,17 +210,23 @@ def _is_number(value: object) -> bool:
     )
 
 
-def _photo_of(file: Path, content: object, photos: dict[str, Path]) -> Path:
-    """The photo whose stem is that of `imagePath`, or else that of the file."""
-    path = content.get("imagePath") if isinstance(content, dict) else None
-    # PureWindowsPath splits at / and \
-    stems = [*([PureWindowsPath(path).stem] if isinstance(path, str) else []), file.stem]
-    photo = next((photos[stem] for stem in stems if stem in photos), None)
-    if photo is None:
-        raise InputError(
-            f"{file} belongs to no photo: {len(photos)} photos are known, such as {next(iter(photos.values())).name}"
-        )
-    return photo
+def _photo_of(file: Path, folder: Path, content: object, names: PhotoNames) -> str:
+    """The photo that `imagePath` names, with the folder of the file where that is not clear, or else the one that
+    the file is named after.
+    """
+    path, place = content.get("imagePath") if isinstance(content, dict) else None, photo_name(file, folder)
+    for changed in (False, True):
+        found = names.match(path, changed) if isinstance(path, str) else ()
+        if len(found) != 1:
+            own = names.match_file(place, folder, changed)
+            found = tuple(name for name in own if name in found) or found or own
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise InputError(f"{file} may belong to {names.choices(found, file.suffix)}: rename it")
+    raise InputError(
+        f"{file} belongs to no photo: {len(names)} photos are known, such as {names.names[0]}{names.advice(place)}"
+    )
 
 
 def _read_picture(file: Path, photo: Path, class_table: ClassTable) -> np.ndarray:
