@@ -19,6 +19,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
+from sc3d.io.folders import files_below
 from sc3d.io.limits import MAX_PIXELS, MAX_SIDE
 from sc3d.io.orientation import (
     ORIENTATION,
@@ -51,6 +52,7 @@ OTHER_FORMATS: dict[str, Callable[[bytes], bool]] = {
     "JPEG XL": lambda head: head[:2] == b"\xff\x0a" or head[4:8] == b"JXL ",
     "PSD": lambda head: head[:4] == b"8BPS",
 }
+STRIPS_AND_TILES = (273, 279), (324, 325)  # tags of TIFF: offsets and lengths
 END_OF_IMAGE, START_OF_SCAN = b"\xff\xd9", 0xDA
 
 
@@ -80,15 +82,18 @@ def open_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
         raise InputError(f"cannot read the {what} {path}: {_what_is_wrong(path)}") from None
 
 
+def _moved(link: Path) -> str:
+    return (
+        f"{link} is a link to {link.readlink()}, which is not there: has it been moved? "
+        "Put it back, or make the link anew"
+    )
+
+
 def _what_is_wrong(path: Path) -> str:
     """Why an image cannot be opened, and what to do."""
-    if path.is_symlink() and not path.exists():
-        return (
-            f"it is a link to {path.readlink()}, which is not there: has the folder of the photos been moved?"
-        )
-    broken = next((folder for folder in path.parents if folder.is_symlink() and not folder.exists()), None)
+    broken = next((link for link in (path, *path.parents) if link.is_symlink() and not link.exists()), None)
     if broken is not None:
-        return f"{broken} is a link to {broken.readlink()}, which is not there: has the folder of the photos been moved? Put it back, or make the link anew"
+        return _moved(broken)
     head = b""
     with suppress(OSError):
         if path.is_file():
@@ -96,7 +101,7 @@ def _what_is_wrong(path: Path) -> str:
                 head = file.read(32)
     name = next((name for name, found in OTHER_FORMATS.items() if found(head)), None)
     if name is not None:
-        return f"it is a {name} image: convert it to JPEG, PNG or TIFF"
+        return f"it is a {name} image, not a JPEG, PNG or TIFF: convert it"
     if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return (
             "it is damaged, or a TIFF of a kind that is not supported: save it with 8 or 16 bits per channel"
@@ -121,14 +126,31 @@ def _pillow() -> ModuleType:
 
 
 def check_end(path: Path) -> None:
-    """InputError for a JPEG that stops within its picture: decoders fill the rest with gray and say nothing."""
+    """InputError for a JPEG, PNG or TIFF that stops within its picture: decoders fill the rest with gray and say
+    nothing.
+    """
     with path.open("rb") as file:
-        if file.read(2) != b"\xff\xd8":
-            return
+        head = file.read(8)
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            scan = _find_scan(data)
-            if scan < 0 or data.rfind(END_OF_IMAGE, scan) < 0:
-                raise InputError(f"the photo {path} is cut off: copy it again from the camera")
+            if head[:2] == b"\xff\xd8":
+                scan = _find_scan(data)
+                whole = scan >= 0 and data.rfind(END_OF_IMAGE, scan) >= 0
+            elif head == b"\x89PNG\r\n\x1a\n":
+                whole = data.rfind(b"IEND") >= 0
+            else:
+                whole = _end_of_tiff(path) <= len(data)
+    if not whole:
+        raise InputError(f"the photo {path} is cut off: copy it again from the camera")
+
+
+def _end_of_tiff(path: Path) -> int:
+    """Where the pixels of the first page of a TIFF end, byte; 0 for other files."""
+    with open_image(path) as image:
+        tags = getattr(image, "tag_v2", {})
+        ends = [0]
+        for offsets, counts in STRIPS_AND_TILES:
+            ends += [a + b for a, b in zip(tags.get(offsets, ()), tags.get(counts, ()), strict=False)]
+        return max(ends)
 
 
 def _find_scan(data: mmap.mmap) -> int:
@@ -150,22 +172,76 @@ def _find_scan(data: mmap.mmap) -> int:
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
 
+OTHER_SUFFIXES = {
+    ".heic",
+    ".heif",
+    ".avif",
+    ".webp",
+    ".bmp",
+    ".gif",
+    ".jp2",
+    ".jxl",
+    ".dng",
+    ".raw",
+    ".cr2",
+    ".nef",
+    ".arw",
+}
+NO_PHOTOS = {"__macosx", "@eadir", "thumbnails", "thumbs"}  # folders of archives, file servers and viewers
+
+
 def list_photos(folder: Path) -> list[Path]:
-    """Photos of a folder and its subfolders, by path."""
-    return sorted(
-        file
-        for file in folder.rglob("*")
-        if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".") and file.is_file()
+    """Photos of a folder and its subfolders, by path. No photos are what sc3d has written there, hidden files and
+    folders, and thumbnails.
+    """
+    return _survey(folder)[0]
+
+
+def left_out(folder: Path) -> str:
+    """What in a folder of photos is not used, by reason, with numbers and examples; "" if there is nothing."""
+    return "; ".join(
+        f"{len(files)} {reason} ({', '.join(str(file.relative_to(folder)) for file in files[:3])}{' ...' if len(files) > 3 else ''})"
+        for reason, files in _survey(folder)[1].items()
+        if files
     )
+
+
+def _survey(folder: Path) -> tuple[list[Path], dict[str, list[Path]]]:
+    """Photos, and the files and folders that are left out, by reason."""
+    files, made = files_below(folder)
+    hidden, thumbnails, others, photos = list[Path](), list[Path](), list[Path](), list[Path]()
+    for file in files:
+        suffix, parts = file.suffix.lower(), file.relative_to(folder).parts
+        if suffix not in IMAGE_SUFFIXES | OTHER_SUFFIXES:
+            continue
+        if any(part.startswith(".") for part in parts):
+            hidden.append(file)
+        elif any(part.lower() in NO_PHOTOS for part in parts[:-1]):
+            thumbnails.append(file)
+        else:
+            (photos if suffix in IMAGE_SUFFIXES else others).append(file)
+    reasons = {
+        "of a format that is not read, convert them to JPEG": others,
+        "written by sc3d": made,
+        "hidden": hidden,
+        "thumbnails or leftovers of an archive": thumbnails,
+    }
+    return photos, reasons
 
 
 def find_photos(folder: Path) -> list[Path]:
     """As `list_photos`; InputError if there are none, or one is a link that leads elsewhere."""
+    if folder.is_symlink() and not folder.exists():
+        raise InputError(f"{_moved(folder)}")
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: give the folder that holds the photos")
     photos = list_photos(folder)
     if not photos:
-        raise InputError(f"no photos in {folder}: JPEG, PNG or TIFF files are expected")
+        others = left_out(folder)
+        raise InputError(
+            f"no photos in {folder}: JPEG, PNG or TIFF files are expected"
+            + (f"; left out: {others}" if others else "")
+        )
     for photo in photos:
         require_within(photo, folder)
     return photos
@@ -288,6 +364,12 @@ def photo_bits(path: Path) -> int:
             f"the photo {path} has {kind} per channel: save it with whole numbers of 8 or 16 bits"
         )
     return bits
+
+
+def num_pages(path: Path) -> int:
+    """Pages of a TIFF; 1 for others (the further pictures of an MPO are previews)."""
+    with open_image(path) as image:
+        return int(getattr(image, "n_frames", 1)) if image.format == "TIFF" else 1
 
 
 def read_orientation(path: Path) -> int:

@@ -133,6 +133,10 @@ class Scene:
         if not self.path.is_dir():
             raise InputError(f"the scene folder {self.path} does not exist")
         for path in paths:
+            if path.is_symlink() and not path.exists():
+                raise InputError(
+                    f"{path} is a link to {path.readlink()}, which is not there: has it been moved? Put it back, or make the link anew"
+                )
             if not path.exists():
                 raise InputError(f"{path} is missing: {hint}")
 

@@ -27,8 +27,7 @@ COLORED = {"RGB", "RGBA"}
 def check_png(file: Path, format: str, checks: Checks) -> Iterator[tuple[str, CheckedMask]]:
     """The photo and mask of a PNG, after a look at all its pixels; mismatches go to `checks`.
 
-    format: "color", "index", or "auto" for ids unless the file has colors, or a palette that holds the colors of the
-        classes
+    format: "color", "index", or "auto" for ids unless the palette holds the colors of the classes
     """
     if not checks.fits(file):
         return
@@ -38,7 +37,7 @@ def check_png(file: Path, format: str, checks: Checks) -> Iterator[tuple[str, Ch
     if name is None or found is None:
         return
     size, turn = found
-    colored = format == "color" or (format == "auto" and is_colored(file))
+    colored = format == "color"
     codes, table = _read_codes(file, colored, format, checks.classes)
     unknown = table[codes] == UNKNOWN
     if unknown.any():

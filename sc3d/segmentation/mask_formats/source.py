@@ -63,7 +63,7 @@ def read_masks(
     masks: dict[str, CheckedMask] = {}
     for file in _files(source.path, kind, names):
         try:
-            for name, mask in _read(file, "auto" if automatic and SUFFIXES[kind] == ".png" else kind, checks):
+            for name, mask in _read(file, "auto" if automatic and kind == "index" else kind, checks):
                 if name in masks:
                     checks.add(
                         "double",
