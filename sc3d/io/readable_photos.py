@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.io.images import has_alpha, photo_bits, read_image, read_opaque, used_range, write_image
+from sc3d.io.images import has_alpha, image_size, photo_bits, read_image, read_opaque, used_range, write_image
 
 PNG = ".png"
 
@@ -30,12 +30,11 @@ def readable_photos(images: Path, names: list[str], work: Path) -> tuple[Path, P
             png.rename(photos / name)  # COLMAP looks into files, not at their names
         else:
             _link(images / name, photos / name)
-    masked = False
-    for name in names:
-        opaque = read_opaque(images / name) if has_alpha(images / name) else None
-        if opaque is not None:
-            masked = True
-            write_image(work / "opaque" / f"{name}{PNG}", np.where(opaque, 255, 0).astype(np.uint8))
+    masked = [name for name in names if has_alpha(images / name) and read_opaque(images / name) is not None]
+    for name in names if masked else ():  # COLMAP skips photos without a mask where others have one
+        opaque = read_opaque(images / name) if name in masked else None
+        pixels = np.ones(image_size(images / name)[::-1], bool) if opaque is None else opaque
+        write_image(work / "opaque" / f"{name}{PNG}", np.where(pixels, 255, 0).astype(np.uint8))
     return photos, work / "opaque" if masked else None
 
 
