@@ -65,7 +65,8 @@ def open_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
     try:
         if not path.is_file():  # a pipe or a device could be opened, and waited for
             raise FileNotFoundError
-        with pillow.open(path, formats=FORMATS) as image:
+        # from a stream: what Pillow maps into memory by name, uncompressed TIFF, it scrambles if it is turned
+        with path.open("rb") as file, pillow.open(file, formats=FORMATS) as image:
             _check_size(path, image.size, what)
             yield image
     except InputError:
