@@ -12,12 +12,13 @@ Layout: https://colmap.github.io/format.html; rigs.bin and frames.bin as COLMAP 
 from __future__ import annotations
 
 import codecs
+import logging
 import mmap
 import shutil
 import struct
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Protocol
@@ -28,6 +29,8 @@ import pycolmap
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
 from sc3d.io.limits import FARTHEST, MAX_PIXELS, MAX_SIDE, DamagedFileError
+
+logger = logging.getLogger(__name__)
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")  # rigs and frames only in newer models
 LARGEST = 1 << 62  # count of a list: bounded by the size of the file alone
@@ -46,8 +49,9 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
     poses that are none.
     """
     if not is_model(folder):
+        above = f" (one is in {folder.parent}: move its files there)" if is_model(folder.parent) else ""
         raise InputError(
-            f"no cameras in {folder}: run `sc3d reconstruct PHOTOS SCENE`, or put a COLMAP model there"
+            f"no cameras in {folder}: run `sc3d reconstruct PHOTOS SCENE`, or put a COLMAP model there{above}"
         )
     check_counts(folder)
     try:
@@ -89,6 +93,23 @@ def photo_names(folder: Path) -> list[str]:
     names: list[str] = []
     _check_part(folder, "images", lambda data, count: _walk_images(data, count, names))
     return names
+
+
+def warn_of_larger(folder: Path) -> None:
+    """Say if a model beside this one, as COLMAP numbers them, has more photos."""
+    others = [other for other in sorted(folder.parent.glob("[0-9]*")) if other != folder and is_model(other)]
+    if not others:
+        return
+    with suppress(InputError):  # one that is damaged is in nobody's way
+        count, counts = len(photo_names(folder)), [len(photo_names(other)) for other in others]
+        if max(counts) > count:
+            logger.warning(
+                "%s has %d photos, but the model beside it in %s has %d: put that one in its place, if it is meant",
+                folder,
+                count,
+                others[counts.index(max(counts))],
+                max(counts),
+            )
 
 
 def _is_binary(folder: Path) -> bool:

@@ -159,6 +159,7 @@ def read_sparse_model(path: Path) -> SparseModel:
     from sc3d.geometry.cameras import View
     from sc3d.io import colmap
 
+    colmap.warn_of_larger(path)
     model = colmap.load_model(path)
     cameras = colmap.copy_cameras(model)
     point_ids, xyz, colors = colmap.point_arrays(model)
