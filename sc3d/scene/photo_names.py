@@ -127,6 +127,14 @@ class PhotoNames:
         clear = (key for key in keys if self.match_file(f"{key}{suffix}") == (name,))
         return next((file for key in clear if (file := folder / f"{key}{suffix}").is_file()), None)
 
+    def same_letters(self, name: str) -> list[str]:
+        """Photos whose path differs from a name in letter case or Unicode form at most."""
+        return [
+            photo
+            for photo in self._tables[1].get(_fold(name).rpartition("/")[2], ())
+            if _fold(photo) == _fold(name)
+        ]
+
     def match_file(self, path: str, folder: Path | None = None, changed: bool = True) -> tuple[str, ...]:
         """Photos that a mask or another file of one photo may belong to.
 
