@@ -17,6 +17,7 @@ master (`master_id`), as the units of a rig's offsets are not stated.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -90,7 +91,8 @@ def read(path: Path, settings: Import) -> Project:
         left_out.setdefault(reason, []).append(_label(camera))
     poses = [_pose(camera, transforms[camera.get("component_id")], path) for camera in kept]
     views = [
-        View(_label(camera), cameras[camera.get("sensor_id")], pose) for camera, pose in zip(kept, poses)
+        View(name, cameras[camera.get("sensor_id")], pose)
+        for name, camera, pose in zip(_names(chunk, kept), kept, poses)
     ]
     _warn_of_shutter(chunk, kept, path)
     moved, georeference = _to_local(views, chunk, path)
@@ -149,6 +151,22 @@ def _sorted_cameras(chunk: ElementTree.Element) -> tuple[list[ElementTree.Elemen
 
 def _label(camera: ElementTree.Element) -> str:
     return camera.get("label", "")
+
+
+def _names(chunk: ElementTree.Element, cameras: list[ElementTree.Element]) -> list[str]:
+    """Labels of cameras, behind that of their group where several cameras have the same."""
+    groups = {
+        camera.get("id"): group.get("label", "")
+        for group in chunk.iterfind("./cameras//group")
+        for camera in group.iter("camera")
+    }
+    counts = Counter(map(_label, cameras))
+    return [
+        f"{groups[camera.get('id')]}/{_label(camera)}"
+        if counts[_label(camera)] > 1 and groups.get(camera.get("id"))
+        else _label(camera)
+        for camera in cameras
+    ]
 
 
 def _cameras(

@@ -21,7 +21,7 @@ import pycolmap
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, Lenses
-from sc3d.importers.photos import PhotoFinder, photo_folder, plain_name
+from sc3d.importers.photos import names_in, photo_folder, plain_name
 from sc3d.importers.project import Project, rigid, some_names
 from sc3d.io.clouds import read_cloud
 from sc3d.io.images import image_size
@@ -167,14 +167,14 @@ def _sizes(project: Project, tables: list[dict], settings: Import) -> list[tuple
     """(width, height) of every view as stated, else of its photo; None where there is neither."""
     stated = [(table.get("w"), table.get("h")) for table in tables]
     folder = photo_folder(project, settings.images) if any(None in size for size in stated) else None
-    finder = PhotoFinder(folder) if folder else None
+    names = names_in(folder) if folder else None
     sizes: list[tuple[int, int] | None] = []
     for view, table, size in zip(project.views, tables, stated):
-        file = finder.find(view.name) if finder and None in size else None
+        found = names.match(view.name, changed=False) if names and None in size else ()
         if None not in size:
             sizes.append((int(_number(table, "w", view.name)), int(_number(table, "h", view.name))))
         else:
-            sizes.append(None if file is None or folder is None else image_size(folder / file))
+            sizes.append(image_size(folder / found[0]) if folder and len(found) == 1 else None)
     return sizes
 
 

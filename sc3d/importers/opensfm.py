@@ -253,7 +253,7 @@ def _observations(
     if not file.is_file():
         return None
     seen: dict[str, tuple[list[int], list[tuple[float, float]]]] = {view.name: ([], []) for view in views}
-    with file.open(encoding="utf-8", errors="replace") as lines:
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
         for line in lines:
             words = line.rstrip("\n").split("\t")
             if len(words) >= 8 and words[1] in rows and words[0] in seen:
