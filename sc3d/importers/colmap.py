@@ -21,6 +21,7 @@ from sc3d.io.colmap import (
     photo_names,
     point_arrays,
     registered_images,
+    warn_of_larger,
 )
 from sc3d.settings.reconstruction import Import
 
@@ -105,6 +106,7 @@ def _warn_of_others(path: Path, chosen: Path) -> None:
     """Say what is in the other models of a project, which share no frame with the one that is read."""
     others = {folder: _names(folder) for folder in _folders(path) if folder != chosen}
     if not others:
+        warn_of_larger(chosen)
         return
     names = _names(chosen)
     lost = sorted(set().union(*others.values()) - names)

@@ -28,14 +28,9 @@ import pyproj
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, Lenses, NoModelError
-from sc3d.georeferencing.alignment import Similarity, fit_similarity
-from sc3d.georeferencing.georeference import (
-    Georeference,
-    crs_to_geodetic,
-    from_origin,
-    geodetic_to_enu,
-    triple,
-)
+from sc3d.georeferencing.alignment import Similarity
+from sc3d.georeferencing.georeference import Georeference, crs_to_geodetic, from_origin
+from sc3d.importers.frames import enu_of_geocentric, moved_view
 from sc3d.importers.project import Project, rigid
 from sc3d.settings.reconstruction import Import
 
@@ -377,17 +372,9 @@ def _to_local(
             "%s names a CRS, but its cameras are not in geocentric coordinates: the place stays unknown", path
         )
         return views, None
-    # points that show how one frame lies in the other
-    frame = middle + 1000 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
     axes = crs.ellipsoid.semi_major_metre, crs.ellipsoid.semi_minor_metre
-    geodetic = _geodetic(frame, axes, crs.geodetic_crs)
-    origin = triple(round(float(value), digits) for value, digits in zip(geodetic[0], (6, 6, 0)))
-    enu = fit_similarity(frame - middle, geodetic_to_enu(geodetic, origin))
-    centers = enu.apply(np.array([view.center for view in views]) - middle)
-    moved = [
-        View(view.name, view.camera, rigid(view.cam_from_world[:3, :3] @ enu.rotation.T, center, str(path)))
-        for view, center in zip(views, centers)
-    ]
+    origin, enu = enu_of_geocentric(middle, lambda points: _geodetic(points, axes, crs.geodetic_crs))
+    moved = [moved_view(view, middle, enu) for view in views]
     return moved, from_origin(origin, crs.to_epsg() if crs.is_projected else None)
 
 

@@ -214,7 +214,17 @@ def _distortion_model(table: dict, size: tuple[int, int], where: str) -> Distort
         (k1, k2, k3, k4),
         (0.0, 0.0) if fisheye else (p1, p2),
         fisheye,
+        left_out=_tangential_cost((p1, p2), size, focal) if fisheye else (),
     )
+
+
+def _tangential_cost(
+    tangential: tuple[float, float], size: tuple[int, int], focal: tuple[float, float]
+) -> tuple[tuple[str, float], ...]:
+    """What it costs at most to leave out p1 and p2 of a fisheye, px: programs differ in what they do there."""
+    reach = float(np.hypot(*np.divide(size, focal))) / 2
+    cost = 3 * float(np.hypot(*tangential)) * reach**2 * max(focal)
+    return (("p1 and p2 of a fisheye", cost),) if cost else ()
 
 
 def _focal(table: dict, size: tuple[int, int], where: str) -> tuple[float, float]:

@@ -104,7 +104,7 @@ def warn_of_larger(folder: Path) -> None:
         count, counts = len(photo_names(folder)), [len(photo_names(other)) for other in others]
         if max(counts) > count:
             logger.warning(
-                "%s has %d photos, but the model beside it in %s has %d: put that one in its place, if it is meant",
+                "%s has %d photos, but the model beside it in %s has %d: take that one, if it is meant",
                 folder,
                 count,
                 others[counts.index(max(counts))],

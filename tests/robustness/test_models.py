@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+import pyproj
 import pytest
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
+from sc3d.georeferencing.georeference import from_origin, read_georeference
 from sc3d.importers.metashape import largest_correction
 from sc3d.importers.photos import locate_photos
 from sc3d.importers.project import Project, read_project
@@ -167,6 +169,9 @@ class TestSeveralModels:
         save_model(tmp_path / "sparse" / "0", fly(count=2))
         save_model(tmp_path / "sparse" / "1", fly(count=5))
         assert len(Scene(tmp_path).model.views) == 2
+        assert "sparse/0 has 2 photos, but the model beside it" in warning(caplog)
+        caplog.clear()
+        assert len(read(tmp_path / "sparse" / "0")[0].views) == 2
         assert "sparse/0 has 2 photos, but the model beside it" in warning(caplog)
         with pytest.raises(InputError, match="move its files there"):
             load_model(save_model(tmp_path / "other" / "sparse", fly()) / "0")
@@ -380,6 +385,8 @@ class TestLenses:
         for camera in everywhere:
             np.testing.assert_allclose(camera.img_from_cam(corner), expected.img_from_cam(corner))
         assert self.camera(tmp_path, is_fisheye=False, k1=0.05).model_name == "OPENCV"
+        with pytest.raises(InputError, match="p1 and p2 of a fisheye"):
+            self.camera(tmp_path, is_fisheye=True, p1=0.1, **self.K)
 
     @pytest.mark.parametrize(
         "top, word",
@@ -553,6 +560,51 @@ class TestFrames:
         )
         assert read(tmp_path)[0].georeference is None
         assert "local coordinates" in warning(caplog)
+
+    def test_pix4d_without_its_offset(self, tmp_path, caplog):
+        (tmp_path / "a_calibrated_camera_parameters.txt").write_text(pix4d_text(fly()))
+        (tmp_path / "a_wkt.prj").write_text(pyproj.CRS.from_epsg(32615).to_wkt("WKT1_ESRI"))
+        assert read(tmp_path)[0].georeference is None
+        assert "a_offset.xyz is missing" in warning(caplog)
+
+    @pytest.mark.parametrize("kind", ["colmap", "metashape"])
+    def test_geocentric_coordinates_without_a_crs(self, tmp_path, caplog, kind):
+        """As COLMAP's model_aligner writes them, and Metashape where the reference is left out."""
+        views, points = fly(), probe(4)
+        geodesy = pycolmap.GPSTransform()
+
+        def ecef(enu: np.ndarray) -> np.ndarray:
+            geodetic = np.asarray(geodesy.enu_to_ellipsoid(np.atleast_2d(enu), *PLACE))
+            return np.asarray(geodesy.ellipsoid_to_ecef(geodetic))
+
+        zero = ecef(np.zeros(3))[0]
+        left, _, right = np.linalg.svd((ecef(np.eye(3)) - zero).T)
+        moved = []
+        for view in views:
+            pose = np.eye(4)
+            pose[:3, :3] = view.cam_from_world[:3, :3] @ (left @ right).T
+            pose[:3, 3] = -pose[:3, :3] @ ecef(view.center)[0]
+            moved.append(replace(view, cam_from_world=pose))
+        if kind == "metashape":
+            file = tmp_path / "a.xml"
+            file.write_text(metashape_xml(moved, metashape_lens(), transform=(np.eye(3), zero, 1.0)))
+        else:
+            file = tmp_path / "model"
+            file.mkdir()
+            rows = np.arange(4)
+            seen = [(rows, rows[:, None] + [[1.0, 2.0]])] * len(views)
+            build_model(moved, ecef(points), np.zeros((4, 3)), seen).write_binary(str(file))
+        run("import", file, tmp_path / "scene")
+        assert "read as those of WGS 84" in caplog.text
+        scene, truth = Scene(tmp_path / "scene"), from_origin(PLACE)
+        found = read_georeference(scene)
+        assert found is not None and found.epsg == 32615
+        centers, expected = (np.array([view.center for view in some]) for some in (scene.model.views, views))
+        np.testing.assert_allclose(found.to_crs(centers), truth.to_crs(expected), atol=1e-3)
+        if kind == "colmap":
+            np.testing.assert_allclose(found.to_crs(scene.model.points), truth.to_crs(points), atol=1e-3)
+            here = found.from_crs(truth.to_crs(probe()))
+            assert same_projections(scene.model.views, views, probe(), here) < 0.01
 
     def test_chunk_of_metashape_that_is_not_referenced(self, tmp_path):
         (tmp_path / "a.xml").write_text(metashape_xml(fly(), metashape_lens()))
