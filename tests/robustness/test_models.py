@@ -566,6 +566,13 @@ class TestFrames:
         (tmp_path / "a_wkt.prj").write_text(pyproj.CRS.from_epsg(32615).to_wkt("WKT1_ESRI"))
         assert read(tmp_path)[0].georeference is None
         assert "a_offset.xyz is missing" in warning(caplog)
+        large = [view.shifted(-np.array([576000.0, 5188000.0, 200.0])) for view in fly()]
+        (tmp_path / "a_calibrated_camera_parameters.txt").write_text(pix4d_text(large))
+        project, _ = read(tmp_path)
+        assert project.georeference is not None and np.abs(project.views[0].center).max() < 1000
+        np.testing.assert_allclose(
+            project.georeference.to_crs(project.views[0].center[None])[0], large[0].center, atol=1e-6
+        )
 
     @pytest.mark.parametrize("kind", ["colmap", "metashape"])
     def test_geocentric_coordinates_without_a_crs(self, tmp_path, caplog, kind):
