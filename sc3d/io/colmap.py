@@ -63,7 +63,10 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
             for image in images:
                 image.name = full_names[image.image_id]
         names = [image.name for image in images]
+        _check_rigs(model, folder)
         poses = [image.cam_from_world() for image in images]
+    except InputError:
+        raise
     # pycolmap raises bare RuntimeError, ValueError, IndexError, MemoryError and UnicodeDecodeError for broken
     # files
     except Exception as error:
@@ -242,6 +245,16 @@ def write_model(path: Path, model: pycolmap.Reconstruction) -> None:
     with atomic_path(path) as temporary:
         temporary.mkdir()
         model.write_binary(str(temporary))
+
+
+def _check_rigs(model: pycolmap.Reconstruction, folder: Path) -> None:
+    for rig_id, rig in model.rigs.items():
+        unplaced = [sensor.id for sensor, pose in rig.non_ref_sensors.items() if pose is None]
+        if unplaced:
+            raise InputError(
+                f"{folder}: camera {unplaced[0]} of rig {rig_id} has no pose in the rig, so its photos have no position: "
+                "calibrate the rig (colmap rig_configurator, mapper) or take the model without it"
+            )
 
 
 def _check_camera(camera: pycolmap.Camera, folder: Path) -> None:

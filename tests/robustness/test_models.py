@@ -268,7 +268,8 @@ class TestPhotos:
         """The rest comes in, with its points and tracks."""
         views = rename(small(fly()), "{}.jpg")
         save_model(tmp_path / "sparse" / "0", views)
-        write_photos(tmp_path / "images", views[:4])
+        extra = replace(views[0], name="never_aligned.jpg")
+        write_photos(tmp_path / "images", [*views[:4], extra])
         run("import", tmp_path, tmp_path / "scene")
         model = Scene(tmp_path / "scene").model
         assert [view.name for view in model.views] == [f"{row}.jpg" for row in range(4)]
@@ -277,6 +278,7 @@ class TestPhotos:
         assert "2 of 6 photos left out: 2 not in " in caplog.text and "(4.jpg, 5.jpg)" in caplog.text
         record = json.loads((tmp_path / "scene" / "sparse" / "0.json").read_text())
         assert sum(record["summary"]["left_out"].values()) == 2
+        assert record["summary"]["photos_without_camera"] == "1 (never_aligned.jpg)"
 
     @pytest.mark.parametrize("kind", ["transforms", "opensfm", "pix4d", "metashape"])
     def test_some_are_gone_in_every_program(self, tmp_path, kind):
@@ -654,6 +656,16 @@ class TestPartialModels:
         (photos / "shot_3.jpg").unlink()
         run("import", tmp_path, tmp_path / "scene")
         assert same_projections(Scene(tmp_path / "scene").model.views, views[:3], probe()) < 1e-6
+
+    def test_rig_with_a_camera_that_is_not_placed(self, tmp_path):
+        save_rig(tmp_path / "binary", small(fly(count=4)))
+        folder = tmp_path / "text"
+        folder.mkdir()
+        pycolmap.Reconstruction(str(tmp_path / "binary")).write_text(str(folder))
+        lines = (folder / "rigs.txt").read_text().splitlines()
+        (folder / "rigs.txt").write_text("\n".join([*lines[:-1], "1 2 CAMERA 1 CAMERA 2 0"]))
+        with pytest.raises(InputError, match="camera 2 of rig 1 has no pose"):
+            read(folder)
 
 
 def save_rig(folder: Path, views: list[View]) -> None:
