@@ -90,6 +90,12 @@ def read(path: Path, settings: Import) -> Project:
         for name, camera, pose in zip(_names(chunk, kept), kept, poses)
     ]
     _warn_of_shutter(chunk, kept, path)
+    if len(transforms) > 1 and _crs(chunk, path) is None:
+        logger.warning(
+            "%s: %d components are read as of one frame, but no CRS says that they are: check how they lie to one another",
+            path,
+            len(transforms),
+        )
     moved, georeference = _to_local(views, chunk, path)
     notes: dict[str, object] = {"chunk": chunk.get("label", "")}
     if chunk.find("transform") is None and chunk.find("./components/component/transform") is None:

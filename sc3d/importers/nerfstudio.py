@@ -267,7 +267,10 @@ def _matrix(rows: object, where: str) -> np.ndarray:
 def _points(folder: Path, content: dict) -> tuple[np.ndarray, np.ndarray]:
     """(P, 3) points of `ply_file_path` in the original frame, (P, 3) colors; none without such a file."""
     original, scale = _original_from_saved(content, folder)
-    file = folder / str(content.get("ply_file_path") or "")
+    file = folder / plain_name(str(content.get("ply_file_path") or ""))
+    if not file.resolve().is_relative_to(folder.resolve()):
+        logger.warning("%s: ply_file_path leads out of the project, it is not read: %r", folder, str(file))
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not file.is_file():
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     cloud = read_cloud(file)

@@ -323,6 +323,24 @@ class TestPhotos:
         assert [len(value) for value in project.left_out.values()] == [1]
         assert "leads out of the project" in next(iter(project.left_out))
 
+    def test_points_that_lead_out(self, tmp_path, caplog):
+        for outside in (tmp_path / "secret.ply", "../secret.ply", "..\\secret.ply"):
+            (tmp_path / "secret.ply").write_bytes(
+                b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n"
+            )
+            caplog.clear()
+            views = rename(fly(), "images/{}.jpg")
+            file = transforms(tmp_path / "project", views, ply_file_path=str(outside))
+            assert not len(read(file)[0].points) and "leads out of the project" in warning(caplog)
+
+    def test_names_that_act_on_terminals(self, tmp_path, caplog):
+        views = rename(small(fly(count=3)), "a_{}.jpg")
+        write_photos(tmp_path / "photos", views[:2])
+        views[2] = replace(views[2], name="\x1b[2Jx\n.jpg")
+        run("import", transforms(tmp_path, views), tmp_path / "scene", "--images", tmp_path / "photos")
+        told = next(record.getMessage() for record in caplog.records if "left out" in record.getMessage())
+        assert told.isprintable() and "1 of 3 photos" in told
+
     @pytest.mark.parametrize("root", ["/home/somebody/project/", "C:/Users/somebody/project/"])
     def test_project_that_was_moved(self, tmp_path, root):
         """All paths are absolute, of another machine."""
@@ -513,6 +531,21 @@ class TestMetashape:
             "1 without a calibrated sensor (shot_4)",
         ):
             assert part in told, told
+
+    def test_components_that_each_have_a_transform(self, tmp_path, caplog):
+        component = "<component id='7'><transform><scale>2</scale></transform></component></components>"
+        project, _ = read(
+            self.write(
+                tmp_path,
+                ('label="Component 1">', 'label="Component 1"><transform><scale>1</scale></transform>'),
+                ("</components>", component),
+                (
+                    '<camera id="2" sensor_id="0" component_id="0"',
+                    '<camera id="2" sensor_id="0" component_id="7"',
+                ),
+            )
+        )
+        assert len(project.views) == 6 and "2 components are read as of one frame" in warning(caplog)
 
     def test_none_is_aligned(self, tmp_path, capsys):
         content = metashape_xml(fly(), metashape_lens())
