@@ -172,10 +172,17 @@ def _sizes(project: Project, tables: list[dict], settings: Import) -> list[tuple
     for view, table, size in zip(project.views, tables, stated):
         found = names.match(view.name, changed=False) if names and None in size else ()
         if None not in size:
-            sizes.append((int(_number(table, "w", view.name)), int(_number(table, "h", view.name))))
+            sizes.append((_whole(table, "w", view.name), _whole(table, "h", view.name)))
         else:
             sizes.append(image_size(folder / found[0]) if folder and len(found) == 1 else None)
     return sizes
+
+
+def _whole(table: dict, key: str, where: str) -> int:
+    value = _number(table, key, where)
+    if not value.is_integer():
+        raise InputError(f"{where}: {key} is {value}: a number of pixels is whole")
+    return int(value)
 
 
 def _number(table: dict, key: str, where: str, default: float | None = None) -> float:

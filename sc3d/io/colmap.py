@@ -116,8 +116,9 @@ def warn_of_larger(folder: Path) -> None:
 
 
 def _is_binary(folder: Path) -> bool:
-    """As pycolmap decides it."""
-    return all((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D"))
+    """As pycolmap decides it, which asks for points, too."""
+    cameras = all((folder / f"{name}.bin").exists() for name in ("cameras", "images"))
+    return cameras and ((folder / "points3D.bin").exists() or not (folder / "points3D.txt").exists())
 
 
 def _text_names(folder: Path) -> dict[int, str]:
@@ -135,20 +136,23 @@ def _text_names(folder: Path) -> dict[int, str]:
 
 @contextmanager
 def _as_pycolmap_reads(folder: Path) -> Iterator[Path]:
-    """The folder itself, or for the time of the block a copy of a text model without what pycolmap does not
-    bear: byte order marks, and no file of points.
+    """The folder itself, or for the time of the block a copy without what pycolmap does not bear: byte order
+    marks in text, and no file of points.
     """
-    files = [folder / f"{name}.txt" for name in FILES]
-    marked = [file.is_file() and _starts_with_mark(file) for file in files]
-    if _is_binary(folder) or not (any(marked) or not files[-1].exists()):
+    is_binary = _is_binary(folder)
+    files = [folder / f"{name}.{'bin' if is_binary else 'txt'}" for name in FILES]
+    marked = not is_binary and any(file.is_file() and _starts_with_mark(file) for file in files)
+    if not files[FILES.index("images")].is_file():
+        raise InputError(f"the COLMAP model in {folder} has no file of photos (images.bin or images.txt)")
+    if not marked and files[-1].exists():
         yield folder
         return
     with tempfile.TemporaryDirectory(prefix="sc3d-colmap-") as name:
         copy = Path(name)
-        (copy / files[-1].name).touch()
+        (copy / files[-1].name).write_bytes(struct.pack("<Q", 0) if is_binary else b"")
         for file in filter(Path.is_file, files):
             with file.open("rb") as source, (copy / file.name).open("wb") as target:
-                source.seek(len(codecs.BOM_UTF8) if _starts_with_mark(file) else 0)
+                source.seek(len(codecs.BOM_UTF8) if marked and _starts_with_mark(file) else 0)
                 shutil.copyfileobj(source, target)
         yield copy
 

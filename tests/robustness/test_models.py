@@ -420,6 +420,7 @@ class TestLenses:
             ({"k5": 0.1}, "k5"),
             ({"is_fisheye": True, "camera_model": "OPENCV"}, "contradict"),
             ({"is_fisheye": "yes"}, "no number"),
+            ({"w": 64.5}, "whole"),
         ],
     )
     def test_lenses_without_a_model(self, tmp_path, top, word):
@@ -661,9 +662,18 @@ class TestPartialModels:
     def test_without_points(self, tmp_path, text):
         folder = save_model(tmp_path / "model", fly(), text, points=0)
         assert len(read(folder)[0].views) == 6
-        if text:
-            (folder / "points3D.txt").unlink()
-            assert len(read(folder)[0].views) == 6
+        (folder / f"points3D.{'txt' if text else 'bin'}").unlink()
+        assert len(read(folder)[0].views) == 6
+
+    @pytest.mark.parametrize("text", [True, False])
+    def test_without_the_points_that_photos_see(self, tmp_path, text):
+        folder = save_model(tmp_path / "model", fly(), text)
+        (folder / f"points3D.{'txt' if text else 'bin'}").unlink()
+        project, _ = read(folder)
+        assert len(project.views) == 6 and not len(project.points)
+        (folder / f"images.{'txt' if text else 'bin'}").unlink()
+        with pytest.raises(InputError, match="no file of photos"):
+            read(folder)
 
     def test_one_camera_per_photo(self, tmp_path):
         views = [
