@@ -13,7 +13,7 @@ import pytest
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.georeferencing.georeference import from_origin, read_georeference
+from sc3d.georeferencing.georeference import from_origin, read_georeference, write_georeference
 from sc3d.importers.metashape import largest_correction
 from sc3d.importers.photos import locate_photos
 from sc3d.importers.project import Project, read_project
@@ -173,6 +173,11 @@ class TestSeveralModels:
         caplog.clear()
         assert len(read(tmp_path / "sparse" / "0")[0].views) == 2
         assert "sparse/0 has 2 photos, but the model beside it" in warning(caplog)
+        caplog.clear()
+        write_georeference(Scene(tmp_path), from_origin(PLACE))  # is that of sparse/0
+        project, _ = read(tmp_path)
+        assert len(project.views) == 2 and project.georeference == from_origin(PLACE)
+        assert "the model beside it" in warning(caplog)
         with pytest.raises(InputError, match="move its files there"):
             load_model(save_model(tmp_path / "other" / "sparse", fly()) / "0")
 
