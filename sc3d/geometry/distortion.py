@@ -99,11 +99,11 @@ class Lenses:
     def warn(self, path: object) -> None:
         """Say in one line what was left out of the lenses, and what it costs."""
         told = [
-            f"{what}: up to {max(costs):.2g} px in {len(costs)} of {len(self._cameras)} lenses"
+            f"{what} (up to {max(costs):.2g} px in {len(costs)} of {len(self._cameras)} lenses)"
             for what, costs in self._costs.items()
         ]
         if told:
-            logger.warning("%s: left out, as no COLMAP model has it: %s", path, "; ".join(told))
+            logger.warning("%s: left out, as no COLMAP model has it: %s", path, ", ".join(told))
 
     def _convert(self, distortion: DistortionModel, where: str) -> pycolmap.Camera:
         _check(distortion, where)

@@ -11,6 +11,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
+from sc3d.georeferencing.georeference import georeference_path
 from sc3d.importers.project import Project, require_found, some_names
 from sc3d.io.colmap import (
     cam_from_world,
@@ -21,7 +22,9 @@ from sc3d.io.colmap import (
     photo_names,
     point_arrays,
     registered_images,
+    warn_of_larger,
 )
+from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import
 
 logger = logging.getLogger(__name__)
@@ -76,11 +79,15 @@ def read(path: Path, settings: Import) -> Project:
 
 
 def _folders(path: Path) -> list[Path]:
-    """Folders of models in a project; a model that is the path itself stands alone."""
+    """Folders of models in a project; a model that is the path itself stands alone, and that of a scene of
+    sc3d, whose georeference belongs to no other.
+    """
     if not path.is_dir():
         return []
-    if is_model(path):
-        return [path]
+    scene = Scene(path)
+    alone = [path, *([scene.sparse] if georeference_path(scene).exists() else [])]
+    if found := [folder for folder in alone if is_model(folder)]:
+        return found[:1]
     found = [folder for place in PLACES for folder in sorted(path.glob(place)) if is_model(folder)]
     return list(dict.fromkeys(found))
 
@@ -105,6 +112,7 @@ def _warn_of_others(path: Path, chosen: Path) -> None:
     """Say what is in the other models of a project, which share no frame with the one that is read."""
     others = {folder: _names(folder) for folder in _folders(path) if folder != chosen}
     if not others:
+        warn_of_larger(chosen)
         return
     names = _names(chosen)
     lost = sorted(set().union(*others.values()) - names)

@@ -17,6 +17,7 @@ master (`master_id`), as the units of a rig's offsets are not stated.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -27,14 +28,9 @@ import pyproj
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, Lenses, NoModelError
-from sc3d.georeferencing.alignment import Similarity, fit_similarity
-from sc3d.georeferencing.georeference import (
-    Georeference,
-    crs_to_geodetic,
-    from_origin,
-    geodetic_to_enu,
-    triple,
-)
+from sc3d.georeferencing.alignment import Similarity
+from sc3d.georeferencing.georeference import Georeference, crs_to_geodetic, from_origin
+from sc3d.importers.frames import enu_of_geocentric, moved_view
 from sc3d.importers.project import Project, rigid
 from sc3d.settings.reconstruction import Import
 
@@ -90,9 +86,16 @@ def read(path: Path, settings: Import) -> Project:
         left_out.setdefault(reason, []).append(_label(camera))
     poses = [_pose(camera, transforms[camera.get("component_id")], path) for camera in kept]
     views = [
-        View(_label(camera), cameras[camera.get("sensor_id")], pose) for camera, pose in zip(kept, poses)
+        View(name, cameras[camera.get("sensor_id")], pose)
+        for name, camera, pose in zip(_names(chunk, kept), kept, poses)
     ]
     _warn_of_shutter(chunk, kept, path)
+    if len(transforms) > 1 and _crs(chunk, path) is None:
+        logger.warning(
+            "%s: %d components are read as of one frame, but no CRS says that they are: check how they lie to one another",
+            path,
+            len(transforms),
+        )
     moved, georeference = _to_local(views, chunk, path)
     notes: dict[str, object] = {"chunk": chunk.get("label", "")}
     if chunk.find("transform") is None and chunk.find("./components/component/transform") is None:
@@ -149,6 +152,22 @@ def _sorted_cameras(chunk: ElementTree.Element) -> tuple[list[ElementTree.Elemen
 
 def _label(camera: ElementTree.Element) -> str:
     return camera.get("label", "")
+
+
+def _names(chunk: ElementTree.Element, cameras: list[ElementTree.Element]) -> list[str]:
+    """Labels of cameras, behind that of their group where several cameras have the same."""
+    groups = {
+        camera.get("id"): group.get("label", "")
+        for group in chunk.iterfind("./cameras//group")
+        for camera in group.iter("camera")
+    }
+    counts = Counter(map(_label, cameras))
+    return [
+        f"{groups[camera.get('id')]}/{_label(camera)}"
+        if counts[_label(camera)] > 1 and groups.get(camera.get("id"))
+        else _label(camera)
+        for camera in cameras
+    ]
 
 
 def _cameras(
@@ -359,17 +378,9 @@ def _to_local(
             "%s names a CRS, but its cameras are not in geocentric coordinates: the place stays unknown", path
         )
         return views, None
-    # points that show how one frame lies in the other
-    frame = middle + 1000 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
     axes = crs.ellipsoid.semi_major_metre, crs.ellipsoid.semi_minor_metre
-    geodetic = _geodetic(frame, axes, crs.geodetic_crs)
-    origin = triple(round(float(value), digits) for value, digits in zip(geodetic[0], (6, 6, 0)))
-    enu = fit_similarity(frame - middle, geodetic_to_enu(geodetic, origin))
-    centers = enu.apply(np.array([view.center for view in views]) - middle)
-    moved = [
-        View(view.name, view.camera, rigid(view.cam_from_world[:3, :3] @ enu.rotation.T, center, str(path)))
-        for view, center in zip(views, centers)
-    ]
+    origin, enu = enu_of_geocentric(middle, lambda points: _geodetic(points, axes, crs.geodetic_crs))
+    moved = [moved_view(view, middle, enu) for view in views]
     return moved, from_origin(origin, crs.to_epsg() if crs.is_projected else None)
 
 

@@ -21,7 +21,7 @@ import pycolmap
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, Lenses
-from sc3d.importers.photos import PhotoFinder, photo_folder, plain_name
+from sc3d.importers.photos import names_in, photo_folder, plain_name
 from sc3d.importers.project import Project, rigid, some_names
 from sc3d.io.clouds import read_cloud
 from sc3d.io.images import image_size
@@ -167,15 +167,22 @@ def _sizes(project: Project, tables: list[dict], settings: Import) -> list[tuple
     """(width, height) of every view as stated, else of its photo; None where there is neither."""
     stated = [(table.get("w"), table.get("h")) for table in tables]
     folder = photo_folder(project, settings.images) if any(None in size for size in stated) else None
-    finder = PhotoFinder(folder) if folder else None
+    names = names_in(folder) if folder else None
     sizes: list[tuple[int, int] | None] = []
     for view, table, size in zip(project.views, tables, stated):
-        file = finder.find(view.name) if finder and None in size else None
+        found = names.match(view.name, changed=False) if names and None in size else ()
         if None not in size:
-            sizes.append((int(_number(table, "w", view.name)), int(_number(table, "h", view.name))))
+            sizes.append((_whole(table, "w", view.name), _whole(table, "h", view.name)))
         else:
-            sizes.append(None if file is None or folder is None else image_size(folder / file))
+            sizes.append(image_size(folder / found[0]) if folder and len(found) == 1 else None)
     return sizes
+
+
+def _whole(table: dict, key: str, where: str) -> int:
+    value = _number(table, key, where)
+    if not value.is_integer():
+        raise InputError(f"{where}: {key} is {value}: a number of pixels is whole")
+    return int(value)
 
 
 def _number(table: dict, key: str, where: str, default: float | None = None) -> float:
@@ -214,7 +221,17 @@ def _distortion_model(table: dict, size: tuple[int, int], where: str) -> Distort
         (k1, k2, k3, k4),
         (0.0, 0.0) if fisheye else (p1, p2),
         fisheye,
+        left_out=_tangential_cost((p1, p2), size, focal) if fisheye else (),
     )
+
+
+def _tangential_cost(
+    tangential: tuple[float, float], size: tuple[int, int], focal: tuple[float, float]
+) -> tuple[tuple[str, float], ...]:
+    """What it costs at most to leave out p1 and p2 of a fisheye, px: programs differ in what they do there."""
+    reach = float(np.hypot(*np.divide(size, focal))) / 2
+    cost = 3 * float(np.hypot(*tangential)) * reach**2 * max(focal)
+    return (("p1 and p2 of a fisheye", cost),) if cost else ()
 
 
 def _focal(table: dict, size: tuple[int, int], where: str) -> tuple[float, float]:
@@ -257,7 +274,10 @@ def _matrix(rows: object, where: str) -> np.ndarray:
 def _points(folder: Path, content: dict) -> tuple[np.ndarray, np.ndarray]:
     """(P, 3) points of `ply_file_path` in the original frame, (P, 3) colors; none without such a file."""
     original, scale = _original_from_saved(content, folder)
-    file = folder / str(content.get("ply_file_path") or "")
+    file = folder / plain_name(str(content.get("ply_file_path") or ""))
+    if not file.resolve().is_relative_to(folder.resolve()):
+        logger.warning("%s: ply_file_path leads out of the project, it is not read: %r", folder, str(file))
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not file.is_file():
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     cloud = read_cloud(file)

@@ -30,6 +30,7 @@ logger = logging.getLogger(__name__)
 EXPECTED = "a folder with reconstruction.json, or with opensfm/reconstruction.json (ODM), is expected"
 FILE, TOPOCENTRIC = "reconstruction.json", "reconstruction.topocentric.json"
 NO_GPS = 999999.0  # gps_dop of a photo without GPS
+NEAR_ZERO = 1e-6  # degrees, a decimeter
 # projection types: names of the radial coefficients, and whether p1, p2 and a principal point belong to them
 PERSPECTIVE = {
     "perspective": ("k1", "k2"),
@@ -253,7 +254,7 @@ def _observations(
     if not file.is_file():
         return None
     seen: dict[str, tuple[list[int], list[tuple[float, float]]]] = {view.name: ([], []) for view in views}
-    with file.open(encoding="utf-8", errors="replace") as lines:
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
         for line in lines:
             words = line.rstrip("\n").split("\t")
             if len(words) >= 8 and words[1] in rows and words[0] in seen:
@@ -288,7 +289,7 @@ def _has_gps(part: dict) -> bool:
     then zero and their dilution of precision NO_GPS. A flight at 0 N 0 E with GPS is one in the Gulf of Guinea.
     """
     reference = part["reference_lla"]
-    if reference.get("latitude") or reference.get("longitude"):
+    if any(abs(float(reference.get(key) or 0.0)) > NEAR_ZERO for key in ("latitude", "longitude")):
         return True
     return any(
         any(shot.get("gps_position") or []) and float(shot.get("gps_dop") or 0.0) < NO_GPS

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-import unicodedata
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -12,28 +11,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.importers.project import Project
 from sc3d.io.images import find_photos, image_size
-
-
-class PhotoFinder:
-    """The photos of a folder by the names that projects give them: with more or less of their path, with
-    other separators, without suffix, in other case or Unicode form; what fits more exactly counts first.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._known: dict[str, Path] = {}
-        files = [file.relative_to(folder) for file in find_photos(folder)]
-        for plain in (_same_letters, str):
-            for key in (lambda file: file.stem, lambda file: file.name, str):  # the exact path counts most
-                self._known |= {plain(key(file)): file for file in files}
-
-    def find(self, name: str) -> Path | None:
-        """Path of a photo in the folder; None if it is not there."""
-        path = PurePosixPath(plain_name(name))
-        parts = [str(PurePosixPath(*path.parts[start:])) for start in range(len(path.parts))]
-        keys = [*parts, path.stem, path.name]
-        return next(
-            (self._known[key] for key in [*keys, *map(_same_letters, keys)] if key in self._known), None
-        )
+from sc3d.scene.photo_names import PhotoNames, photo_name, shared_folders
 
 
 def plain_name(name: str) -> str:
@@ -73,35 +51,69 @@ def locate_photos(project: Project, images: Path | None) -> tuple[Project, Path 
         project = project.without(outside, "with a path that leads out of the project")
     if folder is None:
         return _named_as_meant(project), None
-    finder, count = PhotoFinder(folder), len(project.views)
-    found = [finder.find(view.name) for view in project.views]
-    missing = [row for row, file in enumerate(found) if file is None]
-    if len(missing) == count:
-        raise InputError(
-            f"none of the {count} photos of the project is in {folder}, such as {project.views[0].name}: pass their folder with --images"
-        )
-    project = project.without(missing, f"not in {folder}")
-    files = [str(file) for file in found if file is not None]
-    doubtful = _sharing(project, folder, files)
-    project = project.without(doubtful, "that share a photo with another camera")
-    files = [file for row, file in enumerate(files) if row not in doubtful]
-    views = [replace(view, name=file) for view, file in zip(project.views, files)]
+    names = names_in(folder)
+    found = [names.match(plain_name(view.name), changed=False) for view in project.views]
+    _require_clear(project, folder, found)
+    project, found = _without(project, found, [not photos for photos in found], f"not in {folder}")
+    unclear = [len(photos) > 1 for photos in found]
+    project, found = _without(project, found, unclear, "that may be any of several photos of their name")
+    doubtful = _sharing(project, folder, [photos[0] for photos in found])
+    shared = [row in doubtful for row in range(len(found))]
+    project, found = _without(project, found, shared, "that share a photo with another camera")
+    views = [replace(view, name=photos[0]) for view, photos in zip(project.views, found)]
     for view in views:
         _check_shape(view, image_size(folder / view.name), folder)
     return replace(project, views=views), folder
 
 
+def names_in(folder: Path) -> PhotoNames:
+    """The photos of a folder and its subfolders."""
+    return PhotoNames(photo_name(photo, folder) for photo in find_photos(folder))
+
+
+def _require_clear(project: Project, folder: Path, found: list[tuple[str, ...]]) -> None:
+    """InputError if no view means one photo alone; found: the photos that each view may mean."""
+    if any(len(photos) == 1 for photos in found):
+        return
+    names = [view.name for view in project.views]
+    unclear = [(name, photos) for name, photos in zip(names, found) if photos]
+    if not unclear:
+        raise InputError(
+            f"none of the {len(names)} photos of the project is in {folder}, such as {names[0]}: pass their folder with --images"
+        )
+    name, photos = unclear[0]
+    raise InputError(
+        f"{len(unclear)} of {len(names)} photos of the project may be any of several in {folder}, such as {name!r}: {' or '.join(photos)}; "
+        "give them names with the folder in the program that wrote the project, or pass the folder of its photos alone with --images"
+    )
+
+
+def _without(
+    project: Project, found: list[tuple[str, ...]], out: list[bool], reason: str
+) -> tuple[Project, list[tuple[str, ...]]]:
+    """The project and the photos of its views without those that are out."""
+    rows = {row for row, is_out in enumerate(out) if is_out}
+    return project.without(rows, reason), [photos for row, photos in enumerate(found) if row not in rows]
+
+
 def _sharing(project: Project, folder: Path, files: list[str]) -> set[int]:
-    """Rows of the views whose photo (of `files`) another view has too, and better or as well."""
-    exact = [
-        file if file == plain_name(view.name) or str(folder.absolute() / file) == full else None
+    """Rows of the views whose photo (of `files`) another view has too, and better or as well: the whole path counts
+    most, then the folders in common.
+    """
+    ranks = [
+        (
+            file == plain_name(view.name) or str(folder.absolute() / file) == full,
+            shared_folders(plain_name(view.name), file),
+        )
         for view, file, full in zip(project.views, files, _full_names(project))
     ]
-    claims, exact_claims = Counter(files), Counter(exact)
+    claims: dict[str, list[tuple[bool, int]]] = defaultdict(list)
+    for file, rank in zip(files, ranks):
+        claims[file].append(rank)
     return {
         row
-        for row, file in enumerate(files)
-        if claims[file] > 1 and not (exact[row] == file and exact_claims[file] == 1)
+        for row, (file, rank) in enumerate(zip(files, ranks))
+        if rank != max(claims[file]) or claims[file].count(rank) > 1
     }
 
 
@@ -117,7 +129,15 @@ def _named_as_meant(project: Project) -> Project:
         path.is_absolute() or ".." in path.parts or PureWindowsPath(path).is_absolute() for path in paths
     ]
     names = [path.name if away else str(path) for path, away in zip(paths, elsewhere)]
-    return replace(project, views=[replace(view, name=name) for view, name in zip(project.views, names)])
+    counts = Counter(names)
+    shared = [row for row, name in enumerate(names) if counts[name] > 1]
+    if len(shared) == len(names):
+        raise InputError(
+            f"all {len(names)} photos of the project share their names with others, such as {names[0]!r}, and nothing tells them apart: "
+            "give them names with the folder (100MEDIA/DJI_0001.JPG) in the program that wrote the project"
+        )
+    views = [replace(view, name=name) for view, name in zip(project.views, names)]
+    return replace(project, views=views).without(shared, "that share their names with others")
 
 
 def _full_names(project: Project) -> list[str]:
@@ -136,10 +156,6 @@ def _inside(project: Project) -> list[str]:
 
 def _common_folder(names: list[str]) -> Path:
     return Path(os.path.commonpath([os.path.dirname(name) for name in names]))
-
-
-def _same_letters(name: str) -> str:
-    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _check_shape(view: View, size: tuple[int, int], folder: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, Lenses
 from sc3d.georeferencing.georeference import Georeference, triple
+from sc3d.importers.frames import LARGE, near_origin
 from sc3d.importers.project import Project, require_found, rigid, some_names
 from sc3d.settings.reconstruction import Import
 
@@ -57,7 +59,16 @@ def read(path: Path, settings: Import) -> Project:
         where = f"{file}, {name}"
         views.append(View(name, lenses.camera(distortion, where), rigid(rotation, center, where)))
     lenses.warn(file)
-    return Project("pix4d", views, georeference=_georeference(file), notes={"read": file.name})
+    georeference = _georeference(file)
+    project = Project("pix4d", views, georeference=georeference, notes={"read": file.name})
+    if georeference is None or _place_files(file)[1].is_file():
+        return project
+    if all(np.abs(view.center).max() < LARGE for view in views):
+        logger.warning(
+            "%s is missing, and the positions are not those of a CRS: the place stays unknown",
+            _place_files(file)[1],
+        )
+    return near_origin(replace(project, georeference=None), georeference.epsg)
 
 
 def _files(path: Path) -> list[Path]:

@@ -59,7 +59,8 @@ class Project:
         """The project without the views of some rows; `model` goes if there are any, as it holds them."""
         if not rows:
             return self
-        kept = [row for row in range(len(self.views)) if row not in set(rows)]
+        out = set(rows)
+        kept = [row for row in range(len(self.views)) if row not in out]
         names = [self.views[row].name for row in sorted(rows)]
         return replace(
             self,
@@ -95,7 +96,8 @@ def _told(project: Project) -> str:
 
 def some_names(names: Sequence[str]) -> str:
     """The first names of a list, for messages."""
-    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    first = [name if name.isprintable() else repr(name) for name in names[:3]]
+    return ", ".join(first) + (", ..." if len(names) > 3 else "")
 
 
 def read_project(path: Path, settings: Import) -> Project:

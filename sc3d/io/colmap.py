@@ -12,12 +12,13 @@ Layout: https://colmap.github.io/format.html; rigs.bin and frames.bin as COLMAP 
 from __future__ import annotations
 
 import codecs
+import logging
 import mmap
 import shutil
 import struct
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Protocol
@@ -28,6 +29,8 @@ import pycolmap
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
 from sc3d.io.limits import FARTHEST, MAX_PIXELS, MAX_SIDE, DamagedFileError
+
+logger = logging.getLogger(__name__)
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")  # rigs and frames only in newer models
 LARGEST = 1 << 62  # count of a list: bounded by the size of the file alone
@@ -46,8 +49,9 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
     poses that are none.
     """
     if not is_model(folder):
+        above = f" (one is in {folder.parent}: move its files there)" if is_model(folder.parent) else ""
         raise InputError(
-            f"no cameras in {folder}: run `sc3d reconstruct PHOTOS SCENE`, or put a COLMAP model there"
+            f"no cameras in {folder}: run `sc3d reconstruct PHOTOS SCENE`, or put a COLMAP model there{above}"
         )
     check_counts(folder)
     try:
@@ -59,7 +63,10 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
             for image in images:
                 image.name = full_names[image.image_id]
         names = [image.name for image in images]
+        _check_rigs(model, folder)
         poses = [image.cam_from_world() for image in images]
+    except InputError:
+        raise
     # pycolmap raises bare RuntimeError, ValueError, IndexError, MemoryError and UnicodeDecodeError for broken
     # files
     except Exception as error:
@@ -91,9 +98,27 @@ def photo_names(folder: Path) -> list[str]:
     return names
 
 
+def warn_of_larger(folder: Path) -> None:
+    """Say if a model beside this one, as COLMAP numbers them, has more photos."""
+    others = [other for other in sorted(folder.parent.glob("[0-9]*")) if other != folder and is_model(other)]
+    if not others:
+        return
+    with suppress(InputError):  # one that is damaged is in nobody's way
+        count, counts = len(photo_names(folder)), [len(photo_names(other)) for other in others]
+        if max(counts) > count:
+            logger.warning(
+                "%s has %d photos, but the model beside it in %s has %d: take that one, if it is meant",
+                folder,
+                count,
+                others[counts.index(max(counts))],
+                max(counts),
+            )
+
+
 def _is_binary(folder: Path) -> bool:
-    """As pycolmap decides it."""
-    return all((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D"))
+    """As pycolmap decides it, which asks for points, too."""
+    cameras = all((folder / f"{name}.bin").exists() for name in ("cameras", "images"))
+    return cameras and ((folder / "points3D.bin").exists() or not (folder / "points3D.txt").exists())
 
 
 def _text_names(folder: Path) -> dict[int, str]:
@@ -111,20 +136,23 @@ def _text_names(folder: Path) -> dict[int, str]:
 
 @contextmanager
 def _as_pycolmap_reads(folder: Path) -> Iterator[Path]:
-    """The folder itself, or for the time of the block a copy of a text model without what pycolmap does not
-    bear: byte order marks, and no file of points.
+    """The folder itself, or for the time of the block a copy without what pycolmap does not bear: byte order
+    marks in text, and no file of points.
     """
-    files = [folder / f"{name}.txt" for name in FILES]
-    marked = [file.is_file() and _starts_with_mark(file) for file in files]
-    if _is_binary(folder) or not (any(marked) or not files[-1].exists()):
+    is_binary = _is_binary(folder)
+    files = [folder / f"{name}.{'bin' if is_binary else 'txt'}" for name in FILES]
+    marked = not is_binary and any(file.is_file() and _starts_with_mark(file) for file in files)
+    if not files[FILES.index("images")].is_file():
+        raise InputError(f"the COLMAP model in {folder} has no file of photos (images.bin or images.txt)")
+    if not marked and files[-1].exists():
         yield folder
         return
     with tempfile.TemporaryDirectory(prefix="sc3d-colmap-") as name:
         copy = Path(name)
-        (copy / files[-1].name).touch()
+        (copy / files[-1].name).write_bytes(struct.pack("<Q", 0) if is_binary else b"")
         for file in filter(Path.is_file, files):
             with file.open("rb") as source, (copy / file.name).open("wb") as target:
-                source.seek(len(codecs.BOM_UTF8) if _starts_with_mark(file) else 0)
+                source.seek(len(codecs.BOM_UTF8) if marked and _starts_with_mark(file) else 0)
                 shutil.copyfileobj(source, target)
         yield copy
 
@@ -221,6 +249,16 @@ def write_model(path: Path, model: pycolmap.Reconstruction) -> None:
     with atomic_path(path) as temporary:
         temporary.mkdir()
         model.write_binary(str(temporary))
+
+
+def _check_rigs(model: pycolmap.Reconstruction, folder: Path) -> None:
+    for rig_id, rig in model.rigs.items():
+        unplaced = [sensor.id for sensor, pose in rig.non_ref_sensors.items() if pose is None]
+        if unplaced:
+            raise InputError(
+                f"{folder}: camera {unplaced[0]} of rig {rig_id} has no pose in the rig, so its photos have no position: "
+                "calibrate the rig (colmap rig_configurator, mapper) or take the model without it"
+            )
 
 
 def _check_camera(camera: pycolmap.Camera, folder: Path) -> None:

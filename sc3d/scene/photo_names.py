@@ -127,6 +127,14 @@ class PhotoNames:
         clear = (key for key in keys if self.match_file(f"{key}{suffix}") == (name,))
         return next((file for key in clear if (file := folder / f"{key}{suffix}").is_file()), None)
 
+    def same_letters(self, name: str) -> list[str]:
+        """Photos whose path differs from a name in letter case or Unicode form at most."""
+        return [
+            photo
+            for photo in self._tables[1].get(_fold(name).rpartition("/")[2], ())
+            if _fold(photo) == _fold(name)
+        ]
+
     def match_file(self, path: str, folder: Path | None = None, changed: bool = True) -> tuple[str, ...]:
         """Photos that a mask or another file of one photo may belong to.
 
@@ -170,7 +178,7 @@ class PhotoNames:
         for table, key in ((0, 0), (1, 1), (2, 2), (0, 2), (2, 0), (3, 3), (1, 3), (3, 1)):
             for name in self._tables[table].get(keys[key], ()):
                 if name not in ranks and not _contradicts(folders, name):
-                    ranks[name] = _shared_folders(folders, name), -max(table, key)
+                    ranks[name] = _shared(folders, name), -max(table, key)
         best = (
             name
             for name, rank in ranks.items()
@@ -195,7 +203,7 @@ class PhotoNames:
                 if not _contradicts(folders, name)
             }
             if found:
-                shared = {name: _shared_folders(folders, name) for name in found}
+                shared = {name: _shared(folders, name) for name in found}
                 return tuple(sorted(name for name in found if shared[name] == max(shared.values())))
             known |= names
             names = {shorter for name in names for shorter in _reductions(name)} - known
@@ -227,6 +235,11 @@ class PhotoNames:
     def choices(self, names: Iterable[str], suffix: str = ".png") -> str:
         """What an error says of a name that several photos have: those photos, and how a file of each is named."""
         return " or ".join(f"{name} (whose file is {self._keys[name]}{suffix})" for name in names)
+
+
+def shared_folders(foreign: str, name: str) -> int:
+    """Folders directly above a foreign path and a photo that are named alike."""
+    return _shared(_normal(foreign).split("/")[:-1], name)
 
 
 def files_of_photos(folder: Path, names: PhotoNames, suffixes: Iterable[str]) -> list[Path]:
@@ -289,7 +302,7 @@ def _contradicts(folders: list[str], name: str) -> bool:
     )
 
 
-def _shared_folders(folders: list[str], name: str) -> int:
+def _shared(folders: list[str], name: str) -> int:
     """Folders directly above the two that are named alike."""
     shared = 0
     for one, other in zip(reversed(folders), reversed(name.split("/")[:-1])):

@@ -150,8 +150,9 @@ class Scene:
         return read_sparse_model(self.sparse)
 
     def photo(self, name: str) -> Path:
-        """Path of the photo that a view is named after."""
-        return self.images / name
+        """Path of the photo that a view is named after; its file may be spelled otherwise (see `_spellings`)."""
+        path = self.images / name
+        return path if path.exists() else self.images / self._spellings.get(name, name)
 
     def read_photo(self, name: str) -> np.ndarray:
         """(H, W, 3) uint8 RGB pixels of a photo as stored."""
@@ -200,11 +201,27 @@ class Scene:
     @cached_property
     def photo_names(self) -> PhotoNames:
         """All photos: those in `images/`, and those that cameras are named after."""
+        spelled = set(self._spellings.values())
+        return PhotoNames([name for name in self._listed if name not in spelled] + self._named)
+
+    @cached_property
+    def _listed(self) -> list[str]:
         photos = list_photos(self.images) if self.images.is_dir() else []
-        views = self.model.views if self.sparse.is_dir() else []
-        return PhotoNames(
-            [photo_name(photo, self.images) for photo in photos] + [view.name for view in views]
-        )
+        return [photo_name(photo, self.images) for photo in photos]
+
+    @cached_property
+    def _named(self) -> list[str]:
+        return [view.name for view in self.model.views] if self.sparse.is_dir() else []
+
+    @cached_property
+    def _spellings(self) -> dict[str, str]:
+        """Photos in `images/` by the names of views that differ from theirs in letter case or Unicode form, which
+        Windows and macOS do not tell apart.
+        """
+        others = PhotoNames(set(self._listed) - set(self._named))
+        missing = set(self._named) - set(self._listed)
+        found = {name: others.same_letters(name) for name in missing}
+        return {name: photos[0] for name, photos in found.items() if len(photos) == 1}
 
     def mask_files(self, folder: Path, class_table: ClassTable | None = None) -> dict[str, Path]:
         """Masks (or truth masks, or confidence maps) of the views, by view name; all checked. Those of photos
@@ -267,6 +284,7 @@ def read_sparse_model(path: Path) -> SparseModel:
     from sc3d.geometry.cameras import View
     from sc3d.io import colmap
 
+    colmap.warn_of_larger(path)
     model = colmap.load_model(path)
     cameras = colmap.copy_cameras(model)
     point_ids, xyz, colors = colmap.point_arrays(model)
