@@ -43,7 +43,7 @@ _DATE = re.compile(r"(?:19|20)\d\d[01]\d[0-3]\d\d*")
 _WORD_BEHIND = re.compile(rf"(.+)[-_. ](?:{_WORD})", re.IGNORECASE)
 _WORD_BEFORE = re.compile(r"(?:mask|label|gt|seg)[-_. ](.+)", re.IGNORECASE)
 _CAMVID = re.compile(r"(.+)_L")
-_HASH_BEHIND = re.compile(rf"(.+)[-_.]({_HASH})", re.IGNORECASE)
+_HASH_BEHIND = re.compile(rf"(.+?)[-_.]({_HASH})", re.IGNORECASE)
 _HASH_BEFORE = re.compile(rf"({_HASH})[-_](.+)", re.IGNORECASE)  # Label Studio: 8 digits and a dash
 _ROBOFLOW = re.compile(r"(.+)\.rf\.\w+")
 _ROBOFLOW_SUFFIX = re.compile(r"(.+)_(?:jpe?g|png|tiff?|webp|bmp)", re.IGNORECASE)
@@ -179,6 +179,12 @@ class PhotoNames:
             for name in self._tables[table].get(keys[key], ()):
                 if name not in ranks and not _contradicts(folders, name):
                     ranks[name] = _shared(folders, name), -max(table, key)
+        most = max((shared for shared, _ in ranks.values()), default=0)
+        ranks = {  # those in another folder, if one is in the same
+            name: rank
+            for name, rank in ranks.items()
+            if rank[0] == most or rank[0] == min(len(folders), name.count("/"))
+        }
         best = (
             name
             for name, rank in ranks.items()
@@ -244,8 +250,8 @@ def shared_folders(foreign: str, name: str) -> int:
 
 def files_of_photos(folder: Path, names: PhotoNames, suffixes: Iterable[str]) -> list[Path]:
     """Files of a folder that may belong to photos, by path: those in it, and those in folders below that are
-    named like folders of the photos (others hold something else). With a pattern, those at any depth that fit
-    it.
+    named like folders of the photos, or as cameras name folders (others hold something else). With a pattern, those
+    at any depth that fit it.
     """
     allowed, wanted = {""}, set(suffixes)
     for name in names.names:
@@ -256,7 +262,7 @@ def files_of_photos(folder: Path, names: PhotoNames, suffixes: Iterable[str]) ->
         parts = [_fold(part) for part in Path(place).relative_to(folder).parts]
         deeper = names.pattern is not None or len(parts) < depth
         folders[:] = sorted(below for below in folders if deeper and not below.startswith("."))
-        if names.pattern is not None or "/".join(parts) in allowed:
+        if names.pattern is not None or "/".join(parts) in allowed or _is_camera_folder(parts):
             found += [
                 Path(place, file)
                 for file in files
@@ -292,14 +298,14 @@ def _reductions(name: str) -> set[str]:
     return found - {name}
 
 
+def _is_camera_folder(folders: list[str]) -> bool:
+    return bool(folders) and _CAMERA_FOLDER.fullmatch(folders[-1]) is not None
+
+
 def _contradicts(folders: list[str], name: str) -> bool:
     """Whether a camera put the two into different folders, where it counts photos anew."""
     own = name.split("/")[:-1]
-    return bool(folders and own) and (
-        _CAMERA_FOLDER.fullmatch(folders[-1]) is not None
-        and _CAMERA_FOLDER.fullmatch(own[-1]) is not None
-        and _fold(folders[-1]) != _fold(own[-1])
-    )
+    return _is_camera_folder(folders) and _is_camera_folder(own) and _fold(folders[-1]) != _fold(own[-1])
 
 
 def _shared(folders: list[str], name: str) -> int:

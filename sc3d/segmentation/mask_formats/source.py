@@ -56,7 +56,10 @@ def read_masks(
     folder = source.path if source.path.is_dir() else source.path.parent
     checks = Checks(photo_sizes, read_mapping(source.mapping, class_table), names, folder)
     masks: dict[str, CheckedMask] = {}
-    for file in _files(source.path, kind, names):
+    files = _files(source.path, kind, names)
+    if kind in ("index", "color"):
+        _tell_of_other_folders(source.path, files)
+    for file in files:
         try:
             for name, mask in _read(file, kind, checks):
                 if name in masks:
@@ -132,8 +135,24 @@ def _find(path: Path, suffixes: tuple[str, ...], names: PhotoNames) -> list[Path
         return [path] if path.is_file() and path.suffix.lower() in suffixes else []
     if suffixes == (".png",):
         return files_of_photos(path, names, suffixes)
+    return _all_files(path, suffixes)
+
+
+def _all_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     return sorted(
         file
-        for file in path.rglob("*")
+        for file in folder.rglob("*")
         if file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file()
     )
+
+
+def _tell_of_other_folders(path: Path, files: list[Path]) -> None:
+    """Count the PNGs that were not looked at."""
+    others = sorted(set(_all_files(path, (".png",))) - set(files))
+    if others:
+        logger.warning(
+            "%s: %d PNG files in folders that are not named like those of the photos are left out, such as %s",
+            path,
+            len(others),
+            others[0].relative_to(path),
+        )
