@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import find_photos, image_size, read_image
+from sc3d.io.images import find_photos, read_image
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.provenance import digest
 from sc3d.scene.photo_names import PhotoNames, photo_name
 from sc3d.scene.scene import Scene
 from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, shrink
-from sc3d.segmentation.strokes.files import BACKGROUND, parse_shapes
+from sc3d.segmentation.strokes.files import BACKGROUND, read_shapes, shown_size
 
 DISPLAY_SIZE = 4096  # px, longest side of the photo in the browser
 TRIAL_SIZE = 2048  # px, longest side of the mask that is tried out
@@ -47,7 +47,7 @@ class Session:
         photos = find_photos(scene.images)
         self._names = PhotoNames(photo_name(photo, scene.images) for photo in photos)
         self.photos = dict(zip(map(self._names.key, self._names.names), photos, strict=True))
-        self.sizes = {key: image_size(photo) for key, photo in self.photos.items()}
+        self.sizes = {key: shown_size(photo) for key, photo in self.photos.items()}
         self._start = next(iter(self.photos)) if start is None else self._find(start)
         self._trying, self._writing = threading.Lock(), threading.Lock()
         self._learned: tuple[str, Strokes] | None = None
@@ -129,7 +129,7 @@ class Session:
     def _plain(self, content: object, origin: Path | str, key: str) -> list[dict[str, object]]:
         """The shapes of a LabelMe file, checked, in px of the photo."""
         names = {entry.id: entry.name for entry in self.class_table} | {0: BACKGROUND}
-        shapes = parse_shapes(content, origin, self.sizes[key], self.class_table)
+        shapes = read_shapes(content, origin, self.photos[key], self.class_table)
         return [
             {"label": names[shape.label], "shape_type": shape.kind, "points": shape.points.tolist()}
             | ({"width": shape.width} if shape.width else {})
@@ -137,9 +137,7 @@ class Session:
         ]
 
     def photo(self, key: str) -> bytes:
-        """The photo as JPEG, as it is stored: LabelMe and browsers would turn it by its EXIF orientation, the
-        cameras do not.
-        """
+        """The photo as JPEG, as shown: turned by its EXIF orientation, as in LabelMe; strokes lie in this frame."""
         return self._jpeg(key)
 
     def try_out(self, key: str) -> bytes:
@@ -159,7 +157,7 @@ class Session:
                     state,
                     Strokes.fit(self._scene.strokes, self._scene.images, self.class_table, self._settings),
                 )
-            labels = self._learned[1].segment(shrink(read_image(photo), TRIAL_SIZE)).labels
+            labels = self._learned[1].segment(shrink(self._pixels(photo), TRIAL_SIZE)).labels
         finally:
             self._trying.release()
         return _png(
@@ -168,8 +166,11 @@ class Session:
             )
         )
 
+    def _pixels(self, photo: Path) -> np.ndarray:
+        return read_image(photo, self._scene.images, shown=True)
+
     def _encode(self, key: str) -> bytes:
-        shown = np.ascontiguousarray(shrink(read_image(self.photos[key]), DISPLAY_SIZE)[..., ::-1])
+        shown = np.ascontiguousarray(shrink(self._pixels(self.photos[key]), DISPLAY_SIZE)[..., ::-1])
         return cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
 

@@ -67,6 +67,6 @@ def check(command: Run, segment: Segment) -> None:
                 "--masks PATH is needed (or --segment.backend strokes, grounded-sam or sam3, which make masks)"
             )
         source = mask_source(segment, masks) if segment.masks else MaskFiles(masks, "index")
-        check_masks(source, sizes, class_table, segment.confidence)
+        check_masks(source, sizes, class_table, segment.confidence, command.photos)
     if command.truth is not None:
-        match_masks(command.truth, sizes, class_table)
+        match_masks(command.truth, sizes, class_table, photos=command.photos)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sc3d.errors import InputError
-from sc3d.io.images import IMAGE_SUFFIXES, read_image, write_image
+from sc3d.io.images import IMAGE_SUFFIXES, write_image
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import ViewCommand
 
@@ -94,7 +94,7 @@ def _picture(command: ViewCommand, scene: Scene, views: list[View], photo: View 
     style = Style(by=command.by, from_above=command.from_above, cameras=drawn)
     if command.splats:
         splats = splats_colored_by(scene, command.by, command.classes)
-        pixels = None if photo is None else read_image(scene.photo(photo.name))
+        pixels = None if photo is None else scene.read_photo(photo.name)
         return screenshot_splats(splats, photo, pixels, command.size, style)
     table = scene.class_table() if scene.classes.exists() else None
     cloud = load_cloud(scene, command.file, votes=command.by == "disagreement")

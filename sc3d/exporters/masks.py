@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
-from sc3d.io.images import read_image, read_index_image, write_image
+from sc3d.io.images import read_orientation, write_image
 from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
@@ -37,8 +37,9 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
         confidence_folder.mkdir()
         for view in tqdm(views, desc="rendering masks", unit="photo", disable=None):
             mask, confidence = render_mask(surface, labels.confidence, view, settings.max_size)
-            write_image(scene.photo_names.path(mask_folder, view.name), mask)
-            write_image(scene.photo_names.path(confidence_folder, view.name), confidence)
+            orientation = read_orientation(scene.photo(view.name))
+            write_image(scene.photo_names.path(mask_folder, view.name), mask, orientation)
+            write_image(scene.photo_names.path(confidence_folder, view.name), confidence, orientation)
             covered.append(float((mask > 0).mean()))
     write_image(sheet, _comparison(scene, views))
     return {"photos": len(views), "labelled_pixels": f"{np.mean(covered):.1%}"}
@@ -56,13 +57,11 @@ def _comparison(scene: Scene, views: list[View]) -> np.ndarray:
         size = PANEL, round(PANEL * view.height / view.width)
         pictures, captions = [], []
         if scene.photo(view.name).exists():
-            pictures.append(
-                cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA)
-            )
+            pictures.append(cv2.resize(scene.read_photo(view.name), size, interpolation=cv2.INTER_AREA))
             captions.append(view.name)
         for folder, caption in ((scene.masks, "mask in"), (scene.export / "masks", "mask back")):
             file = scene.mask_file(folder, view.name)
-            mask = np.zeros((1, 1), np.uint8) if file is None else read_index_image(file)
+            mask = np.zeros((1, 1), np.uint8) if file is None else scene.read_mask(file, view.name)
             pictures.append(palette[cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)])
             captions.append(caption)
         rows.append(side_by_side(pictures, captions))

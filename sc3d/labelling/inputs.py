@@ -13,7 +13,6 @@ import open3d as o3d
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.io.clouds import read_cloud
-from sc3d.io.images import image_size, read_index_image
 from sc3d.labelling.density import GaussianField, gaussian_density, kernel_density
 from sc3d.labelling.observation import Mask
 from sc3d.scene.labelled_cloud import spacing_of
@@ -32,6 +31,7 @@ class Masks:
     files: dict[str, Path]
     confidences: dict[str, Path]
     views: list[View]
+    scene: Scene
 
     @classmethod
     def load(cls, scene: Scene, confidence: Path | None) -> Masks:
@@ -46,15 +46,19 @@ class Masks:
         files = scene.mask_files(scene.masks, scene.class_table())
         confidences = scene.mask_files(confidence) if confidence is not None and confidence.is_dir() else {}
         for name, path in confidences.items():
-            if name in files and image_size(path) != image_size(files[name]):
+            if name in files and scene.mask_size(path, name) != scene.mask_size(files[name], name):
                 raise InputError(f"{path} has another size than its mask: both must be the same")
-        return cls(files, confidences, [view for view in scene.model.views if view.name in files])
+        return cls(files, confidences, [view for view in scene.model.views if view.name in files], scene)
 
     def read(self, view: View) -> Mask:
         """As `fuse` wants it."""
         confidence = self.confidences.get(view.name)
-        sure = None if confidence is None else read_index_image(confidence)
-        return read_index_image(self.files[view.name]), sure
+        sure = None if confidence is None else self.scene.read_confidence(confidence, view.name)
+        return self.scene.read_mask(self.files[view.name], view.name), sure
+
+    def size(self, view: View) -> tuple[int, int]:
+        """(width, height) px of the mask of a view."""
+        return self.scene.mask_size(self.files[view.name], view.name)
 
 
 def best_confidence(scene: Scene) -> Path:
@@ -85,7 +89,7 @@ def voxel_size_for(spacing: float, sample: np.ndarray, masks: Masks) -> float:
     """
     footprints = []
     for view in masks.views:
-        focal = view.focal * image_size(masks.files[view.name])[0] / view.width
+        focal = view.focal * masks.size(view)[0] / view.width
         footprints.append(np.median(np.linalg.norm(sample - view.center, axis=1)) / focal)
     return max(2 * spacing, 1.5 * float(np.median(footprints)))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View
-from sc3d.io.images import data_uri, read_image, read_index_image
+from sc3d.io.images import data_uri
 from sc3d.report.data import ReportData
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.view.colors import COLORINGS, color_points
@@ -68,7 +68,7 @@ def comparison(data: ReportData, view: View, labelled: LabelledSurface | None) -
         panels.append(
             (
                 "photo",
-                data_uri(cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA)),
+                data_uri(cv2.resize(scene.read_photo(view.name), size, interpolation=cv2.INTER_AREA)),
             )
         )
     if data.class_table is None:
@@ -82,7 +82,7 @@ def comparison(data: ReportData, view: View, labelled: LabelledSurface | None) -
         if caption == "fused labels" and labelled is not None:
             labels, _ = labelled.see(view, size)
         elif file is not None:
-            labels = cv2.resize(read_index_image(file), size, interpolation=cv2.INTER_NEAREST)
+            labels = cv2.resize(scene.read_mask(file, view.name), size, interpolation=cv2.INTER_NEAREST)
         else:
             continue
         panels.append((caption, data_uri(palette[labels], ".png")))

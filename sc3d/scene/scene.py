@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,13 +15,22 @@ from sc3d.io.images import (
     check_photo,
     find_photos,
     image_size,
+    index_image_size,
     list_photos,
-    read_index_image,
+    mask_orientation,
+    read_image,
+    read_opaque,
     require_within,
+    turned_onto,
 )
 from sc3d.io.limits import FARTHEST, MAX_MASK_PIXELS
+from sc3d.io.orientation import turned_size
 from sc3d.scene.class_table import CONTROL, ClassTable, read_classes
+from sc3d.scene.mask_values import Meanings, meanings_of, read_confidence, read_labels
 from sc3d.scene.photo_names import PhotoNames, files_of_photos, photo_name
+
+if TYPE_CHECKING:
+    from sc3d.geometry.cameras import View
 
 logger = logging.getLogger(__name__)
 
@@ -140,6 +150,50 @@ class Scene:
         path = self.images / name
         return path if path.exists() else self.images / self._spellings.get(name, name)
 
+    def read_photo(self, name: str) -> np.ndarray:
+        """(H, W, 3) uint8 RGB pixels of a photo as stored."""
+        return read_image(self.photo(name), self.images)
+
+    def read_mask(self, file: Path, name: str) -> np.ndarray:
+        """(H, W) uint8 class ids of a mask or truth mask of a photo, in the photo's frame as stored, 0 where the
+        photo is transparent.
+        """
+        return self._onto_photo(read_labels(file, self._meanings), file, name)
+
+    def read_confidence(self, file: Path, name: str) -> np.ndarray:
+        """(H, W) uint8 of a confidence map, as `read_mask`."""
+        return self._onto_photo(read_confidence(file), file, name)
+
+    @cached_property
+    def _meanings(self) -> Meanings:
+        return meanings_of(self.class_table())
+
+    def _onto_photo(self, pixels: np.ndarray, file: Path, name: str) -> np.ndarray:
+        mask, opaque = turned_onto(pixels, file, self.photo(name)), self._opaque(name)
+        if opaque is None:
+            return mask
+        rows, columns = (
+            (np.arange(size) * whole) // size for size, whole in zip(mask.shape, opaque.shape, strict=True)
+        )
+        return np.where(opaque[np.ix_(rows, columns)], mask, 0).astype(np.uint8)
+
+    def mask_size(self, file: Path, name: str) -> tuple[int, int]:
+        """(width, height) of what `read_mask` gives, from the header."""
+        return index_image_size(file, self.photo(name))
+
+    def opaque_pixels(self, view: View, target: View) -> np.ndarray | None:
+        """(H, W) bool pixels of `target`, a view of the same pose, that lie in the photo of `view` and are opaque
+        there; None if the photo has no transparent pixels.
+        """
+        from sc3d.geometry.cameras import resample
+
+        opaque = self._opaque(view.name)
+        return None if opaque is None else resample(opaque.astype(np.uint8), view, target, labels=True) > 0
+
+    def _opaque(self, name: str) -> np.ndarray | None:
+        photo = self.photo(name)
+        return read_opaque(photo) if photo.is_file() else None
+
     @cached_property
     def photo_names(self) -> PhotoNames:
         """All photos: those in `images/`, and those that cameras are named after."""
@@ -173,7 +227,7 @@ class Scene:
         aspect than the photo, or ids outside the class table.
         """
         sizes = {view.name: (view.width, view.height) for view in self.model.views}
-        return match_masks(folder, sizes, class_table, self.photo_names)
+        return match_masks(folder, sizes, class_table, self.photo_names, self.images)
 
     def mask_file(self, folder: Path, name: str) -> Path | None:
         """The mask of one photo in a folder, not looked into; None if there is none."""
@@ -278,10 +332,11 @@ def match_masks(
     photo_sizes: dict[str, tuple[int, int]],
     class_table: ClassTable | None,
     names: PhotoNames | None = None,
+    photos: Path | None = None,
 ) -> dict[str, Path]:
     """Match the files of a folder of masks to photos and check them.
 
-    photo_sizes: (width, height) px by photo name
+    photo_sizes: (width, height) px as stored by photo name; photos: their folder, for their EXIF orientation
     names: all photos, of which those without a size are not checked and not returned; None = no others
     returns: path of the mask by photo name, for photos that have one
     """
@@ -293,16 +348,37 @@ def match_masks(
         raise InputError(
             f"none of the {len(found)} masks in {folder} is of a photo with a camera: the model has {len(photo_sizes)}, such as {next(iter(photo_sizes), 'none')}"
         )
+    meanings, turns = None if class_table is None else meanings_of(class_table), list[str]()
     for name, file in matched.items():
         require_within(file, folder)
-        check_mask_aspect(file, image_size(file), photo_sizes[name])
-        if class_table is not None:
-            unknown = class_table.unknown(read_index_image(file))
+        turn, assumed = mask_orientation(file, None if photos is None else photos / name)
+        if assumed:
+            turns.append(name)
+        check_mask_aspect(file, turned_size(image_size(file), turn), photo_sizes[name])
+        if class_table is not None and meanings is not None:
+            unknown = class_table.unknown(read_labels(file, meanings))
             if unknown:
                 raise InputError(
                     f"{file} has class id {unknown[0]}, which is not in the class table (ids {[entry.id for entry in class_table]})"
                 )
+    if class_table is not None:
+        tell_of_turned(folder, len(turns), *turns[:1])
     return matched
+
+
+@cache  # tiles look at the same masks again and again
+def tell_of_turned(source: Path, count: int, example: str = "") -> None:
+    """Warn of masks that lie as their photos are shown by a rule alone (`sc3d.io.orientation`), and name one of the
+    photos.
+    """
+    if count:
+        logger.warning(
+            "%s: %d masks (such as that of %s) are of photos that EXIF turns, and are read as drawn on the photo as it is shown; "
+            "if they lie on the pixels as stored, give them the EXIF orientation of their photo",
+            source,
+            count,
+            example,
+        )
 
 
 def check_mask_aspect(file: Path | str, mask_size: tuple[int, int], photo_size: tuple[int, int]) -> None:

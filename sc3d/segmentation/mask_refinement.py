@@ -15,7 +15,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.io.atomic import atomic_path, discard
-from sc3d.io.images import write_image
+from sc3d.io.images import read_orientation, write_image
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.fusion import fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size, read_given_cloud
@@ -134,7 +134,9 @@ def refine_scene(scene: Scene, settings: Segment) -> Refinement:
             folder.mkdir()
             for view in tqdm(masks.views, desc="writing confidence", unit="photo", disable=None):
                 file = scene.photo_names.path(folder, view.name)
-                write_image(file, refinement.confidence(view, masks.read))
+                write_image(
+                    file, refinement.confidence(view, masks.read), read_orientation(scene.photo(view.name))
+                )
     else:
         discard(scene.confidence_refined)
     return refinement

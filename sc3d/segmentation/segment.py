@@ -13,8 +13,17 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from sc3d.io.atomic import discard, remove_leftovers
-from sc3d.io.images import find_photos, image_size, read_image, write_image
+from sc3d.io.images import (
+    find_photos,
+    image_size,
+    index_image_size,
+    read_image,
+    read_opaque,
+    read_orientation,
+    write_image,
+)
 from sc3d.io.json_files import read_json, write_json
+from sc3d.io.orientation import inverse, turned
 from sc3d.io.provenance import digest
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.photo_names import PhotoNames, photo_name
@@ -39,7 +48,7 @@ class Segmenter(Protocol):
     """What a backend offers."""
 
     def segment(self, image: np.ndarray) -> Segmentation:
-        """Segment an (H, W, 3) uint8 RGB photo."""
+        """Segment an (H, W, 3) uint8 RGB photo as shown, the right way up."""
         ...
 
 
@@ -150,14 +159,21 @@ def segment_photos(
     todo = _check_photos(images, names, folders.masks, overwrite)
     pending, num_pixels, num_instances = set(todo), np.zeros(256, np.int64), 0
     for photo in tqdm(todo, desc="segment", unit="photo", disable=None):
-        image = read_image(images / photo)
+        image = read_image(images / photo, images, shown=True)
         result = Segmentation(*segmenter.segment(image))
         for array in (result.labels, result.confidence):
             if array.shape != image.shape[:2] or array.dtype != np.uint8:
                 raise ValueError(
                     f"the segmenter returned {array.shape} {array.dtype} for a photo of {image.shape[:2]}"
                 )
-        _write(photo, names, folders, result, class_table)
+        _write(
+            photo,
+            names,
+            folders,
+            _as_stored(images / photo, result),
+            read_orientation(images / photo),
+            class_table,
+        )
         num_pixels += np.bincount(result.labels.ravel(), minlength=256)
         num_instances += len(result.instances or ())
     return SegmentSummary(
@@ -168,17 +184,37 @@ def segment_photos(
     )
 
 
+def _as_stored(photo: Path, result: Segmentation) -> Segmentation:
+    """Labels and confidence turned from the photo as shown to that as stored, nothing where it is transparent;
+    instances stay as shown.
+    """
+    back, opaque = inverse(read_orientation(photo)), read_opaque(photo)
+    labels, confidence = (
+        np.ascontiguousarray(turned(values, back)) for values in (result.labels, result.confidence)
+    )
+    if opaque is not None:
+        labels, confidence = np.where(opaque, labels, np.uint8(0)), np.where(opaque, confidence, np.uint8(0))
+    return Segmentation(labels, confidence, result.instances)
+
+
 def _write(
-    photo: str, names: PhotoNames, folders: Folders, result: Segmentation, class_table: ClassTable
+    photo: str,
+    names: PhotoNames,
+    folders: Folders,
+    result: Segmentation,
+    orientation: int,
+    class_table: ClassTable,
 ) -> None:
     """The mask comes last: that it exists says that the photo is finished."""
     objects = names.path(folders.instances, photo, ".json")
     if result.instances is not None:
-        write_instances(objects, photo, result.labels.shape, result.instances, class_table)
+        write_instances(
+            objects, photo, turned(result.labels, orientation).shape, result.instances, class_table
+        )
     else:
         objects.unlink(missing_ok=True)  # of masks that are replaced
-    write_image(names.path(folders.confidence, photo), result.confidence)
-    write_image(names.path(folders.masks, photo), result.labels)
+    write_image(names.path(folders.confidence, photo), result.confidence, orientation)
+    write_image(names.path(folders.masks, photo), result.labels, orientation)
 
 
 def _check_photos(images: Path, names: PhotoNames, out_masks: Path, overwrite: bool) -> list[str]:
@@ -190,5 +226,5 @@ def _check_photos(images: Path, names: PhotoNames, out_masks: Path, overwrite: b
         if overwrite or mask is None:
             todo.append(photo)
         else:
-            check_mask_aspect(mask, image_size(mask), size)
+            check_mask_aspect(mask, index_image_size(mask, images / photo), size)
     return todo

@@ -15,7 +15,6 @@ from sc3d.geometry.cameras import local_origin
 from sc3d.geometry.neighbors import NeighborIndex, point_spacing
 from sc3d.geometry.voxels import BLOCK, VOXELS, sort_by_voxel, unpack_blocks, voxel_origin
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
-from sc3d.io.images import image_size
 from sc3d.io.ply import write_records
 from sc3d.labelling.cloud import Cloud, CloudExtent
 from sc3d.labelling.fusion import Fusion, fuse
@@ -132,9 +131,7 @@ def _ranges(
         parts.subfolder("ranges"), {view.name: number for number, view in enumerate(masks.views)}
     )
     return compute_ranges(
-        RangeJob(
-            scene.path, mesh, maps, {view.name: image_size(masks.files[view.name]) for view in masks.views}
-        ),
+        RangeJob(scene.path, mesh, maps, {view.name: masks.size(view) for view in masks.views}),
         executor,
     )
 

@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.io.images import read_orientation
 from sc3d.io.limits import MAX_MASK_PIXELS
+from sc3d.io.orientation import inverse, mask_turn, turned_size
 from sc3d.scene.photo_names import PhotoNames, photo_name, stem
 from sc3d.scene.scene import check_mask_aspect
 from sc3d.segmentation.mask_formats.mapping import ClassMapping
@@ -30,7 +32,7 @@ class CheckedMask:
 
     origin: where it comes from, for messages
     size: (width, height) px
-    read: makes it, (H, W) uint8 class ids of the scene
+    read: makes it, (H, W) uint8 class ids of the scene, in the frame of the photo as stored
     """
 
     origin: str
@@ -49,13 +51,17 @@ class Checks:
         classes: ClassMapping,
         names: PhotoNames | None = None,
         folder: Path = Path(),
+        photos: Path | None = None,
     ) -> None:
-        """photo_sizes: (width, height) px by photo name; names: those photos, None = with the rules that programs
-        follow; folder: the files' own
+        """photo_sizes: (width, height) px as stored by photo name; names: those photos, None = with the rules that
+        programs follow; folder: the files' own; photos: that of the photos, for their EXIF orientation
         """
         self.classes = classes
         self.names = PhotoNames(photo_sizes) if names is None else names
         self.folder = folder
+        self.turned: list[str] = []  # photos that EXIF turns, whose annotations lie as shown by a rule alone
+        self.by_palette = 0  # masks of which the palette's colors count, not the ids
+        self._photos = photos
         self._photo_sizes = photo_sizes
         self._mismatches: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
@@ -122,13 +128,18 @@ class Checks:
         folder = place.rpartition("/")[0]
         return self.names.match(f"{folder}/{candidate}", changed) if len(found) > 1 and folder else found
 
-    def size(self, name: str, stated: tuple[Any, Any] | None, origin: str) -> tuple[int, int] | None:
-        """(width, height) px of the mask of a photo: as stated if that fits the photo, the photo's own if
-        nothing is stated.
+    def size(
+        self, name: str, stated: tuple[Any, Any] | None, origin: str, own: int = 1
+    ) -> tuple[tuple[int, int], int] | None:
+        """(width, height) px of the mask of a photo: as stated if that fits the photo, that of the photo as shown
+        if nothing is stated; and the orientation by which it is turned into the frame of the photo as stored.
+
+        own: EXIF orientation of the mask
         """
         photo = self._photo_sizes[name]
+        orientation = 1 if self._photos is None else read_orientation(self._photos / name)
         if stated is None:
-            return photo
+            return turned_size(photo, orientation), inverse(orientation)
         try:
             width, height = (int(value) for value in stated)
             if width < 1 or height < 1 or (width, height) != tuple(float(value) for value in stated):
@@ -145,12 +156,15 @@ class Checks:
                 f"{_where(name, origin)} is {width}x{height}, but its photo is {photo[0]}x{photo[1]}: more than {MAX_MASK_PIXELS} px are refused",
             )
             return None
+        turn, assumed = mask_turn(own, (width, height), orientation, photo)
         try:
-            check_mask_aspect(_where(name, origin), (width, height), photo)
+            check_mask_aspect(_where(name, origin), turned_size((width, height), turn), photo)
         except InputError as error:
             self.add("size", str(error))
             return None
-        return width, height
+        if assumed:
+            self.turned.append(name)
+        return (width, height), turn
 
     def class_id(self, keys: tuple[str, ...], origin: str) -> int | None:
         """Class of the scene for a name, or else a number, in the file."""

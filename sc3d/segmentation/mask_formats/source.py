@@ -12,6 +12,7 @@ from pathlib import Path
 from sc3d.errors import InputError
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.photo_names import NamePattern, PhotoNames, files_of_photos
+from sc3d.scene.scene import tell_of_turned
 from sc3d.segmentation.mask_formats.annotations import to_mask
 from sc3d.segmentation.mask_formats.checks import CheckedMask, Checks
 from sc3d.segmentation.mask_formats.coco import read_coco
@@ -43,25 +44,29 @@ class MaskFiles:
 
 
 def read_masks(
-    source: MaskFiles, photo_sizes: dict[str, tuple[int, int]], class_table: ClassTable
+    source: MaskFiles,
+    photo_sizes: dict[str, tuple[int, int]],
+    class_table: ClassTable,
+    photos: Path | None = None,
 ) -> dict[str, CheckedMask]:
     """Masks by photo name, all checked and none drawn yet.
 
-    photo_sizes: (width, height) px by photo name
+    photo_sizes: (width, height) px as stored by photo name; photos: their folder, for their EXIF orientation
     Raises InputError, in one line, for everything that does not fit.
     """
     pattern = None if source.name_pattern is None else NamePattern(source.name_pattern)
     names = PhotoNames(photo_sizes, pattern)
     kind = detect(source.path, names) if source.format == "auto" else source.format
     folder = source.path if source.path.is_dir() else source.path.parent
-    checks = Checks(photo_sizes, read_mapping(source.mapping, class_table), names, folder)
+    checks = Checks(photo_sizes, read_mapping(source.mapping, class_table), names, folder, photos)
+    automatic = source.format == "auto"
     masks: dict[str, CheckedMask] = {}
     files = _files(source.path, kind, names)
     if kind in ("index", "color"):
         _tell_of_other_folders(source.path, files)
     for file in files:
         try:
-            for name, mask in _read(file, kind, checks):
+            for name, mask in _read(file, "auto" if automatic and SUFFIXES[kind] == ".png" else kind, checks):
                 if name in masks:
                     checks.add(
                         "double",
@@ -76,13 +81,28 @@ def read_masks(
             f"no masks in {source.path}: no annotation with an area is there"
             + ("" if pattern is None else f", or no name fits --name-pattern {pattern.text!r}")
         )
+    if checks.by_palette:
+        logger.info(
+            "%s: %d masks are read by the colors of their palette, which are those of the class table; --format index takes the ids",
+            source.path,
+            checks.by_palette,
+        )
+    if checks.turned and SUFFIXES[kind] == ".png":
+        tell_of_turned(source.path, len(checks.turned), checks.turned[0])
+    elif checks.turned:
+        logger.info(
+            "%s: %d photos (such as %s) are turned by EXIF: annotations are read as made on the photo as it is shown",
+            source.path,
+            len(checks.turned),
+            checks.turned[0],
+        )
     logger.info("%s: %s masks for %d of %d photos", source.path, kind, len(masks), len(photo_sizes))
     return dict(sorted(masks.items()))
 
 
 def _read(file: Path, kind: str, checks: Checks) -> Iterator[tuple[str, CheckedMask]]:
-    if kind in ("index", "color"):
-        yield from check_png(file, kind == "color", checks)
+    if kind not in READERS:
+        yield from check_png(file, kind, checks)
         return
     for photo in READERS[kind](file):
         found = to_mask(photo, checks)

@@ -2,15 +2,15 @@
 
 LabelMe JSON: shapes of type linestrip, line, point (with `"width": <px>`, which LabelMe keeps although it
 does not know it), polygon, rectangle and circle; coordinates in px from the upper left corner of the photo as
-it is stored; later shapes cover earlier ones. The label is the name of a class, or `_background_` for what
+it is shown (`sc3d.io.orientation`); later shapes cover earlier ones. The label is the name of a class, or `_background_` for what
 belongs to no class. PNG: the colors of the class table; black and transparent pixels say nothing. A photo may
 have both, the PNG below.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,14 @@ import cv2
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import find_photos, image_size, open_image
+from sc3d.io.images import find_photos, image_size, mask_orientation, open_image, read_orientation
 from sc3d.io.json_files import read_json
+from sc3d.io.orientation import mask_turn, turned, turned_points, turned_size
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.photo_names import PhotoNames, files_of_photos, photo_name
 from sc3d.scene.scene import check_mask_aspect
+
+logger = logging.getLogger(__name__)
 
 BACKGROUND = "_background_"  # LabelMe's own name for it
 NOTHING = -1  # a pixel without a stroke; 0 is background
@@ -36,7 +39,7 @@ _MIN_SHARE = 0.25  # of a reduced pixel that a PNG must cover
 
 @dataclass(frozen=True)
 class StrokeShape:
-    """One stroke or area. label: class id, 0 = background; points: (N, 2) float64 px of the stored photo;
+    """One stroke or area. label: class id, 0 = background; points: (N, 2) float64 px of the photo as shown;
     width: of strokes, px, 0 = default.
     """
 
@@ -50,7 +53,7 @@ class StrokeShape:
 class PhotoStrokes:
     """Everything that was drawn on one photo.
 
-    size: (width, height) px of the photo
+    size: (width, height) px of the photo as shown
     shapes: from the bottom to the top
     picture: (H, W) int16 class ids of a PNG, NOTHING elsewhere; None if there is no PNG
     """
@@ -95,17 +98,60 @@ def read_strokes(folder: Path, photos_folder: Path, class_table: ClassTable) -> 
             f"no strokes in {folder}: draw some with `sc3d annotate SCENE`, or put LabelMe JSON or PNG files there"
         )
     found: dict[Path, PhotoStrokes] = {}
+    outside: list[str] = []
     for file in files:
         content = read_json(file) if file.suffix.lower() == ".json" else None
         photo = photos_folder / _photo_of(file, folder, content, names)
-        size = image_size(photo)
-        shapes = () if content is None else parse_shapes(content, file, size, class_table)
-        picture = None if content is not None else _read_picture(file, size, class_table)
+        size = shown_size(photo)
+        shapes = () if content is None else read_shapes(content, file, photo, class_table)
+        outside += [f"{file.name}: shape {index + 1}" for index in _outside(shapes, size)]
+        picture = None if content is not None else _read_picture(file, photo, class_table)
         before = found.get(photo, PhotoStrokes(photo, size))
         found[photo] = PhotoStrokes(
             photo, size, before.shapes + shapes, before.picture if picture is None else picture
         )
+    if outside:
+        logger.warning(
+            "%s: %d shapes lie outside of their photos and are left out, such as %s",
+            folder,
+            len(outside),
+            "; ".join(outside[:3]),
+        )
     return [found[photo] for photo in sorted(found)]
+
+
+def shown_size(photo: Path) -> tuple[int, int]:
+    """(width, height) px of a photo as shown."""
+    return turned_size(image_size(photo), read_orientation(photo))
+
+
+def _outside(shapes: tuple[StrokeShape, ...], size: tuple[int, int]) -> list[int]:
+    """Indices of the shapes whose box does not reach into the photo; size: (width, height) px."""
+    found = []
+    for index, shape in enumerate(shapes):
+        reach = np.hypot(*(shape.points[1] - shape.points[0])) if shape.kind == "circle" else shape.width
+        points = shape.points[:1] if shape.kind == "circle" else shape.points
+        low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
+        if (high < 0).any() or (low > size).any():
+            found.append(index)
+    return found
+
+
+def read_shapes(
+    content: object, origin: Path | str, photo: Path, class_table: ClassTable
+) -> tuple[StrokeShape, ...]:
+    """`parse_shapes` for a photo as shown; shapes whose file states the size of the photo as stored, and not as
+    shown, are turned.
+    """
+    orientation, size = read_orientation(photo), image_size(photo)
+    sides = [content.get(key) for key in ("imageWidth", "imageHeight")] if isinstance(content, dict) else []
+    stated = [side for side in sides if isinstance(side, int) and 0 < side < _MAX_COORDINATE]
+    if len(stated) < 2 or mask_turn(1, (stated[0], stated[1]), orientation, size)[0] != 1:
+        return parse_shapes(content, origin, turned_size(size, orientation), class_table)
+    return tuple(
+        replace(shape, points=turned_points(shape.points, size, orientation))
+        for shape in parse_shapes(content, origin, size, class_table)
+    )
 
 
 def parse_shapes(
@@ -113,7 +159,7 @@ def parse_shapes(
 ) -> tuple[StrokeShape, ...]:
     """The shapes of a decoded LabelMe file, scaled to the photo; InputError if something is wrong.
 
-    origin: names the file in messages; size: (width, height) px of the photo
+    origin: names the file in messages; size: (width, height) px of the photo that they were drawn on
     """
     shapes = content.get("shapes") if isinstance(content, dict) else None
     if not isinstance(content, dict) or not isinstance(shapes, list):
@@ -150,17 +196,17 @@ def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) 
         raise InputError(f"{origin}: a {kind} needs at least {MIN_POINTS[kind]} points")
     if not _is_number(width) or width < 0:
         raise InputError(f"{origin}: width must be a number of px")
-    return StrokeShape(
-        ids[label], kind, np.array(points, np.float64).reshape(-1, 2) * scale, float(width) * scale
-    )
+    placed = np.array(points, np.float64).reshape(-1, 2) * scale
+    if not (np.abs(placed) < _MAX_COORDINATE).all():
+        raise InputError(f"{origin}: points must be a list of [x, y] in px")
+    return StrokeShape(ids[label], kind, placed, float(width) * scale)
 
 
 def _is_number(value: object) -> bool:
     return (
         isinstance(value, int | float)
         and not isinstance(value, bool)
-        and math.isfinite(value)
-        and abs(value) < _MAX_COORDINATE
+        and abs(value) < _MAX_COORDINATE  # false for what is not a number, too
     )
 
 
@@ -183,11 +229,12 @@ def _photo_of(file: Path, folder: Path, content: object, names: PhotoNames) -> s
     )
 
 
-def _read_picture(file: Path, size: tuple[int, int], class_table: ClassTable) -> np.ndarray:
-    """(H, W) int16 class ids of a PNG in the colors of the class table, NOTHING where it is black or
-    transparent.
+def _read_picture(file: Path, photo: Path, class_table: ClassTable) -> np.ndarray:
+    """(H, W) int16 class ids of a PNG in the colors of the class table, on the photo as shown, NOTHING where it is
+    black or transparent.
     """
-    check_mask_aspect(file, image_size(file), size)
+    onto, photo_size = mask_orientation(file, photo)[0], image_size(photo)
+    check_mask_aspect(file, turned_size(image_size(file), onto), photo_size)
     with open_image(file, "picture of strokes") as image:
         rgba = np.array(image.convert("RGBA"))
     codes = (rgba[..., :3].astype(np.int32) * [65536, 256, 1]).sum(axis=-1)
@@ -203,7 +250,8 @@ def _read_picture(file: Path, size: tuple[int, int], class_table: ClassTable) ->
         raise InputError(
             f"{file} has the color #{unknown[0]:06x}, which is not in the class table: draw without smoothing, and not as JPEG"
         )
-    return np.array([ids[int(value)] for value in values], np.int16)[places].reshape(codes.shape)
+    labels = np.array([ids[int(value)] for value in values], np.int16)[places].reshape(codes.shape)
+    return turned(turned(labels, onto), read_orientation(photo))
 
 
 def _reduce(picture: np.ndarray, width: int, height: int) -> np.ndarray:
