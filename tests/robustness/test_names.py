@@ -340,13 +340,13 @@ def test_a_scene_of_several_cards_goes_through_all_stages(tmp_path):
     metrics = json.loads(scene.metrics.read_text())
     assert metrics["labels"]["miou"] > 0.97 and metrics["masks"]["miou"] == 1
     assert len(metrics["per_photo"]) == 5
-    execute("export", scene, Export(format="masks"))
+    execute("export", scene, Export(format=("masks",)))
     for view in scene.model.views:
         mask = read_index_image((scene.export / "masks" / view.name).with_suffix(".png"))
         truth = truth_mask(view)
         assert (mask == truth)[truth > 0].mean() > 0.98
         assert (scene.export / "confidence" / view.name).with_suffix(".png").is_file()
-    execute("export", scene, Export(format="transforms"))
+    execute("export", scene, Export(format=("transforms",)))
     files = list(scene.export.rglob("transforms*.json"))
     frames = json.loads(files[0].read_text())["frames"]
     assert len({frame["file_path"] for frame in frames}) == 5
