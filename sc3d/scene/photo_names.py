@@ -215,6 +215,18 @@ class PhotoNames:
             names = {shorter for name in names for shorter in _reductions(name)} - known
         return ()
 
+    def one(self, name: str, where: Path) -> str:
+        """The photo that a user asks for by a name, of which suffix and folders may be missing; InputError, that
+        names the photos in `where`, unless that is one.
+        """
+        found = self.match(name, changed=False)
+        if len(found) == 1:
+            return found[0]
+        likely = found or self.nearest(name) or self.names[:5]
+        raise InputError(
+            f"{'several photos are' if found else 'no photo'} {name!r} in {where}: one of {', '.join(likely)} ..."
+        )
+
     def nearest(self, foreign: str) -> list[str]:
         """Photos whose names are most like a foreign one; none if nothing is."""
         by_stem = {_fold(PurePosixPath(name).stem): name for name in reversed(self.names)}

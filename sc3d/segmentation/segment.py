@@ -20,6 +20,7 @@ from sc3d.io.images import (
     read_image,
     read_opaque,
     read_orientation,
+    require_within,
     write_image,
 )
 from sc3d.io.json_files import read_json, write_json
@@ -206,6 +207,8 @@ def _write(
     class_table: ClassTable,
 ) -> None:
     """The mask comes last: that it exists says that the photo is finished."""
+    for folder in folders:
+        require_within(names.path(folder, photo).parent, folder)
     objects = names.path(folders.instances, photo, ".json")
     if result.instances is not None:
         write_instances(

@@ -13,6 +13,7 @@ import pycolmap
 import pytest
 
 from sc3d.annotate.session import Session
+from sc3d.commands.view import _find_photo
 from sc3d.errors import InputError
 from sc3d.importers.clouds import read_geometry
 from sc3d.importers.metashape import read as read_metashape
@@ -303,13 +304,29 @@ def test_strokes_of_photos_of_one_name(tmp_path):
     found = {one.photo.relative_to(scene.images).as_posix(): one.shapes[0].label for one in read}
     assert found == {CARDS[0]: 1, CARDS[2]: 3}
     assert Session(scene).read("101MEDIA/DJI_0001")[0]["label"] == "grass"
-    with pytest.raises(
-        InputError, match="several photos are 'DJI_0001'.*100MEDIA/DJI_0001, 101MEDIA/DJI_0001"
-    ):
+    with pytest.raises(InputError, match="several photos are 'DJI_0001'.*100MEDIA/DJI_0001.JPG, 101MEDIA/"):
         Session(scene, "DJI_0001")
     write_json(scene.strokes / "DJI_0002.json", labelme("road", "DJI_0002.JPG"))
     with pytest.raises(InputError, match="DJI_0002.json may belong to 100MEDIA/DJI_0002.JPG"):
         read_strokes(scene.strokes, scene.images, scene.class_table())
+
+
+def test_no_folder_of_a_scene_leads_out_of_it(tmp_path):
+    """A scene from somebody else may hold links in place of the folders of cards."""
+    images = write_photos(tmp_path / "images", *CARDS)
+    write_json(tmp_path / "classes.json", CLASSES)
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    folders = Folders(*(tmp_path / name for name in ("masks", "confidence", "instances")))
+    for folder in (folders.masks, tmp_path / "strokes"):
+        folder.mkdir()
+        (folder / "100MEDIA").symlink_to(outside)
+    with pytest.raises(InputError, match="leads out"):
+        photos = [images / name for name in CARDS]
+        segment_photos(photos, folders, Brightness(), Scene(tmp_path).class_table(), images=images)
+    with pytest.raises(InputError, match="leads out"):
+        Session(Scene(tmp_path)).save("100MEDIA/DJI_0001", drawing("road"))
+    assert not list(outside.iterdir())
 
 
 # ---- a whole scene
@@ -353,6 +370,9 @@ def test_a_scene_of_several_cards_goes_through_all_stages(tmp_path):
     execute("report", scene, Report())
     page = scene.report.read_text()
     assert page.count("given mask of") == page.count("truth of") > 2
+    assert _find_photo("101MEDIA/DJI_0001", scene.model.views, scene).name == CARDS[2]
+    with pytest.raises(InputError, match="several photos are 'DJI_0001'"):
+        _find_photo("DJI_0001", scene.model.views, scene)
     assert photo_pictures(scene, scene.model.views[2], scene.class_table(), 64).note == ""
 
 
