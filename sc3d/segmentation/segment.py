@@ -94,7 +94,8 @@ def segment_scene(
 ) -> SegmentSummary:
     """Write masks, confidence maps and instances of a scene's photos.
 
-    Those of an interrupted run are gone on with if they were made with the same settings; others are set aside.
+    Those of an interrupted run are gone on with if they were made with the same settings; others are set
+    aside.
     """
     folders = Folders(scene.masks, scene.confidence, scene.instances)
     marker, state = scene.path / "segment.unfinished.json", _state(scene, settings, class_table)
@@ -151,7 +152,8 @@ def segment_photos(
     images: folder below which the photos are named; None = the one that they have in common
     Photos that have a mask are skipped unless `overwrite`, so an interrupted run goes on where it stopped,
     whatever stopped it.
-    Raises InputError before the work starts if a photo cannot be opened, or an old mask does not fit its photo.
+    Raises InputError before the work starts if a photo cannot be opened, or an old mask does not fit its
+    photo.
     """
     from tqdm import tqdm
 
@@ -186,8 +188,8 @@ def segment_photos(
 
 
 def _as_stored(photo: Path, result: Segmentation) -> Segmentation:
-    """Labels and confidence turned from the photo as shown to that as stored, nothing where it is transparent;
-    instances stay as shown.
+    """Labels and confidence turned from the photo as shown to that as stored, nothing where it is
+    transparent; instances stay as shown.
     """
     back, opaque = inverse(read_orientation(photo)), read_opaque(photo)
     labels, confidence = (

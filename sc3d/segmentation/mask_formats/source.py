@@ -70,7 +70,8 @@ def read_masks(
                 if name in masks:
                     checks.add(
                         "double",
-                        f"{name} has a mask in {masks[name].origin} and another in {mask.origin}; --name-pattern says which are meant",
+                        f"{name} has a mask in {masks[name].origin} and another in {mask.origin}; "
+                        "--name-pattern says which are meant",
                     )
                 masks.setdefault(name, mask)
         except InputError as error:
@@ -148,8 +149,8 @@ def _files(path: Path, kind: str, names: PhotoNames) -> list[Path]:
 
 
 def _find(path: Path, suffixes: tuple[str, ...], names: PhotoNames) -> list[Path]:
-    """The file itself, or the files of a folder by name; annotations also in all folders below, PNGs only in those
-    that are named like folders of the photos, because others may hold photos.
+    """The file itself, or the files of a folder by name; annotations also in all folders below, PNGs only in
+    those that are named like folders of the photos, because others may hold photos.
     """
     if not path.is_dir():
         return [path] if path.is_file() and path.suffix.lower() in suffixes else []
@@ -171,7 +172,8 @@ def _tell_of_other_folders(path: Path, files: list[Path]) -> None:
     others = sorted(set(_all_files(path, (".png",))) - set(files))
     if others:
         logger.warning(
-            "%s: %d PNG files in folders that are not named like those of the photos are left out, such as %s",
+            "%s: %d PNG files in folders that are not named like those of the photos are left out, "
+            "such as %s",
             path,
             len(others),
             others[0].relative_to(path),
