@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import find_photos, read_image
+from sc3d.io.images import find_photos, read_image, require_within
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.provenance import digest
 from sc3d.scene.photo_names import PhotoNames, photo_name
@@ -48,22 +48,16 @@ class Session:
         self._names = PhotoNames(photo_name(photo, scene.images) for photo in photos)
         self.photos = dict(zip(map(self._names.key, self._names.names), photos, strict=True))
         self.sizes = {key: shown_size(photo) for key, photo in self.photos.items()}
-        self._start = next(iter(self.photos)) if start is None else self._find(start)
+        self._start = (
+            next(iter(self.photos))
+            if start is None
+            else self._names.key(self._names.one(start, scene.images))
+        )
         self._trying, self._writing = threading.Lock(), threading.Lock()
         self._learned: tuple[str, Strokes] | None = None
         self._jpeg = lru_cache(maxsize=4)(self._encode)
         for key in self.photos:
             self.read(key)
-
-    def _find(self, name: str) -> str:
-        """Key of the photo that is asked for."""
-        found = self._names.match(name, changed=False)
-        if len(found) == 1:
-            return self._names.key(found[0])
-        likely = [self._names.key(photo) for photo in found] or list(self.photos)[:5]
-        raise InputError(
-            f"{'several photos are' if found else 'no photo'} {name!r} in {self._scene.images}: one of {', '.join(likely)} ..."
-        )
 
     def describe(self) -> dict[str, object]:
         """Everything the page shows at its start, as JSON."""
@@ -93,7 +87,9 @@ class Session:
         the folder.
         """
         name, folder = photo_name(self.photos[key], self._scene.images), self._scene.strokes
-        return self._names.find(folder, name, ".json") or self._names.path(folder, name, ".json")
+        file = self._names.find(folder, name, ".json") or self._names.path(folder, name, ".json")
+        require_within(file.parent, folder)
+        return file
 
     def read(self, key: str) -> list[dict[str, object]]:
         """The shapes of a photo's LabelMe file, in px of the photo; none if there is no file."""

@@ -24,8 +24,8 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
-    """A mask in `export/masks` and a confidence map in `export/confidence` for every photo, named like it; usable
-    as `segment --masks`, `--confidence`.
+    """A mask in `export/masks` and a confidence map in `export/confidence` for every photo, named like it;
+    usable as `segment --masks`, `--confidence`.
     """
     cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
     views = scene.model.views

@@ -79,12 +79,14 @@ def _require_clear(project: Project, folder: Path, found: list[tuple[str, ...]])
     unclear = [(name, photos) for name, photos in zip(names, found) if photos]
     if not unclear:
         raise InputError(
-            f"none of the {len(names)} photos of the project is in {folder}, such as {names[0]}: pass their folder with --images"
+            f"none of the {len(names)} photos of the project is in {folder}, such as {names[0]}: "
+            "pass their folder with --images"
         )
     name, photos = unclear[0]
     raise InputError(
-        f"{len(unclear)} of {len(names)} photos of the project may be any of several in {folder}, such as {name!r}: {' or '.join(photos)}; "
-        "give them names with the folder in the program that wrote the project, or pass the folder of its photos alone with --images"
+        f"{len(unclear)} of {len(names)} photos of the project may be any of several in {folder}, "
+        f"such as {name!r}: {' or '.join(photos)}; give them names with the folder in the program that wrote "
+        "the project, or pass the folder of its photos alone with --images"
     )
 
 
@@ -97,8 +99,8 @@ def _without(
 
 
 def _sharing(project: Project, folder: Path, files: list[str]) -> set[int]:
-    """Rows of the views whose photo (of `files`) another view has too, and better or as well: the whole path counts
-    most, then the folders in common.
+    """Rows of the views whose photo (of `files`) another view has too, and better or as well: the whole path
+    counts most, then the folders in common.
     """
     ranks = [
         (
@@ -133,8 +135,8 @@ def _named_as_meant(project: Project) -> Project:
     shared = [row for row, name in enumerate(names) if counts[name] > 1]
     if len(shared) == len(names):
         raise InputError(
-            f"all {len(names)} photos of the project share their names with others, such as {names[0]!r}, and nothing tells them apart: "
-            "give them names with the folder (100MEDIA/DJI_0001.JPG) in the program that wrote the project"
+            f"all {len(names)} photos of the project share their names with others, such as {names[0]!r}, "
+            "and nothing tells them apart: give them names with the folder (100MEDIA/DJI_0001.JPG) in the program that wrote the project"
         )
     views = [replace(view, name=name) for view, name in zip(project.views, names)]
     return replace(project, views=views).without(shared, "that share their names with others")
@@ -161,5 +163,6 @@ def _common_folder(names: list[str]) -> Path:
 def _check_shape(view: View, size: tuple[int, int], folder: Path) -> None:
     if abs(size[0] * view.height - size[1] * view.width) > max(size[0], view.width):
         raise InputError(
-            f"{folder / view.name} is {size[0]}x{size[1]}, but its camera is {view.width}x{view.height}: these are other photos, or turned ones"
+            f"{folder / view.name} is {size[0]}x{size[1]}, but its camera is {view.width}x{view.height}: "
+            "these are other photos, or turned ones"
         )

@@ -1,12 +1,13 @@
 """Names of photos: where the files that belong to a photo lie, and which photo a foreign name means.
 
-A photo is named by its path below `images/`, with forward slashes. Its mask, and all else that is kept per photo
-(confidence, truth, strokes, instances), is named like it: by the file name without suffix while no two photos share
-that (`masks/DJI_0001.png`), else by the path without suffix (`masks/100MEDIA/DJI_0001.png`), and by the path with it
-where photos of one folder differ in nothing else (`masks/a.jpg.png`). Whatever is clear is found: a path as well.
+A photo is named by its path below `images/`, with forward slashes. Its mask, and all else that is kept per
+photo (confidence, truth, strokes, instances), is named like it: by the file name without suffix while no two
+photos share that (`masks/DJI_0001.png`), else by the path without suffix (`masks/100MEDIA/DJI_0001.png`), and
+by the path with it where photos of one folder differ in nothing else (`masks/a.jpg.png`). Whatever is clear
+is found: a path as well.
 
-Other programs leave out folders or suffixes, and add words and hashes. A foreign name means the photos that fit it
-best; the caller decides what to do with none or several.
+Other programs leave out folders or suffixes, and add words and hashes. A foreign name means the photos that
+fit it best; the caller decides what to do with none or several.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ _CAMERA_FOLDER = re.compile(
     r"[1-9]\d\d\w{5}"
 )  # as cameras name them (DCF, JEITA CP-3461): 100MEDIA, 101_PANO
 
-# What annotation programs and data sets write before or behind the name of the photo: FloodNet's _lab, Cityscapes'
-# _gtFine_labelIds, CamVid's _L, Segments.ai's _label_ground-truth, ...
+# What annotation programs and data sets write before or behind the name of the photo: FloodNet's _lab,
+# Cityscapes' _gtFine_labelIds, CamVid's _L, Segments.ai's _label_ground-truth, ...
 _WORD = (
     "masks?|labels?|lab|label_?ids|label_?train_?ids|train_?ids|gt_?fine|gt_?coarse|gt|ground|truth|colou?rs?|"
     "segmentation|segm?|semantic|annotations?|anno|class(?:es)?|watershed|confidence|conf"
@@ -43,7 +44,7 @@ _DATE = re.compile(r"(?:19|20)\d\d[01]\d[0-3]\d\d*")
 _WORD_BEHIND = re.compile(rf"(.+)[-_. ](?:{_WORD})", re.IGNORECASE)
 _WORD_BEFORE = re.compile(r"(?:mask|label|gt|seg)[-_. ](.+)", re.IGNORECASE)
 _CAMVID = re.compile(r"(.+)_L")
-_HASH_BEHIND = re.compile(rf"(.+)[-_.]({_HASH})", re.IGNORECASE)
+_HASH_BEHIND = re.compile(rf"(.+?)[-_.]({_HASH})", re.IGNORECASE)
 _HASH_BEFORE = re.compile(rf"({_HASH})[-_](.+)", re.IGNORECASE)  # Label Studio: 8 digits and a dash
 _ROBOFLOW = re.compile(r"(.+)\.rf\.\w+")
 _ROBOFLOW_SUFFIX = re.compile(r"(.+)_(?:jpe?g|png|tiff?|webp|bmp)", re.IGNORECASE)
@@ -70,7 +71,8 @@ class NamePattern:
         """InputError unless `{photo}` is in it once."""
         if text.count(PHOTO) != 1:
             raise InputError(
-                f"--name-pattern {text!r} must hold {PHOTO} once, in the place of the photo's name, such as '{PHOTO}_lab.png'"
+                f"--name-pattern {text!r} must hold {PHOTO} once, in the place of the photo's name, "
+                f"such as '{PHOTO}_lab.png'"
             )
         self.text, self._depth = text, text.count("/")
         self._whole = PurePosixPath(text).suffix.lower() in SUFFIXES
@@ -92,7 +94,9 @@ class PhotoNames:
     """All photos of a scene by name."""
 
     def __init__(self, names: Iterable[str], pattern: NamePattern | None = None) -> None:
-        """names: paths below `images/`; pattern: how foreign names are made, in place of the rules of programs"""
+        """names: paths below `images/`; pattern: how foreign names are made, in place of the rules of
+        programs
+        """
         self.names = tuple(dict.fromkeys(names))
         self.pattern = pattern
         self._keys = _unique_keys(self.names)
@@ -138,8 +142,8 @@ class PhotoNames:
     def match_file(self, path: str, folder: Path | None = None, changed: bool = True) -> tuple[str, ...]:
         """Photos that a mask or another file of one photo may belong to.
 
-        path: below the folder of masks; folder: that folder, whose own name may tell what `path` does not; changed:
-            as for `match`
+        path: below the folder of masks; changed: as for `match`
+        folder: that folder, whose own name may tell what `path` does not
         """
         path = _normal(path)
         key = path.removesuffix(PurePosixPath(path).suffix)
@@ -152,8 +156,8 @@ class PhotoNames:
         return found
 
     def match(self, foreign: str, changed: bool = True) -> tuple[str, ...]:
-        """Photos that a name of another program may mean, the best that there are, in order: one if the name is
-        clear.
+        """Photos that a name of another program may mean, the best that there are, in order: one if the name
+        is clear.
 
         foreign: a name or path of any system, with or without suffix; changed: whether words and hashes of
             programs may be in it
@@ -179,6 +183,12 @@ class PhotoNames:
             for name in self._tables[table].get(keys[key], ()):
                 if name not in ranks and not _contradicts(folders, name):
                     ranks[name] = _shared(folders, name), -max(table, key)
+        most = max((shared for shared, _ in ranks.values()), default=0)
+        ranks = {  # those in another folder, if one is in the same
+            name: rank
+            for name, rank in ranks.items()
+            if rank[0] == most or rank[0] == min(len(folders), name.count("/"))
+        }
         best = (
             name
             for name, rank in ranks.items()
@@ -209,6 +219,19 @@ class PhotoNames:
             names = {shorter for name in names for shorter in _reductions(name)} - known
         return ()
 
+    def one(self, name: str, where: Path) -> str:
+        """The photo that a user asks for by a name, of which suffix and folders may be missing; InputError,
+        that names the photos in `where`, unless that is one.
+        """
+        found = self.match(name, changed=False)
+        if len(found) == 1:
+            return found[0]
+        likely = found or self.nearest(name) or self.names[:5]
+        raise InputError(
+            f"{'several photos are' if found else 'no photo'} {name!r} in {where}: "
+            f"one of {', '.join(likely)} ..."
+        )
+
     def nearest(self, foreign: str) -> list[str]:
         """Photos whose names are most like a foreign one; none if nothing is."""
         by_stem = {_fold(PurePosixPath(name).stem): name for name in reversed(self.names)}
@@ -218,8 +241,8 @@ class PhotoNames:
         return [by_stem[part] for part in near[:NUM_NEAREST]]
 
     def advice(self, foreign: str) -> str:
-        """What an error says of a name that no photo has: the nearest names and, where one is a part of it, the
-        pattern that would fit; empty if nothing is near.
+        """What an error says of a name that no photo has: the nearest names and, where one is a part of it,
+        the pattern that would fit; empty if nothing is near.
         """
         if self.pattern is not None:
             return f"; --name-pattern is {self.pattern.text!r}"
@@ -233,7 +256,9 @@ class PhotoNames:
         return f"{told}: if it belongs there, --name-pattern '{before}{PHOTO}{behind}' says so"
 
     def choices(self, names: Iterable[str], suffix: str = ".png") -> str:
-        """What an error says of a name that several photos have: those photos, and how a file of each is named."""
+        """What an error says of a name that several photos have: those photos, and how a file of each is
+        named.
+        """
         return " or ".join(f"{name} (whose file is {self._keys[name]}{suffix})" for name in names)
 
 
@@ -244,8 +269,8 @@ def shared_folders(foreign: str, name: str) -> int:
 
 def files_of_photos(folder: Path, names: PhotoNames, suffixes: Iterable[str]) -> list[Path]:
     """Files of a folder that may belong to photos, by path: those in it, and those in folders below that are
-    named like folders of the photos (others hold something else). With a pattern, those at any depth that fit
-    it.
+    named like folders of the photos, or as cameras name folders (others hold something else). With a pattern,
+    those at any depth that fit it.
     """
     allowed, wanted = {""}, set(suffixes)
     for name in names.names:
@@ -256,7 +281,7 @@ def files_of_photos(folder: Path, names: PhotoNames, suffixes: Iterable[str]) ->
         parts = [_fold(part) for part in Path(place).relative_to(folder).parts]
         deeper = names.pattern is not None or len(parts) < depth
         folders[:] = sorted(below for below in folders if deeper and not below.startswith("."))
-        if names.pattern is not None or "/".join(parts) in allowed:
+        if names.pattern is not None or "/".join(parts) in allowed or _is_camera_folder(parts):
             found += [
                 Path(place, file)
                 for file in files
@@ -292,14 +317,14 @@ def _reductions(name: str) -> set[str]:
     return found - {name}
 
 
+def _is_camera_folder(folders: list[str]) -> bool:
+    return bool(folders) and _CAMERA_FOLDER.fullmatch(folders[-1]) is not None
+
+
 def _contradicts(folders: list[str], name: str) -> bool:
     """Whether a camera put the two into different folders, where it counts photos anew."""
     own = name.split("/")[:-1]
-    return bool(folders and own) and (
-        _CAMERA_FOLDER.fullmatch(folders[-1]) is not None
-        and _CAMERA_FOLDER.fullmatch(own[-1]) is not None
-        and _fold(folders[-1]) != _fold(own[-1])
-    )
+    return _is_camera_folder(folders) and _is_camera_folder(own) and _fold(folders[-1]) != _fold(own[-1])
 
 
 def _shared(folders: list[str], name: str) -> int:

@@ -159,8 +159,8 @@ class Scene:
         return read_image(self.photo(name), self.images)
 
     def read_mask(self, file: Path, name: str) -> np.ndarray:
-        """(H, W) uint8 class ids of a mask or truth mask of a photo, in the photo's frame as stored, 0 where the
-        photo is transparent.
+        """(H, W) uint8 class ids of a mask or truth mask of a photo, in the photo's frame as stored, 0 where
+        the photo is transparent.
         """
         return self._onto_photo(read_labels(file, self._meanings), file, name)
 
@@ -186,8 +186,8 @@ class Scene:
         return index_image_size(file, self.photo(name))
 
     def opaque_pixels(self, view: View, target: View) -> np.ndarray | None:
-        """(H, W) bool pixels of `target`, a view of the same pose, that lie in the photo of `view` and are opaque
-        there; None if the photo has no transparent pixels.
+        """(H, W) bool pixels of `target`, a view of the same pose, that lie in the photo of `view` and are
+        opaque there; None if the photo has no transparent pixels.
         """
         from sc3d.geometry.cameras import resample
 
@@ -215,8 +215,8 @@ class Scene:
 
     @cached_property
     def _spellings(self) -> dict[str, str]:
-        """Photos in `images/` by the names of views that differ from theirs in letter case or Unicode form, which
-        Windows and macOS do not tell apart.
+        """Photos in `images/` by the names of views that differ from theirs in letter case or Unicode form,
+        which Windows and macOS do not tell apart.
         """
         others = PhotoNames(set(self._listed) - set(self._named))
         missing = set(self._named) - set(self._listed)
@@ -240,8 +240,8 @@ class Scene:
         )
 
     def warn_of_unplaced(self, *folders: Path) -> None:
-        """Say in one line how many masks, or other images, in `folders` are of photos without a camera, if there
-        is a model.
+        """Say in one line how many masks, or other images, in `folders` are of photos without a camera, if
+        there is a model.
         """
         if not self.sparse.is_dir():
             return
@@ -254,7 +254,8 @@ class Scene:
         if unplaced:
             examples = ", ".join(sorted(unplaced)[:_NUM_EXAMPLES])
             logger.warning(
-                "%d photos have no camera, as they did not register: what belongs to them is left out (%s), such as %s%s",
+                "%d photos have no camera, as they did not register: "
+                "what belongs to them is left out (%s), such as %s%s",
                 len(unplaced),
                 ", ".join(counts),
                 examples,
@@ -304,11 +305,11 @@ def read_sparse_model(path: Path) -> SparseModel:
 
 
 def find_masks(folder: Path, names: PhotoNames, strict: bool = True) -> dict[str, Path]:
-    """Files of a folder of masks by photo name, none looked into yet: each at its photo's path with the suffix
-    .png, or named so that it can mean one photo alone (see `sc3d.scene.photo_names`).
+    """Files of a folder of masks by photo name, none looked into yet: each at its photo's path with the
+    suffix .png, or named so that it can mean one photo alone (see `sc3d.scene.photo_names`).
 
-    Raises InputError for a file that belongs to no photo or to several, and for two of one photo; without `strict`,
-    they are passed over.
+    Raises InputError for a file that belongs to no photo or to several, and for two of one photo; without
+    `strict`, they are passed over.
     """
     found: dict[str, Path] = {}
     for file in files_of_photos(folder, names, (".png",)):
@@ -326,7 +327,8 @@ def _misfit(
     """Why a mask cannot be given to a photo; photos: those that it may mean; found: what they have already."""
     if not photos:
         advice = names.advice(photo_name(file, folder))
-        return f"{file} belongs to no photo: {len(names)} photos are known, such as {next(iter(names.names), 'none')}{advice}"
+        example = next(iter(names.names), "none")
+        return f"{file} belongs to no photo: {len(names)} photos are known, such as {example}{advice}"
     if len(photos) > 1:
         return f"{file} may belong to {names.choices(photos)}: rename it"
     return f"{found[photos[0]]} and {file} both belong to {photos[0]}: remove one"
@@ -351,7 +353,8 @@ def match_masks(
     matched = {name: file for name, file in found.items() if name in photo_sizes}
     if not matched:
         raise InputError(
-            f"none of the {len(found)} masks in {folder} is of a photo with a camera: the model has {len(photo_sizes)}, such as {next(iter(photo_sizes), 'none')}"
+            f"none of the {len(found)} masks in {folder} is of a photo with a camera: "
+            f"the model has {len(photo_sizes)}, such as {next(iter(photo_sizes), 'none')}"
         )
     meanings, turns = None if class_table is None else meanings_of(class_table), list[str]()
     for name, file in matched.items():
@@ -373,8 +376,8 @@ def match_masks(
 
 @cache  # tiles look at the same masks again and again
 def tell_of_turned(source: Path, count: int, example: str = "") -> None:
-    """Warn of masks that lie as their photos are shown by a rule alone (`sc3d.io.orientation`), and name one of the
-    photos.
+    """Warn of masks that lie as their photos are shown by a rule alone (`sc3d.io.orientation`), and name one
+    of the photos.
     """
     if count:
         logger.warning(

@@ -20,6 +20,7 @@ from sc3d.io.images import (
     read_image,
     read_opaque,
     read_orientation,
+    require_within,
     write_image,
 )
 from sc3d.io.json_files import read_json, write_json
@@ -93,7 +94,8 @@ def segment_scene(
 ) -> SegmentSummary:
     """Write masks, confidence maps and instances of a scene's photos.
 
-    Those of an interrupted run are gone on with if they were made with the same settings; others are set aside.
+    Those of an interrupted run are gone on with if they were made with the same settings; others are set
+    aside.
     """
     folders = Folders(scene.masks, scene.confidence, scene.instances)
     marker, state = scene.path / "segment.unfinished.json", _state(scene, settings, class_table)
@@ -150,7 +152,8 @@ def segment_photos(
     images: folder below which the photos are named; None = the one that they have in common
     Photos that have a mask are skipped unless `overwrite`, so an interrupted run goes on where it stopped,
     whatever stopped it.
-    Raises InputError before the work starts if a photo cannot be opened, or an old mask does not fit its photo.
+    Raises InputError before the work starts if a photo cannot be opened, or an old mask does not fit its
+    photo.
     """
     from tqdm import tqdm
 
@@ -185,8 +188,8 @@ def segment_photos(
 
 
 def _as_stored(photo: Path, result: Segmentation) -> Segmentation:
-    """Labels and confidence turned from the photo as shown to that as stored, nothing where it is transparent;
-    instances stay as shown.
+    """Labels and confidence turned from the photo as shown to that as stored, nothing where it is
+    transparent; instances stay as shown.
     """
     back, opaque = inverse(read_orientation(photo)), read_opaque(photo)
     labels, confidence = (
@@ -206,6 +209,8 @@ def _write(
     class_table: ClassTable,
 ) -> None:
     """The mask comes last: that it exists says that the photo is finished."""
+    for folder in folders:
+        require_within(names.path(folder, photo).parent, folder)
     objects = names.path(folders.instances, photo, ".json")
     if result.instances is not None:
         write_instances(

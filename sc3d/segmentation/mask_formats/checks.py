@@ -53,8 +53,8 @@ class Checks:
         folder: Path = Path(),
         photos: Path | None = None,
     ) -> None:
-        """photo_sizes: (width, height) px as stored by photo name; names: those photos, None = with the rules that
-        programs follow; folder: the files' own; photos: that of the photos, for their EXIF orientation
+        """photo_sizes: (width, height) px as stored by photo name; names: those photos, None = with the rules
+        that programs follow; folder: the files' own; photos: that of the photos, for their EXIF orientation
         """
         self.classes = classes
         self.names = PhotoNames(photo_sizes) if names is None else names
@@ -131,8 +131,9 @@ class Checks:
     def size(
         self, name: str, stated: tuple[Any, Any] | None, origin: str, own: int = 1
     ) -> tuple[tuple[int, int], int] | None:
-        """(width, height) px of the mask of a photo: as stated if that fits the photo, that of the photo as shown
-        if nothing is stated; and the orientation by which it is turned into the frame of the photo as stored.
+        """(width, height) px of the mask of a photo: as stated if that fits the photo, that of the photo as
+        shown if nothing is stated; and the orientation by which it is turned into the frame of the photo as
+        stored.
 
         own: EXIF orientation of the mask
         """

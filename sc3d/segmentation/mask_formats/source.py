@@ -61,13 +61,17 @@ def read_masks(
     checks = Checks(photo_sizes, read_mapping(source.mapping, class_table), names, folder, photos)
     automatic = source.format == "auto"
     masks: dict[str, CheckedMask] = {}
-    for file in _files(source.path, kind, names):
+    files = _files(source.path, kind, names)
+    if kind in ("index", "color"):
+        _tell_of_other_folders(source.path, files)
+    for file in files:
         try:
             for name, mask in _read(file, "auto" if automatic and kind == "index" else kind, checks):
                 if name in masks:
                     checks.add(
                         "double",
-                        f"{name} has a mask in {masks[name].origin} and another in {mask.origin}; --name-pattern says which are meant",
+                        f"{name} has a mask in {masks[name].origin} and another in {mask.origin}; "
+                        "--name-pattern says which are meant",
                     )
                 masks.setdefault(name, mask)
         except InputError as error:
@@ -145,15 +149,32 @@ def _files(path: Path, kind: str, names: PhotoNames) -> list[Path]:
 
 
 def _find(path: Path, suffixes: tuple[str, ...], names: PhotoNames) -> list[Path]:
-    """The file itself, or the files of a folder by name; annotations also in all folders below, PNGs only in those
-    that are named like folders of the photos, because others may hold photos.
+    """The file itself, or the files of a folder by name; annotations also in all folders below, PNGs only in
+    those that are named like folders of the photos, because others may hold photos.
     """
     if not path.is_dir():
         return [path] if path.is_file() and path.suffix.lower() in suffixes else []
     if suffixes == (".png",):
         return files_of_photos(path, names, suffixes)
+    return _all_files(path, suffixes)
+
+
+def _all_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     return sorted(
         file
-        for file in path.rglob("*")
+        for file in folder.rglob("*")
         if file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file()
     )
+
+
+def _tell_of_other_folders(path: Path, files: list[Path]) -> None:
+    """Count the PNGs that were not looked at."""
+    others = sorted(set(_all_files(path, (".png",))) - set(files))
+    if others:
+        logger.warning(
+            "%s: %d PNG files in folders that are not named like those of the photos are left out, "
+            "such as %s",
+            path,
+            len(others),
+            others[0].relative_to(path),
+        )
