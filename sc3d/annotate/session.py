@@ -133,7 +133,9 @@ class Session:
         ]
 
     def photo(self, key: str) -> bytes:
-        """The photo as JPEG, as shown: turned by its EXIF orientation, as in LabelMe; strokes lie in this frame."""
+        """The photo as JPEG, as shown: turned by its EXIF orientation, as in LabelMe; strokes lie in this
+        frame.
+        """
         return self._jpeg(key)
 
     def try_out(self, key: str) -> bytes:

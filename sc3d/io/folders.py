@@ -1,4 +1,4 @@
-"""What of a folder is its owner's, and what sc3d has written there: a scene may lie inside the folder of photos."""
+"""What of a folder is its owner's, and what sc3d has written there: a scene may lie among the photos."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ PICTURES = ("train.jpg",)
 
 
 def files_below(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Files of a folder and its subfolders, ordered; and the folders and files in it that sc3d has written, scenes
-    among them, which are not looked into. Links to folders are not followed.
+    """Files of a folder and its subfolders, ordered; and the folders and files in it that sc3d has written,
+    scenes among them, which are not looked into. Links to folders are not followed.
     """
     found: list[Path] = []
     made: list[Path] = []
@@ -29,7 +29,7 @@ def files_below(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def is_scene(folder: Path) -> bool:
-    """Whether a folder is one of sc3d's scenes: an output with a sidecar lies in it, or a link to photos around it."""
+    """Whether a folder is a scene of sc3d: it holds an output with a sidecar, or a link to photos around it."""
     with suppress(OSError):
         sidecars = [*folder.glob("*.json"), *(folder / "sparse").glob("*.json")]
         images = folder / "images"

@@ -83,7 +83,8 @@ def open_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
         raise InputError(f"cannot read the {what} {path}: {_what_is_wrong(path)}") from None
 
 
-def _moved(link: Path) -> str:
+def broken_link(link: Path) -> str:
+    """What to say of a link to nothing."""
     return (
         f"{link} is a link to {link.readlink()}, which is not there: has it been moved? "
         "Put it back, or make the link anew"
@@ -94,7 +95,7 @@ def _what_is_wrong(path: Path) -> str:
     """Why an image cannot be opened, and what to do."""
     broken = next((link for link in (path, *path.parents) if link.is_symlink() and not link.exists()), None)
     if broken is not None:
-        return _moved(broken)
+        return broken_link(broken)
     head = b""
     with suppress(OSError):
         if path.is_file():
@@ -127,8 +128,8 @@ def _pillow() -> ModuleType:
 
 
 def check_end(path: Path) -> None:
-    """InputError for a JPEG, PNG or TIFF that stops within its picture: decoders fill the rest with gray and say
-    nothing.
+    """InputError for a JPEG, PNG or TIFF that stops within its picture: decoders fill the rest with gray and
+    say nothing.
     """
     with path.open("rb") as file:
         head = file.read(8)
@@ -192,19 +193,19 @@ NO_PHOTOS = {"__macosx", "@eadir", "thumbnails", "thumbs"}  # folders of archive
 
 
 def list_photos(folder: Path) -> list[Path]:
-    """Photos of a folder and its subfolders, by path. No photos are what sc3d has written there, hidden files and
-    folders, and thumbnails.
+    """Photos of a folder and its subfolders, by path. No photos are what sc3d has written there, hidden files
+    and folders, and thumbnails.
     """
     return _survey(folder)[0]
 
 
 def left_out(folder: Path) -> str:
-    """What in a folder of photos is not used, by reason, with numbers and examples; "" if there is nothing."""
-    return "; ".join(
-        f"{len(files)} {reason} ({', '.join(str(file.relative_to(folder)) for file in files[:3])}{' ...' if len(files) > 3 else ''})"
-        for reason, files in _survey(folder)[1].items()
-        if files
-    )
+    """What in a folder of photos is not used, by reason, with numbers and examples; "" if nothing is."""
+    parts = []
+    for reason, files in _survey(folder)[1].items():
+        shown = [str(file.relative_to(folder)) for file in files[:3]] + ["..."] * (len(files) > 3)
+        parts += [f"{len(files)} {reason} ({', '.join(shown)})"] if files else []
+    return "; ".join(parts)
 
 
 def _survey(folder: Path) -> tuple[list[Path], dict[str, list[Path]]]:
@@ -233,7 +234,7 @@ def _survey(folder: Path) -> tuple[list[Path], dict[str, list[Path]]]:
 def find_photos(folder: Path) -> list[Path]:
     """As `list_photos`; InputError if there are none, or one is a link that leads elsewhere."""
     if folder.is_symlink() and not folder.exists():
-        raise InputError(f"{_moved(folder)}")
+        raise InputError(broken_link(folder))
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: give the folder that holds the photos")
     photos = list_photos(folder)
@@ -279,7 +280,7 @@ def require_within(file: Path, folder: Path) -> None:
 def read_image(path: Path, folder: Path | None = None, shown: bool = False) -> np.ndarray:
     """(H, W, 3) uint8 RGB; InputError if it is damaged, cut off or too large.
 
-    folder: of all photos of the set, whose range of values 16-bit photos are stretched by; None: the photo's own
+    folder: of all photos of the set, by whose range 16-bit photos are stretched; None: the photo's own
     shown: turned by its EXIF orientation; else as stored (see `sc3d.io.orientation`)
     """
     orientation = read_orientation(path)
@@ -316,8 +317,8 @@ def read_stored(path: Path) -> np.ndarray:
 
 
 def read_opaque(path: Path) -> np.ndarray | None:
-    """(H, W) bool pixels of a photo, as stored, whose alpha is not 0: alpha is a mask, and what it hides is used
-    nowhere. None if there is no alpha, or all is opaque.
+    """(H, W) bool pixels of a photo, as stored, whose alpha is not 0: alpha is a mask, and what it hides is
+    used nowhere. None if there is no alpha, or all is opaque.
     """
     with open_image(path, "photo") as image:
         if not _has_alpha(image):
@@ -339,8 +340,9 @@ def _has_alpha(image: Image.Image) -> bool:
 
 @cache
 def used_range(folder: Path) -> tuple[int, int] | None:
-    """The range of values by which the 16-bit photos of a folder and its subfolders are stretched to 8 bits, one
-    for all, so that they stay comparable; None if they use at least half of all values, which need no stretching.
+    """The range of values by which the 16-bit photos of a folder and its subfolders are stretched to 8 bits,
+    one for all, so that they stay comparable; None if they use at least half of all values, which need no
+    stretching.
     """
     files = [file for file in find_photos(folder) if photo_bits(file) == 16]
     some = files[:: max(1, len(files) // SAMPLED_PHOTOS)]
@@ -462,8 +464,8 @@ def index_image_size(path: Path, photo: Path | None) -> tuple[int, int]:
 
 
 def mask_orientation(path: Path, photo: Path | None) -> tuple[int, bool]:
-    """How a mask is turned into the frame of its photo as stored, and whether only a rule says so (`mask_turn`);
-    (1, False) where there is no photo.
+    """How a mask is turned into the frame of its photo as stored, and whether only a rule says so
+    (`mask_turn`); (1, False) where there is no photo.
     """
     if photo is None or not photo.is_file():
         return 1, False
@@ -488,8 +490,8 @@ def data_uri(image: np.ndarray, suffix: str = ".jpg") -> str:
 
 
 def write_image(path: Path, image: np.ndarray, orientation: int = 1) -> None:
-    """Write (H, W) or (H, W, 3) uint8 RGB; the suffix chooses the format. orientation: for a PNG to state, that of
-    the photo in whose frame a mask lies.
+    """Write (H, W) or (H, W, 3) uint8 RGB; the suffix chooses the format. orientation: for a PNG to state,
+    that of the photo in whose frame a mask lies.
     """
     import cv2
 

@@ -1,9 +1,9 @@
 """Which way up the pixels of a picture lie. This is the one place that says so.
 
 sc3d's pixel frame is the photo as it is stored: COLMAP reads it so, cameras, masks and confidence maps in the
-scene folder lie in it. People and their programs see the photo as shown: turned by the orientation that its EXIF
-states (1 to 8). So whatever is drawn on a photo (masks, truth, strokes, LabelMe, COCO, CVAT) lies as the photo
-is shown; it is turned into sc3d's frame where it is read (`mask_turn`). Two things say otherwise:
+scene folder lie in it. People and their programs see the photo as shown: turned by the orientation that its
+EXIF states (1 to 8). So whatever is drawn on a photo (masks, truth, strokes, LabelMe, COCO, CVAT) lies as the
+photo is shown; it is turned into sc3d's frame where it is read (`mask_turn`). Two things say otherwise:
 
 - a picture that has an orientation of its own is turned by it first, as every viewer does. Masks that sc3d
   writes for turned photos carry the orientation of their photo, and so does nothing to them;
@@ -59,8 +59,8 @@ def inverse(orientation: int) -> int:
 def mask_turn(own: int, size: tuple[int, int], photo: int, photo_size: tuple[int, int]) -> tuple[int, bool]:
     """How a picture drawn on a photo is turned into the frame of the photo as stored.
 
-    own, photo: orientations that the picture and the photo state, 1 = none; size, photo_size: (width, height) px
-    as stored
+    own, photo: orientations that the picture and the photo state, 1 = none; size, photo_size: (width, height)
+    px as stored
     returns: the orientation to turn it by; whether only the rule says that it lies as the photo is shown, not
         its sides or its own orientation
     """

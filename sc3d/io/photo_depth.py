@@ -51,8 +51,8 @@ def value_range(images: Sequence[np.ndarray]) -> tuple[int, int] | None:
 
 
 def stretch(image: np.ndarray, used: Callable[[], tuple[int, int] | None]) -> np.ndarray:
-    """uint8 of an image of 8 or 16 bits: the used range of 16 bits becomes 0 to 255; without one, the high byte
-    is taken.
+    """uint8 of an image of 8 or 16 bits: the used range of 16 bits becomes 0 to 255; without one, the high
+    byte is taken.
 
     used: gives the range, asked for 16 bits only
     """

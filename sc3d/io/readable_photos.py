@@ -14,9 +14,9 @@ PNG = ".png"
 
 
 def readable_photos(images: Path, names: list[str], work: Path) -> tuple[Path, Path | None]:
-    """The folder that COLMAP shall read photos from, and that of its masks (`<name>.png`, 0 = no features), None
-    if no photo is transparent anywhere. The folder of photos is `images`, or one in `work` of the same names where
-    16-bit photos must be stretched.
+    """The folder that COLMAP shall read photos from, and that of its masks (`<name>.png`, 0 = no features),
+    None if no photo is transparent anywhere. The folder of photos is `images`, or one in `work` of the same
+    names where 16-bit photos must be stretched.
 
     names: relative to `images`
     """

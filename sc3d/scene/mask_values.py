@@ -1,9 +1,9 @@
 """What the values of a mask stand for: ids, or the colors of a palette.
 
-A palette PNG may hold ids with any palette, made to be looked at, or the colors of the class table in the order
-of whatever program wrote it; PNG optimizers turn gray pictures into palettes and into 1, 2 or 4 bits. Each way to
-read a file is tried on the values that occur in it. One that fits is taken; if several fit and disagree, the
-palette counts only if it surely is that of the class table, and anything else is refused.
+A palette PNG may hold ids with any palette, made to be looked at, or the colors of the class table in the
+order of whatever program wrote it; PNG optimizers turn gray pictures into palettes and into 1, 2 or 4 bits.
+Each way to read a file is tried on the values that occur in it. One that fits is taken; if several fit and
+disagree, the palette counts only if it surely is that of the class table, and anything else is refused.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def read_labels(path: Path, meanings: Meanings) -> np.ndarray:
 
 
 def read_values(path: Path, meanings: Meanings) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) uint8 values of a gray or palette PNG as stored; (256,) int16 class id of each value, UNKNOWN where
-    there is none. InputError as in `read_labels`.
+    """(H, W) uint8 values of a gray or palette PNG as stored; (256,) int16 class id of each value, UNKNOWN
+    where there is none. InputError as in `read_labels`.
     """
     image = read_samples(path)
     if image.palette is None and image.bits == 8:
@@ -105,8 +105,8 @@ def _is_table(image: IndexImage, meanings: Meanings) -> bool:
 
 
 def read_confidence(path: Path) -> np.ndarray:
-    """(H, W) uint8 values of a confidence map as stored: gray levels, also those of a gray palette; the index of
-    any other.
+    """(H, W) uint8 values of a confidence map as stored: gray levels, also those of a gray palette; the index
+    of any other.
     """
     image = read_samples(path)
     if image.palette is None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.images import (
+    broken_link,
     check_photo,
     find_photos,
     image_size,
@@ -134,9 +135,7 @@ class Scene:
             raise InputError(f"the scene folder {self.path} does not exist")
         for path in paths:
             if path.is_symlink() and not path.exists():
-                raise InputError(
-                    f"{path} is a link to {path.readlink()}, which is not there: has it been moved? Put it back, or make the link anew"
-                )
+                raise InputError(broken_link(path))
             if not path.exists():
                 raise InputError(f"{path} is missing: {hint}")
 

@@ -1,4 +1,4 @@
-"""Text in pictures, in any script that a font of the machine has: Pillow brings a font of ASCII letters only."""
+"""Text in pictures, in any script that a font of the machine has: Pillow's own font has ASCII letters."""
 
 from __future__ import annotations
 
@@ -34,8 +34,9 @@ LETTERS = {
 
 @lru_cache(maxsize=512)
 def lettering(text: str, size: int) -> tuple[str, FreeTypeFont]:
-    """The text as it can be drawn, and the font for it: Pillow's own if that has all letters, else the font of the
-    machine that has most of them. Letters that it lacks become similar ones, or their number ("U+9053").
+    """The text as it can be drawn, and the font for it: Pillow's own if that has all letters, else the font
+    of the machine that has most of them. Letters that it lacks become similar ones, or their number
+    ("U+9053").
 
     size: of the font, px
     """

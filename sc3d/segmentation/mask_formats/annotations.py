@@ -51,8 +51,8 @@ class PhotoAnnotations:
 
 
 def to_mask(photo: PhotoAnnotations, checks: Checks) -> tuple[str, CheckedMask] | None:
-    """The photo's name and its mask, not painted yet; None if there is nothing to paint or something is wrong,
-    which `checks` keeps.
+    """The photo's name and its mask, not painted yet; None if there is nothing to paint or something is
+    wrong, which `checks` keeps.
     """
     with_area = [annotation for annotation in photo.annotations if annotation.build is not None]
     checks.skip(annotation.kind for annotation in photo.annotations if annotation.build is None)

@@ -91,7 +91,9 @@ class ClassMapping:
 
     @cached_property
     def meanings(self) -> Meanings:
-        """What the values and the palettes of PNGs may stand for; without ids or colors where the mapping has none."""
+        """What the values and the palettes of PNGs may stand for; without ids or colors where the mapping has
+        none.
+        """
         if self.mapping is None:
             return meanings_of(self.table)
         try:

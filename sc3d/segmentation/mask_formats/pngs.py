@@ -1,4 +1,5 @@
-"""PNGs with one id or one color per pixel, named like the photos; values are taken exactly, nothing is guessed.
+"""PNGs with one id or one color per pixel, named like the photos; values are taken exactly, nothing is
+guessed.
 
 Ids are those of the class table, or those of a mapping: then also 16-bit, such as ADE20K's and Cityscapes'.
 Colors are those of the class table or of a mapping; a color between two classes, as JPEG and smooth scaling
@@ -70,7 +71,9 @@ def is_colored(file: Path) -> bool:
 def _read_codes(
     file: Path, colored: bool, format: str, classes: ClassMapping
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) values or colors 0xRRGGBB of a PNG, and the class id of each (int16, UNKNOWN where there is none)."""
+    """(H, W) values or colors 0xRRGGBB of a PNG, and the class id of each (int16, UNKNOWN where there is
+    none).
+    """
     if colored:
         return _read_colors(file), classes.by_color
     with open_image(file, "mask") as image:

@@ -289,8 +289,8 @@ def _pieces(strokes: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 def sample_pixels(
     strokes: np.ndarray, wanted: np.ndarray, most: int, random: np.random.Generator
 ) -> np.ndarray:
-    """Places of at most about `most` wanted pixels, of each stroke its share, but at least `_MIN_PIXELS` of small
-    ones: they correct large ones.
+    """Places of at most about `most` wanted pixels, of each stroke its share, but at least `_MIN_PIXELS` of
+    small ones: they correct large ones.
 
     strokes: (P,) int number of each pixel's stroke; wanted: (P,) bool
     returns: (N,) int places, ascending

@@ -2,9 +2,9 @@
 
 LabelMe JSON: shapes of type linestrip, line, point (with `"width": <px>`, which LabelMe keeps although it
 does not know it), polygon, rectangle and circle; coordinates in px from the upper left corner of the photo as
-it is shown (`sc3d.io.orientation`); later shapes cover earlier ones. The label is the name of a class, or `_background_` for what
-belongs to no class. PNG: the colors of the class table; black and transparent pixels say nothing. A photo may
-have both, the PNG below.
+it is shown (`sc3d.io.orientation`); later shapes cover earlier ones. The label is the name of a class, or
+`_background_` for what belongs to no class. PNG: the colors of the class table; black and transparent pixels
+say nothing. A photo may have both, the PNG below.
 """
 
 from __future__ import annotations
@@ -140,8 +140,8 @@ def _outside(shapes: tuple[StrokeShape, ...], size: tuple[int, int]) -> list[int
 def read_shapes(
     content: object, origin: Path | str, photo: Path, class_table: ClassTable
 ) -> tuple[StrokeShape, ...]:
-    """`parse_shapes` for a photo as shown; shapes whose file states the size of the photo as stored, and not as
-    shown, are turned.
+    """`parse_shapes` for a photo as shown; shapes whose file states the size of the photo as stored, and not
+    as shown, are turned.
     """
     orientation, size = read_orientation(photo), image_size(photo)
     sides = [content.get(key) for key in ("imageWidth", "imageHeight")] if isinstance(content, dict) else []
@@ -211,8 +211,8 @@ def _is_number(value: object) -> bool:
 
 
 def _photo_of(file: Path, folder: Path, content: object, names: PhotoNames) -> str:
-    """The photo that `imagePath` names, with the folder of the file where that is not clear, or else the one that
-    the file is named after.
+    """The photo that `imagePath` names, with the folder of the file where that is not clear, or else the one
+    that the file is named after.
     """
     path, place = content.get("imagePath") if isinstance(content, dict) else None, photo_name(file, folder)
     for changed in (False, True):
@@ -230,8 +230,8 @@ def _photo_of(file: Path, folder: Path, content: object, names: PhotoNames) -> s
 
 
 def _read_picture(file: Path, photo: Path, class_table: ClassTable) -> np.ndarray:
-    """(H, W) int16 class ids of a PNG in the colors of the class table, on the photo as shown, NOTHING where it is
-    black or transparent.
+    """(H, W) int16 class ids of a PNG in the colors of the class table, on the photo as shown, NOTHING where
+    it is black or transparent.
     """
     onto, photo_size = mask_orientation(file, photo)[0], image_size(photo)
     check_mask_aspect(file, turned_size(image_size(file), onto), photo_size)
