@@ -45,7 +45,9 @@ def check_png(file: Path, format: str, checks: Checks) -> Iterator[tuple[str, Ch
         checks.add("value", _describe(file, codes, unknown, colored, checks.classes))
         return
     ids = checks.classes.meanings.by_id
-    checks.by_palette += not colored and bool((table[codes] != ids[np.minimum(codes, len(ids) - 1)]).any())
+    checks.by_palette += not colored and bool(
+        (table[codes] != ids[np.minimum(codes, len(ids) - 1, dtype=np.int64)]).any()
+    )
     read = partial(read_png, file, colored, format, checks.classes, turn)
     yield name, CheckedMask(str(file), turned_size(size, turn), read)
 
