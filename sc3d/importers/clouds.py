@@ -13,8 +13,11 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.clouds import read_cloud, read_mesh
-from sc3d.io.las import check_las
-from sc3d.io.ply import read_header
+from sc3d.io.colors import to_bytes
+from sc3d.io.las import open_las
+from sc3d.io.las_crs import read_crs
+from sc3d.io.ply import RESERVED, read_header
+from sc3d.io.splats import OTHER_FORMATS, SPLATS
 
 if TYPE_CHECKING:
     import laspy
@@ -24,6 +27,8 @@ CLOUDS = {".ply", ".las", ".laz", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts", ".
 MESHES = {".ply", ".obj"}
 # as PDAL and CloudCompare name it
 CLASSIFICATION = ("classification", "scalar_Classification", "scalar_classification", "Classification")
+# as CloudCompare and PDAL name them in LAS, and PCL in PCD
+NORMALS = (("NormalX", "NormalY", "NormalZ"), ("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 LAS_EXTRAS = ("intensity", "return_number", "number_of_returns")
 
 
@@ -55,6 +60,8 @@ def read_geometry(path: Path) -> Geometry:
         found = _read_open3d(path)
     elif suffix in CLOUDS:
         found = _read_text(path)
+    elif suffix in OTHER_FORMATS:
+        raise InputError(f"{path} {SPLATS}")
     else:
         raise InputError(f"{path}: {', '.join(sorted(CLOUDS | MESHES))} can be read")
     if not len(found.positions):
@@ -86,25 +93,19 @@ def to_open3d(geometry: Geometry) -> o3d.t.geometry.PointCloud | o3d.t.geometry.
             )
         )
     for name, values in geometry.attributes.items():
-        table[name] = tensor(np.ascontiguousarray(values.reshape(len(values), -1)))
+        columns = np.ascontiguousarray(values.reshape(len(values), -1))
+        if name not in RESERVED:
+            table[name] = tensor(columns)
+        elif name == "normals" and columns.shape[1] == 3:
+            table.normals = tensor(columns)
+        else:  # not what Open3D means by it
+            table[f"{name}_"] = tensor(columns)
     return made
 
 
 def _read_las(path: Path) -> Geometry:
-    import laspy
-
-    check_las(path)
-    try:
-        # not laszip, which ends the process for broken files
-        file = laspy.read(path, laz_backend=(laspy.LazBackend.LazrsParallel, laspy.LazBackend.Lazrs))
-        return _las_geometry(file, path)
-    except (KeyboardInterrupt, InputError):
-        raise
-    # laspy raises many kinds for broken files; a panic of lazrs is no Exception
-    except BaseException as error:
-        raise InputError(
-            f"cannot read {path}: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
-        ) from None
+    with open_las(path) as reader:
+        return _las_geometry(reader.read(), path)
 
 
 def _las_geometry(file: laspy.LasData, path: Path) -> Geometry:
@@ -116,30 +117,22 @@ def _las_geometry(file: laspy.LasData, path: Path) -> Geometry:
     attributes |= {name: np.asarray(file[name]) for name in file.point_format.extra_dimension_names}
     colors = None
     if {"red", "green", "blue"} <= names:
-        colors = np.stack([np.asarray(file[name]) for name in ("red", "green", "blue")], axis=1)
-        colors = (colors >> 8 if colors.max(initial=0) > 255 else colors).astype(np.uint8)
-    return Geometry(
-        np.asarray(file.xyz, np.float64),
-        colors,
-        {name: _storable(values) for name, values in attributes.items()},
-        epsg=_las_epsg(file.header, path),
-    )
+        colors = to_bytes(np.stack([np.asarray(file[name]) for name in ("red", "green", "blue")], axis=1))
+    crs = read_crs(file.header, path)
+    positions = np.asarray(file.xyz, np.float64)
+    positions[:, 2] *= crs.height_scale
+    return Geometry(positions, colors, _with_normals(attributes), epsg=crs.epsg)
 
 
-def _las_epsg(header: laspy.LasHeader, path: Path) -> int | None:
-    """EPSG code of the horizontal CRS in a LAS header."""
-    import pyproj
-
-    try:
-        crs = header.parse_crs()
-    except (pyproj.exceptions.CRSError, ValueError, IndexError):
-        return None
-    if crs is None:
-        return None
-    crs = crs.sub_crs_list[0] if crs.is_compound else crs
-    if crs.is_geographic:
-        raise InputError(f"{path} is in {crs.name}, in degrees: convert it to a projected CRS first")
-    return crs.to_epsg()
+def _with_normals(attributes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same attributes, with normals in three of them under their usual name."""
+    for names in NORMALS:
+        if set(names) <= attributes.keys():
+            normals = np.stack([attributes[name] for name in names], axis=1).astype(np.float32)
+            return {name: values for name, values in attributes.items() if name not in names} | {
+                "normals": normals
+            }
+    return attributes
 
 
 def _read_open3d(path: Path) -> Geometry:
@@ -147,27 +140,20 @@ def _read_open3d(path: Path) -> Geometry:
     table = {name: values.numpy() for name, values in cloud.point.items()}
     colors = table.pop("colors", None)
     positions = table.pop("positions")
-    if colors is not None and colors.dtype != np.uint8:
-        colors = np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8)
     return Geometry(
         positions.astype(np.float64),
         colors,
-        _classified({name: _storable(values) for name, values in table.items()}),
+        _with_normals(_classified(table)),
     )
 
 
 def _read_ply_mesh(path: Path) -> Geometry:
-    """A PLY mesh with Open3D's older reader, which keeps float64; further attributes of the vertices are
-    lost.
-    """
-    import open3d as o3d
-
-    read_mesh(path)  # checks that it is whole
-    mesh = o3d.io.read_triangle_mesh(str(path))
-    colors = (
-        np.rint(np.asarray(mesh.vertex_colors) * 255).astype(np.uint8) if mesh.has_vertex_colors() else None
+    """Further attributes of the vertices are lost."""
+    mesh = read_mesh(path)
+    colors = to_bytes(mesh.vertex.colors.numpy()) if "colors" in mesh.vertex else None
+    return Geometry(
+        mesh.vertex.positions.numpy().astype(np.float64), colors, {}, mesh.triangle.indices.numpy()
     )
-    return Geometry(np.asarray(mesh.vertices), colors, {}, np.asarray(mesh.triangles))
 
 
 def _read_obj(path: Path) -> Geometry:
@@ -192,12 +178,7 @@ def _read_obj(path: Path) -> Geometry:
         raise InputError(f"{path} cannot be read as OBJ: {error}") from None
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(table):
         raise InputError(f"{path} holds no triangles, or triangles of vertices that it does not hold")
-    colors = table[:, 3:6] if table.shape[1] >= 6 else None
-    colors = (
-        None
-        if colors is None
-        else np.clip(np.rint(colors * (255 if colors.max() <= 1 else 1)), 0, 255).astype(np.uint8)
-    )
+    colors = to_bytes(table[:, 3:6]) if table.shape[1] >= 6 else None
     return Geometry(table[:, :3], colors, {}, triangles)
 
 
@@ -260,17 +241,3 @@ def _classified(attributes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             values = attributes.pop(name)
             return attributes | {"classification": np.clip(np.rint(values), 0, 255).astype(np.uint8)}
     return attributes
-
-
-def _storable(values: np.ndarray) -> np.ndarray:
-    """Numbers of a type that Open3D writes to PLY."""
-    if values.dtype == bool:
-        return values.astype(np.uint8)
-    if (
-        values.dtype.kind == "u"
-        and values.dtype.itemsize > 1
-        or values.dtype.kind == "i"
-        and values.dtype.itemsize > 4
-    ):
-        return values.astype(np.int32 if values.max(initial=0) < 2**31 else np.float64)
-    return values.astype(np.float32) if values.dtype == np.float16 else values

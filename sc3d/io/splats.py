@@ -33,6 +33,11 @@ NORMALS = ["nx", "ny", "nz"]
 ORIGIN = "sc3d origin"
 DEGREES = {0: 0, 9: 1, 24: 2, 45: 3}  # of the harmonics, by the number of f_rest properties
 FLAT = 1e-3  # third scale of a Gaussian that has two, times the smaller of them
+# what is said of a file that was meant to be a cloud
+SPLATS = (
+    "holds Gaussian splats, not a cloud: copy it to SCENE/gaussians.ply as a plain splat PLY,"
+    " and run `sc3d extract SCENE`"
+)
 OTHER_FORMATS = {".splat", ".spz", ".ksplat", ".sog"}
 
 

@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
-from sc3d.geometry.cameras import local_origin
+from sc3d.geometry.cameras import View, local_origin
 from sc3d.io.atomic import atomic_path
 from sc3d.io.clouds import write_geometry
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.fusion import fuse
-from sc3d.labelling.inputs import Masks, best_confidence, default_voxel_size, point_density, read_given_cloud
+from sc3d.labelling.inputs import (
+    Masks,
+    best_confidence,
+    default_voxel_size,
+    given_cloud_path,
+    point_density,
+    read_given_cloud,
+    require_in_view,
+)
+from sc3d.scene.frame_check import Box, box_of, describe
 from sc3d.scene.labelled_cloud import point_arrays, read_surface, with_labels
-from sc3d.scene.labels import STATE_NAMES
+from sc3d.scene.labels import STATE_NAMES, UNSEEN
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -38,11 +51,28 @@ class LabelSummary:
         return {"points": int(self.counts.sum()), "views": self.num_views, "voxel_size": size, **states}
 
 
+def summarize(counts: np.ndarray, voxel_size: float, views: list[View], path: Path, box: Box) -> LabelSummary:
+    """The summary of a cloud; a warning with numbers if no point of it was seen. box: around the cloud, world"""
+    if not counts[np.arange(len(counts)) != UNSEEN].any():
+        logger.warning(
+            "no photo sees any of the %d points of %s with a label: the points are at %s, the %d cameras with masks at %s",
+            counts.sum(),
+            path,
+            describe(box),
+            len(views),
+            describe(box_of(np.array([view.center for view in views]))),
+        )
+    return LabelSummary(counts, voxel_size, len(views))
+
+
 def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     """Fuse the masks of a scene on its cloud (or `settings.cloud`) and write seeds and votes."""
     settings = settings.resolved
     masks = Masks.load(scene, best_confidence(scene) if settings.use_confidence else None)
     given = read_given_cloud(scene, settings.cloud)
+    path, positions = given_cloud_path(scene, settings.cloud), given.point.positions.numpy()
+    box = positions.min(axis=0), positions.max(axis=0)
+    require_in_view(path, box, masks, scene.model.points)
     points, normals = point_arrays(given, np.array([view.center for view in masks.views]))
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=default_voxel_size(points, masks))
@@ -57,4 +87,4 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         fusion.grid.save(temporary)
     write_geometry(settings.output or scene.seeds, with_labels(given, normals, fusion.labels, fusion.votes))
     counts = np.bincount(fusion.labels.state, minlength=len(STATE_NAMES))
-    return LabelSummary(counts, settings.voxel_size, len(masks.views))
+    return summarize(counts, settings.voxel_size, masks.views, path, box)

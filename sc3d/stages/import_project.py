@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from sc3d.errors import InputError
 from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
 from sc3d.importers.clouds import CLOUDS, MESHES, is_mesh, read_geometry, to_open3d
@@ -15,9 +17,13 @@ from sc3d.importers.project import project_files, read_project
 from sc3d.io.atomic import require_writable
 from sc3d.io.clouds import write_geometry
 from sc3d.io.images import require_place
+from sc3d.io.splats import OTHER_FORMATS
 from sc3d.runner import execute
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import, ImportCommand
+
+
+NO_POINTS = np.zeros((0, 3))
 
 
 def main(command: ImportCommand) -> None:
@@ -37,7 +43,7 @@ def is_geometry(path: Path, settings: Import) -> bool:
     return settings.source == "cloud" or (
         settings.source == "auto"
         and path.is_file()
-        and path.suffix.lower() in CLOUDS | MESHES
+        and path.suffix.lower() in CLOUDS | MESHES | OTHER_FORMATS
         and not path.name.endswith("calibrated_camera_parameters.txt")
     )
 
@@ -70,7 +76,8 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
         views, georeference = project.views, project.georeference
         if photos is not None:
             require_place(photos, scene.images)
-    placed = place_geometries(geometries, georeference, views, settings.epsg)
+    sparse_points = project.points if project is not None else scene.model.points if views else NO_POINTS
+    placed = place_geometries(geometries, georeference, views, sparse_points, settings.epsg)
     if project is not None:
         figures = write_project(scene, project, photos, [geometry for geometry, _ in placed.values()])
         georeference_path(scene).unlink(missing_ok=True)

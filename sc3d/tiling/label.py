@@ -19,8 +19,15 @@ from sc3d.io.images import image_size
 from sc3d.io.ply import write_records
 from sc3d.labelling.cloud import Cloud, CloudExtent
 from sc3d.labelling.fusion import Fusion, fuse
-from sc3d.labelling.inputs import FOOTPRINT_SAMPLE, Masks, best_confidence, point_density, voxel_size_for
-from sc3d.labelling.label import LabelSummary
+from sc3d.labelling.inputs import (
+    FOOTPRINT_SAMPLE,
+    Masks,
+    best_confidence,
+    point_density,
+    require_in_view,
+    voxel_size_for,
+)
+from sc3d.labelling.label import LabelSummary, summarize
 from sc3d.scene.labelled_cloud import SPACING_NEIGHBORS, SPACING_SAMPLE, VOTES, unit_normals
 from sc3d.scene.labels import STATE_NAMES
 from sc3d.scene.scene import Scene
@@ -60,15 +67,13 @@ class LabelJob:
 
 
 def label_fits(scene: Scene, settings: Label) -> bool:
-    """Whether cloud and mesh fit into memory as a whole, and nobody asked for workers. LAS and LAZ are read in parts in
-    any case.
-    """
+    """Whether cloud and mesh fit into memory as a whole, and nobody asked for workers."""
     source = settings.cloud or scene.cloud
     count = num_points(source)
     if count is None or not source.exists():
         return True  # cannot be read in parts
     needed = count * BYTES + mesh_triangles(scene.mesh) * TRIANGLE
-    return source.suffix.lower() == ".ply" and fits(needed, settings)
+    return fits(needed, settings)
 
 
 def label_scene(scene: Scene, settings: Label) -> LabelSummary:
@@ -91,6 +96,8 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     ]
     folder = WorkFolder(output, "label", decisive, settings)
     statistics = CloudStatistics.from_cloud(cloud)
+    box = statistics.extent.low, statistics.extent.high
+    require_in_view(cloud.path, box, masks, scene.model.points)
     margin = BLOCKS * BLOCK * (settings.voxel_size or VOXEL * statistics.spacing)
     grid = statistics.grid(max_points(settings, BYTES), margin)
     store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
@@ -107,7 +114,7 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     write_field(job.results, store.tiles, settings.voxel_size, scene.votes_of(settings.output))
     counts = _write(output, cloud, job, scene.class_table().num_ids)
     folder.remove()
-    return LabelSummary(counts, settings.voxel_size, len(masks.views))
+    return summarize(counts, settings.voxel_size, masks.views, cloud.path, box)
 
 
 def _ranges(
