@@ -15,7 +15,7 @@ from sc3d.errors import InputError
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.colors import to_bytes
 from sc3d.io.las import open_las
-from sc3d.io.las_crs import read_crs
+from sc3d.io.crs import read_las_crs
 from sc3d.io.ply import RESERVED, read_header
 from sc3d.io.splats import OTHER_FORMATS, SPLATS
 
@@ -118,7 +118,7 @@ def _las_geometry(file: laspy.LasData, path: Path) -> Geometry:
     colors = None
     if {"red", "green", "blue"} <= names:
         colors = to_bytes(np.stack([np.asarray(file[name]) for name in ("red", "green", "blue")], axis=1))
-    crs = read_crs(file.header, path)
+    crs = read_las_crs(file.header, path)
     positions = np.asarray(file.xyz, np.float64)
     positions[:, 2] *= crs.height_scale
     return Geometry(positions, colors, _with_normals(attributes), epsg=crs.epsg)

@@ -22,7 +22,7 @@ from sc3d.importers.frames import frame_of, move_to_world, place_geometry, turn_
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.io.clouds import write_geometry
 from sc3d.io.las import open_las
-from sc3d.io.las_crs import read_crs
+from sc3d.io.crs import read_las_crs
 from sc3d.io.ply import read_header, write_records
 from sc3d.scene.scene import Scene
 from sc3d.settings.common import Resources
@@ -85,7 +85,7 @@ def _stated(path: Path, geometry: Geometry | None) -> int | None:
     if path.suffix.lower() not in PARTS:
         return None
     with open_las(path) as reader:
-        return read_crs(reader.header, path).epsg
+        return read_las_crs(reader.header, path).epsg
 
 
 def _write_in_parts(target: Path, path: Path, epsg: int | None, georeference: Georeference | None) -> None:

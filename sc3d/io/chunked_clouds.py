@@ -12,7 +12,7 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.colors import COLORS, color_names, to_bytes
 from sc3d.io.las import check_las, open_las
-from sc3d.io.las_crs import read_crs
+from sc3d.io.crs import read_las_crs
 from sc3d.io.limits import FARTHEST
 from sc3d.io.ply import check_ply
 from sc3d.io.splats import SPLATS, is_splat_ply
@@ -128,7 +128,7 @@ def _with_bytes(record: np.dtype) -> np.dtype:
 def _read_las(cloud: CloudFile) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     start = 0
     with open_las(cloud.path) as file:
-        scale = read_crs(file.header, cloud.path).height_scale
+        scale = read_las_crs(file.header, cloud.path).height_scale
         for points in file.chunk_iterator(RECORDS_AT_ONCE):
             columns = {axis: np.asarray(getattr(points, axis)) for axis in "xyz"}
             columns["z"] = columns["z"] * scale

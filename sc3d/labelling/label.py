@@ -22,6 +22,7 @@ from sc3d.labelling.inputs import (
     read_given_cloud,
     require_in_view,
 )
+from sc3d.labelling.normal_sides import judge_sides, sample_step, with_sides
 from sc3d.scene.frame_check import Box, box_of, describe
 from sc3d.scene.labelled_cloud import point_arrays, read_surface, with_labels
 from sc3d.scene.labels import STATE_NAMES, UNSEEN
@@ -33,11 +34,14 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LabelSummary:
-    """Of a labelled cloud. counts: (states,) int64 points in each state; voxel_size: of the label field, world units"""
+    """Of a labelled cloud. counts: (states,) int64 points in each state; voxel_size: of the label field, world units;
+    num_turned: given normals that were turned around
+    """
 
     counts: np.ndarray
     voxel_size: float
     num_views: int
+    num_turned: int = 0
 
     def figures(self) -> dict[str, object]:
         """What the stage reports."""
@@ -48,11 +52,18 @@ class LabelSummary:
             if name != "propagated"
         }
         size = round(self.voxel_size, 5)
-        return {"points": int(self.counts.sum()), "views": self.num_views, "voxel_size": size, **states}
+        turned = {"normals_turned": self.num_turned} if self.num_turned else {}
+        points = int(self.counts.sum())
+        return {"points": points, "views": self.num_views, "voxel_size": size, **turned, **states}
 
 
-def summarize(counts: np.ndarray, voxel_size: float, views: list[View], path: Path, box: Box) -> LabelSummary:
-    """The summary of a cloud; a warning with numbers if no point of it was seen. box: around the cloud, world"""
+def summarize(
+    counts: np.ndarray, voxel_size: float, views: list[View], path: Path, box: Box, num_turned: int
+) -> LabelSummary:
+    """The summary of a cloud; a warning with numbers if no point of it was seen.
+
+    box: around the cloud, world; num_turned: normals that were turned
+    """
     if not counts[np.arange(len(counts)) != UNSEEN].any():
         logger.warning(
             "no photo sees any of the %d points of %s with a label: the points are at %s, the %d cameras with masks at %s",
@@ -62,7 +73,7 @@ def summarize(counts: np.ndarray, voxel_size: float, views: list[View], path: Pa
             len(views),
             describe(box_of(np.array([view.center for view in views]))),
         )
-    return LabelSummary(counts, voxel_size, len(views))
+    return LabelSummary(counts, voxel_size, len(views), num_turned)
 
 
 def label_scene(scene: Scene, settings: Label) -> LabelSummary:
@@ -74,6 +85,11 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     box = positions.min(axis=0), positions.max(axis=0)
     require_in_view(path, box, masks, scene.model.points)
     points, normals = point_arrays(given, np.array([view.center for view in masks.views]))
+    step = sample_step(len(points))
+    sides = judge_sides(points[::step], normals[::step], masks.views, path)
+    turned = with_sides(points, normals, masks.views, sides)
+    num_turned = int((turned != normals).any(axis=1).sum())
+    normals = turned
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=default_voxel_size(points, masks))
     surface, density = None, None
@@ -87,4 +103,4 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         fusion.grid.save(temporary)
     write_geometry(settings.output or scene.seeds, with_labels(given, normals, fusion.labels, fusion.votes))
     counts = np.bincount(fusion.labels.state, minlength=len(STATE_NAMES))
-    return summarize(counts, settings.voxel_size, masks.views, path, box)
+    return summarize(counts, settings.voxel_size, masks.views, path, box, num_turned)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,6 +17,8 @@ from sc3d.geometry.raycast import FirstSurface, RayTarget, Surface, first_surfac
 from sc3d.geometry.voxel_traversal import VoxelSurface
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.scene.labels import STATE_NAMES, Labels
+
+logger = logging.getLogger(__name__)
 
 NORMAL_NEIGHBORS = 30
 SPACING_SAMPLE, SPACING_NEIGHBORS = 100_000, 8
@@ -47,8 +50,12 @@ def unit_normals(
     if given is not None:
         normals = given.astype(np.float32)
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        if np.isfinite(lengths).all() and (lengths > 0).all():
+        unusable = ~(np.isfinite(lengths) & (lengths > 0))
+        if not unusable.any():
             return normals / lengths
+        logger.warning(
+            "%d of %d normals have no length or are not finite: all are estimated", unusable.sum(), len(normals)
+        )
     neighbors, _ = NeighborIndex(points, origin).nearest(points, NORMAL_NEIGHBORS)
     if neighbors.shape[1] < 3:
         raise InputError(f"the cloud has {len(points)} points: normals need at least 3")

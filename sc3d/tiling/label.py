@@ -28,6 +28,7 @@ from sc3d.labelling.inputs import (
     voxel_size_for,
 )
 from sc3d.labelling.label import LabelSummary, summarize
+from sc3d.labelling.normal_sides import Sides, judge_sides, sample_step, with_sides
 from sc3d.scene.labelled_cloud import SPACING_NEIGHBORS, SPACING_SAMPLE, VOTES, unit_normals
 from sc3d.scene.labels import STATE_NAMES
 from sc3d.scene.scene import Scene
@@ -50,7 +51,7 @@ BLOCKS = 2
 @dataclass(frozen=True)
 class LabelJob:
     """What the task of a tile needs to know. settings: with the voxel size; maps: None = no occlusion test;
-    confidence: folder of confidence maps or None
+    confidence: folder of confidence maps or None; sides: what to do with given normals
     """
 
     scene: Path
@@ -60,6 +61,7 @@ class LabelJob:
     results: Results
     maps: RangeMaps | None
     confidence: Path | None
+    sides: Sides = Sides.KEEP
 
     @property
     def margin(self) -> float:
@@ -104,17 +106,19 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     spacing, sample = sample_spacing(store, statistics)
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=voxel_size_for(spacing, sample, masks))
+    sides = _judge_sides(cloud, masks)
     with open_executor(settings) as executor:
         maps = None
         if settings.depth_filter:
             maps = _ranges(scene, masks, store, spacing, settings, folder, executor)
         results = Results(folder.subfolder("results"), store)
-        job = LabelJob(scene.path, settings, statistics.extent, store, results, maps, confidence)
+        job = LabelJob(scene.path, settings, statistics.extent, store, results, maps, confidence, sides)
         executor.run("voting", partial(label_tile, job), store.tiles)
     write_field(job.results, store.tiles, settings.voxel_size, scene.votes_of(settings.output))
     counts = _write(output, cloud, job, scene.class_table().num_ids)
     folder.remove()
-    return summarize(counts, settings.voxel_size, masks.views, cloud.path, box)
+    num_turned = sum(int(results.read(tile, "turned")[0]) for tile in store.tiles)
+    return summarize(counts, settings.voxel_size, masks.views, cloud.path, box, num_turned)
 
 
 def _ranges(
@@ -143,6 +147,22 @@ def _ranges(
             scene.path, mesh, maps, {view.name: image_size(masks.files[view.name]) for view in masks.views}
         ),
         executor,
+    )
+
+
+def _judge_sides(cloud: CloudFile, masks: Masks) -> Sides:
+    """What to do with the cloud's own normals, by the points that `labelling.label` looks at."""
+    step, found = sample_step(cloud.num_points), []
+    for start, records in cloud.chunks() if {"nx", "ny", "nz"} <= set(cloud.names) else ():
+        found.append(records[-start % step :: step])
+    if not found:
+        return Sides.KEEP
+    sample = np.concatenate(found)
+    given = columns(sample, ("nx", "ny", "nz"))
+    lengths = np.linalg.norm(given, axis=1, keepdims=True)
+    usable = np.isfinite(lengths[:, 0]) & (lengths[:, 0] > 0)
+    return judge_sides(
+        positions(sample)[usable], given[usable] / lengths[usable], masks.views, cloud.path
     )
 
 
@@ -186,6 +206,9 @@ def label_tile(job: LabelJob, tile: int) -> None:
         np.array([view.center for view in masks.views]),
         job.extent.low,
     )
+    turned = with_sides(points, normals, masks.views, job.sides)
+    num_turned = (turned != normals)[halo.core].any(axis=1).sum()
+    normals = turned
     origin = voxel_origin(job.extent.low, job.settings.voxel_size)
     density = None
     if job.settings.mechanisms.density:
@@ -210,7 +233,7 @@ def label_tile(job: LabelJob, tile: int) -> None:
         normals=normals[core],
     )
     keys, votes = _blocks(fusion, points, core)
-    job.results.write(tile, keys=keys, field=votes)
+    job.results.write(tile, turned=np.array([num_turned]), keys=keys, field=votes)
 
 
 def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

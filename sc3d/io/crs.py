@@ -1,4 +1,4 @@
-"""Which CRS a LAS file says that its points are in, and the unit of its heights: WKT, or GeoTIFF keys.
+"""The CRS of files: its horizontal part, and the unit of the heights; in LAS by WKT or GeoTIFF keys.
 
 Keys: http://geotiff.maptools.org/spec/geotiff6.html: 3072 is the projected CRS, 3076 its unit, 4096 the vertical
 CRS, 4099 the unit of heights; 32767 = defined elsewhere.
@@ -30,7 +30,7 @@ class FileCrs(NamedTuple):
     height_scale: float = 1.0
 
 
-def read_crs(header: laspy.LasHeader, path: Path) -> FileCrs:
+def read_las_crs(header: laspy.LasHeader, path: Path) -> FileCrs:
     """The CRS of a LAS file; InputError for one in degrees; a warning for one that cannot be used."""
     import pyproj
 
@@ -45,17 +45,9 @@ def read_crs(header: laspy.LasHeader, path: Path) -> FileCrs:
 
 
 def describe_crs(crs: pyproj.CRS, path: Path, height_unit: float | None = None) -> FileCrs:
-    """What a CRS says, compound or bound to another by TOWGS84 or not. height_unit: meters, of a file that states
-    it elsewhere.
-    """
-    crs = _unbound(crs)
-    if crs.is_compound:
-        parts = [_unbound(part) for part in crs.sub_crs_list]
-        crs, vertical = parts[0], parts[1]
-        height_unit = float(vertical.axis_info[0].unit_conversion_factor)
-    elif len(crs.axis_info) > 2:
-        height_unit = float(crs.axis_info[2].unit_conversion_factor)
-        crs = crs.to_2d()
+    """What a CRS says. height_unit: meters, of a file that states it elsewhere."""
+    crs, unit_of_heights = split_crs(crs)
+    height_unit = unit_of_heights or height_unit
     if crs.is_geographic or crs.is_geocentric:
         unit = "in degrees" if crs.is_geographic else "geocentric"
         raise InputError(f"{path} is in {crs.name}, {unit}: convert it to a projected CRS first")
@@ -67,8 +59,22 @@ def describe_crs(crs: pyproj.CRS, path: Path, height_unit: float | None = None) 
     unit = float(crs.axis_info[0].unit_conversion_factor) if crs.axis_info else 1.0
     scale = 1.0 if height_unit is None else height_unit / unit
     if abs(scale - 1) > 1e-9:
-        logger.info("%s: heights are in other units than eastings, and are multiplied by %.7g", path, scale)
-    return FileCrs(epsg, scale)
+        logger.info("%s: heights are in another unit than eastings: multiplied by %.7g", path, scale)
+        return FileCrs(epsg, scale)
+    return FileCrs(epsg)
+
+
+def split_crs(crs: pyproj.CRS) -> tuple[pyproj.CRS, float | None]:
+    """The horizontal part of a CRS, be it compound, bound to another by TOWGS84, or with heights of its own; and
+    meters per unit of its heights, None = it does not say.
+    """
+    crs = _unbound(crs)
+    if crs.is_compound:
+        horizontal, vertical = (_unbound(part) for part in crs.sub_crs_list[:2])
+        return horizontal, float(vertical.axis_info[0].unit_conversion_factor)
+    if crs.is_geocentric or len(crs.axis_info) < 3:
+        return crs, None
+    return crs.to_2d(), float(crs.axis_info[2].unit_conversion_factor)
 
 
 def _unbound(crs: pyproj.CRS) -> pyproj.CRS:
