@@ -4,6 +4,7 @@ classes and whatever else they hold.
 
 from __future__ import annotations
 
+import logging
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,22 +14,31 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.clouds import read_cloud, read_mesh
-from sc3d.io.colors import to_bytes
-from sc3d.io.las import open_las
+from sc3d.io.colors import COLORS, color_names, to_bytes
 from sc3d.io.crs import read_las_crs
+from sc3d.io.las import open_las
 from sc3d.io.ply import RESERVED, read_header
 from sc3d.io.splats import OTHER_FORMATS, SPLATS
+from sc3d.io.text_clouds import read_table
 
 if TYPE_CHECKING:
     import laspy
     import open3d as o3d
+
+logger = logging.getLogger(__name__)
 
 CLOUDS = {".ply", ".las", ".laz", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts", ".txt", ".csv", ".asc"}
 MESHES = {".ply", ".obj"}
 # as PDAL and CloudCompare name it
 CLASSIFICATION = ("classification", "scalar_Classification", "scalar_classification", "Classification")
 # as CloudCompare and PDAL name them in LAS, and PCL in PCD
-NORMALS = (("NormalX", "NormalY", "NormalZ"), ("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
+NORMALS = (
+    ("NormalX", "NormalY", "NormalZ"),
+    ("normalx", "normaly", "normalz"),
+    ("nx", "ny", "nz"),
+    ("normal_x", "normal_y", "normal_z"),
+)
+AXES = (("x", "easting", "east", "e"), ("y", "northing", "north", "n"), ("z", "height", "elevation", "h"))
 LAS_EXTRAS = ("intensity", "return_number", "number_of_returns")
 
 
@@ -183,40 +193,59 @@ def _read_obj(path: Path) -> Geometry:
 
 
 def _read_text(path: Path) -> Geometry:
-    """x y z per line, then colors (three whole numbers up to 255) or normals; separated by blanks, commas,
-    semicolons or tabs; a header is skipped.
-    """
-    rows = []
-    with path.open(encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file, start=1):
-            words = line.replace(",", " ").replace(";", " ").split()
-            if not words or words[0].startswith(("#", "//")):
-                continue
-            try:
-                rows.append([float(word) for word in words])
-            except ValueError:
-                if rows:
-                    raise InputError(
-                        f"{path}, line {number}: numbers are expected, not {line.strip()[:60]!r}"
-                    ) from None
-    width = len(rows[-1]) if rows else 0
-    # PTS starts with the number of points
-    rows = [row for row in rows if len(row) == width] if rows and len(rows[0]) == 1 else rows
-    if width < 3 or any(len(row) != width for row in rows):
-        raise InputError(f"{path}: x y z [r g b] with as many numbers in every line are expected")
-    table = np.array(rows)
+    """A cloud as text (`io.text_clouds`), by its header, or x y z and then colors or normals, by their values."""
+    names, table = read_table(path)
+    columns = dict(zip(names, table.T, strict=True))
+    axes = [next((name for name in known if name in columns), "") for known in AXES]
+    if not all(axes):
+        if names:
+            logger.warning(
+                "%s: its header (%s) names no x, y and z: the first three columns are taken",
+                path,
+                " ".join(names),
+            )
+        columns, axes = _unnamed(path, table), list("xyz")
+    positions = np.stack([columns.pop(axis) for axis in axes], axis=1)
+    found = color_names(columns)
+    colors = None if found is None else np.stack([columns.pop(name) for name in found], axis=1)
+    if colors is not None:
+        are_bytes = colors.max(initial=0) > 1 and bool((colors == np.rint(colors)).all())
+        colors = to_bytes(colors.astype(np.int64) if are_bytes else colors)
+    return Geometry(positions, colors, _with_normals(_classified(columns)))
+
+
+def _unnamed(path: Path, table: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns by what their values look like: x y z, then three colors or normals."""
+    columns = dict(zip("xyz", table[:, :3].T, strict=True))
     # PTS has the intensity in front of the colors
-    offset = 4 if path.suffix.lower() == ".pts" and width == 7 else 3
-    rest = table[:, offset : offset + 3]
-    colored = (
-        rest.shape[1] == 3 and (rest >= 0).all() and (rest <= 255).all() and (rest == np.rint(rest)).all()
-    )
-    normals = rest.shape[1] == 3 and not colored and np.allclose(np.linalg.norm(rest, axis=1), 1, atol=0.05)
-    return Geometry(
-        table[:, :3],
-        rest.astype(np.uint8) if colored else None,
-        {"normals": rest.astype(np.float32)} if normals else {},
-    )
+    start = 4 if path.suffix.lower() == ".pts" and table.shape[1] >= 7 else 3
+    kinds = []
+    for first in range(start, table.shape[1] - 2, 3):
+        part = table[:, first : first + 3]
+        names = _kind(part)
+        if names is None or names in kinds:
+            break
+        kinds.append(names)
+        columns |= dict(zip(names, part.T, strict=True))
+    used = start + 3 * len(kinds)
+    if used < table.shape[1]:
+        logger.warning(
+            "%s: %d of its %d columns have no names and are left out",
+            path,
+            table.shape[1] - used + start - 3,
+            table.shape[1],
+        )
+    return columns
+
+
+def _kind(part: np.ndarray) -> tuple[str, str, str] | None:
+    """Names of three columns (N, 3): normals, colors or None."""
+    whole, low, high = bool((part == np.rint(part)).all()), part.min(), part.max()
+    if (not whole or low < 0) and np.allclose(np.linalg.norm(part, axis=1), 1, atol=0.05):
+        return NORMALS[0]
+    if low >= 0 and (high <= 1 or whole and high <= 65535):
+        return COLORS
+    return None
 
 
 def is_mesh(path: Path) -> bool:

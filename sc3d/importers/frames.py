@@ -93,9 +93,7 @@ def place_geometry(geometry: Geometry, epsg: int | None, georeference: Georefere
     positions = move_to_world(geometry.positions, epsg, georeference)
     attributes = dict(geometry.attributes)
     if "normals" in attributes:
-        attributes["normals"] = turn_to_world(
-            geometry.positions, attributes["normals"], epsg, georeference
-        )
+        attributes["normals"] = turn_to_world(geometry.positions, attributes["normals"], epsg, georeference)
     return replace(geometry, positions=positions, attributes=attributes)
 
 

@@ -21,8 +21,8 @@ from sc3d.importers.clouds import Geometry, read_geometry, to_open3d
 from sc3d.importers.frames import frame_of, move_to_world, place_geometry, turn_to_world
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.io.clouds import write_geometry
-from sc3d.io.las import open_las
 from sc3d.io.crs import read_las_crs
+from sc3d.io.las import open_las
 from sc3d.io.ply import read_header, write_records
 from sc3d.scene.scene import Scene
 from sc3d.settings.common import Resources

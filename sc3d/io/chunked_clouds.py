@@ -11,8 +11,8 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.colors import COLORS, color_names, to_bytes
-from sc3d.io.las import check_las, open_las
 from sc3d.io.crs import read_las_crs
+from sc3d.io.las import check_las, open_las
 from sc3d.io.limits import FARTHEST
 from sc3d.io.ply import check_ply
 from sc3d.io.splats import SPLATS, is_splat_ply

@@ -12,6 +12,7 @@ NAMES = (
     COLORS,
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
     ("r", "g", "b"),
+    ("rf", "gf", "bf"),
     ("Red", "Green", "Blue"),
     ("R", "G", "B"),
     ("scalar_R", "scalar_G", "scalar_B"),

@@ -49,12 +49,14 @@ def describe_crs(crs: pyproj.CRS, path: Path, height_unit: float | None = None) 
     crs, unit_of_heights = split_crs(crs)
     height_unit = unit_of_heights or height_unit
     if crs.is_geographic or crs.is_geocentric:
-        unit = "in degrees" if crs.is_geographic else "geocentric"
-        raise InputError(f"{path} is in {crs.name}, {unit}: convert it to a projected CRS first")
+        kind = "in degrees" if crs.is_geographic else "geocentric"
+        raise InputError(f"{path} is in {crs.name}, {kind}: convert it to a projected CRS first")
     epsg = crs.to_epsg(min_confidence=SURE)
     if epsg is None:
         logger.warning(
-            "%s is in %r, which has no EPSG code: its CRS is not used, --epsg says which it is", path, crs.name
+            "%s is in %r, which has no EPSG code: its CRS is not used, --epsg says which it is",
+            path,
+            crs.name,
         )
     unit = float(crs.axis_info[0].unit_conversion_factor) if crs.axis_info else 1.0
     scale = 1.0 if height_unit is None else height_unit / unit
@@ -96,8 +98,10 @@ def _unit_of_keys(header: laspy.LasHeader) -> float | None:
         return units[keys[VERTICAL_UNIT]]
     code = keys.get(VERTICAL_CRS)
     try:
-        return None if code in (None, 0, USER_DEFINED) else float(
-            pyproj.CRS.from_epsg(code).axis_info[0].unit_conversion_factor
+        return (
+            None
+            if code in (None, 0, USER_DEFINED)
+            else float(pyproj.CRS.from_epsg(code).axis_info[0].unit_conversion_factor)
         )
     except pyproj.exceptions.CRSError:
         return None

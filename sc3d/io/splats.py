@@ -167,7 +167,9 @@ def _widen(arrays: dict[str, np.ndarray], width: np.ndarray) -> None:
     squared = np.exp(2.0 * arrays["log_scales"].astype(np.float64))
     wider = squared + width.astype(np.float64) ** 2
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        opacity = np.sqrt((squared / wider).prod(axis=1)) / (1 + np.exp(-arrays["opacity_logits"].astype(np.float64)))
+        opacity = np.sqrt((squared / wider).prod(axis=1)) / (
+            1 + np.exp(-arrays["opacity_logits"].astype(np.float64))
+        )
         arrays["opacity_logits"] = np.log(opacity / (1 - opacity)).astype(np.float32)
         arrays["log_scales"] = (np.log(wider) / 2).astype(np.float32)
 
@@ -176,7 +178,9 @@ def _repair_turns(arrays: dict[str, np.ndarray], path: Path) -> None:
     """Quaternions of length 0 are no rotation: taken as none at all."""
     none = ~arrays["quats"].any(axis=1)
     if none.any():
-        logger.warning("%s: %d Gaussians have no rotation (0 0 0 0) and are taken as not turned", path, none.sum())
+        logger.warning(
+            "%s: %d Gaussians have no rotation (0 0 0 0) and are taken as not turned", path, none.sum()
+        )
         arrays["quats"][none] = (1, 0, 0, 0)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import open3d as o3d
 
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.io.atomic import atomic_path
@@ -24,7 +25,7 @@ from sc3d.labelling.inputs import (
 )
 from sc3d.labelling.normal_sides import judge_sides, sample_step, with_sides
 from sc3d.scene.frame_check import Box, box_of, describe
-from sc3d.scene.labelled_cloud import point_arrays, read_surface, with_labels
+from sc3d.scene.labelled_cloud import point_arrays, read_surface, usable_normals, with_labels
 from sc3d.scene.labels import STATE_NAMES, UNSEEN
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
@@ -85,11 +86,7 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     box = positions.min(axis=0), positions.max(axis=0)
     require_in_view(path, box, masks, scene.model.points)
     points, normals = point_arrays(given, np.array([view.center for view in masks.views]))
-    step = sample_step(len(points))
-    sides = judge_sides(points[::step], normals[::step], masks.views, path)
-    turned = with_sides(points, normals, masks.views, sides)
-    num_turned = int((turned != normals).any(axis=1).sum())
-    normals = turned
+    normals, num_turned = _on_the_right_side(given, points, normals, masks.views, path)
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=default_voxel_size(points, masks))
     surface, density = None, None
@@ -104,3 +101,14 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     write_geometry(settings.output or scene.seeds, with_labels(given, normals, fusion.labels, fusion.votes))
     counts = np.bincount(fusion.labels.state, minlength=len(STATE_NAMES))
     return summarize(counts, settings.voxel_size, masks.views, path, box, num_turned)
+
+
+def _on_the_right_side(
+    given: o3d.t.geometry.PointCloud, points: np.ndarray, normals: np.ndarray, views: list[View], path: Path
+) -> tuple[np.ndarray, int]:
+    """Normals (N, 3) of a cloud, turned if they are its own and of the wrong side; how many were."""
+    if "normals" not in given.point or not usable_normals(given.point.normals.numpy()).all():
+        return normals, 0
+    step = sample_step(len(points))
+    turned = with_sides(points, normals, views, judge_sides(points[::step], normals[::step], views, path))
+    return turned, int((turned != normals).any(axis=1).sum())

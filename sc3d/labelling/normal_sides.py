@@ -24,8 +24,11 @@ RIGHT, INVERTED = 0.8, 0.2
 
 
 class Sides(Enum):
-    """What to do with normals: as they are, all turned around, each turned to the nearest camera."""
+    """What to do with the normals of a cloud: made anew, as they are, all turned around, each turned to the nearest
+    camera.
+    """
 
+    ESTIMATE = "estimate"
     KEEP = "keep"
     INVERT = "invert"
     ORIENT = "orient"
@@ -70,7 +73,7 @@ def judge_sides(points: np.ndarray, normals: np.ndarray, views: list[View], path
 
 def with_sides(points: np.ndarray, normals: np.ndarray, views: list[View], sides: Sides) -> np.ndarray:
     """(N, 3) unit normals at points (N, 3), turned as `judge_sides` says."""
-    if sides is Sides.KEEP:
+    if sides in (Sides.KEEP, Sides.ESTIMATE):
         return normals
     if sides is Sides.INVERT:
         return -normals

@@ -47,9 +47,7 @@ def apart(box: Box, scene: Box) -> bool:
 
 def describe(box: Box) -> str:
     """As "x 0.0 to 9.5, y ...": one line for messages."""
-    return ", ".join(
-        f"{axis} {low:.1f} to {high:.1f}" for axis, low, high in zip("xyz", *box, strict=True)
-    )
+    return ", ".join(f"{axis} {low:.1f} to {high:.1f}" for axis, low, high in zip("xyz", *box, strict=True))
 
 
 def check_frame(path: Path, points: np.ndarray, views: list[View], sparse_points: np.ndarray) -> bool:

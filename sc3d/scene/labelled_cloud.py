@@ -48,18 +48,24 @@ def unit_normals(
         `NeighborIndex`
     """
     if given is not None:
-        normals = given.astype(np.float32)
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        unusable = ~(np.isfinite(lengths) & (lengths > 0))
-        if not unusable.any():
-            return normals / lengths
+        normals, usable = given.astype(np.float32), usable_normals(given)
+        if usable.all():
+            return normals / np.linalg.norm(normals, axis=1, keepdims=True)
         logger.warning(
-            "%d of %d normals have no length or are not finite: all are estimated", unusable.sum(), len(normals)
+            "%d of %d normals have no length or are not finite: all are estimated",
+            (~usable).sum(),
+            len(normals),
         )
     neighbors, _ = NeighborIndex(points, origin).nearest(points, NORMAL_NEIGHBORS)
     if neighbors.shape[1] < 3:
         raise InputError(f"the cloud has {len(points)} points: normals need at least 3")
     return orient_normals(points, estimate_normals(points, neighbors), centers)
+
+
+def usable_normals(normals: np.ndarray) -> np.ndarray:
+    """(N,) bool normals (N, 3) that have a direction."""
+    lengths = np.linalg.norm(normals.astype(np.float32), axis=1)
+    return np.isfinite(lengths) & (lengths > 0)
 
 
 def read_surface(

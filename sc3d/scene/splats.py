@@ -28,6 +28,9 @@ def read_scene_splats(scene: Scene) -> tuple[dict[str, np.ndarray], np.ndarray]:
         )
     if len(arrays["means"]):
         check_frame(
-            scene.gaussians, arrays["means"].astype(np.float64) + origin, scene.model.views, scene.model.points
+            scene.gaussians,
+            arrays["means"].astype(np.float64) + origin,
+            scene.model.views,
+            scene.model.points,
         )
     return arrays, origin

@@ -22,7 +22,6 @@ from sc3d.runner import execute
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import, ImportCommand
 
-
 NO_POINTS = np.zeros((0, 3))
 
 

@@ -4,6 +4,7 @@ tile votes for itself.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +30,13 @@ from sc3d.labelling.inputs import (
 )
 from sc3d.labelling.label import LabelSummary, summarize
 from sc3d.labelling.normal_sides import Sides, judge_sides, sample_step, with_sides
-from sc3d.scene.labelled_cloud import SPACING_NEIGHBORS, SPACING_SAMPLE, VOTES, unit_normals
+from sc3d.scene.labelled_cloud import (
+    SPACING_NEIGHBORS,
+    SPACING_SAMPLE,
+    VOTES,
+    unit_normals,
+    usable_normals,
+)
 from sc3d.scene.labels import STATE_NAMES
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
@@ -40,6 +47,9 @@ from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, mesh_trian
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
 from sc3d.tiling.work_folder import WorkFolder
 
+logger = logging.getLogger(__name__)
+
+NORMALS = ("nx", "ny", "nz")
 BYTES = 420  # of a point while its tile votes
 VOXEL = 2.2  # of a label voxel, in point spacings, while neither is known exactly
 SAMPLE_MARGIN = 20.0  # around a tile whose spacing is measured, point spacings
@@ -152,18 +162,27 @@ def _ranges(
 
 def _judge_sides(cloud: CloudFile, masks: Masks) -> Sides:
     """What to do with the cloud's own normals, by the points that `labelling.label` looks at."""
-    step, found = sample_step(cloud.num_points), []
-    for start, records in cloud.chunks() if {"nx", "ny", "nz"} <= set(cloud.names) else ():
+    if not set(NORMALS) <= set(cloud.names):
+        return Sides.ESTIMATE
+    step, found, unusable = sample_step(cloud.num_points), [], 0
+    for start, records in cloud.chunks():
+        unusable += int((~usable_normals(_normals(records))).sum())
         found.append(records[-start % step :: step])
-    if not found:
-        return Sides.KEEP
+    if unusable:
+        logger.warning(
+            "%s: %d of %d normals have no length or are not finite: all are estimated",
+            cloud.path,
+            unusable,
+            cloud.num_points,
+        )
+        return Sides.ESTIMATE
     sample = np.concatenate(found)
-    given = columns(sample, ("nx", "ny", "nz"))
-    lengths = np.linalg.norm(given, axis=1, keepdims=True)
-    usable = np.isfinite(lengths[:, 0]) & (lengths[:, 0] > 0)
-    return judge_sides(
-        positions(sample)[usable], given[usable] / lengths[usable], masks.views, cloud.path
-    )
+    return judge_sides(positions(sample), _normals(sample), masks.views, cloud.path)
+
+
+def _normals(records: np.ndarray) -> np.ndarray:
+    """(N, 3)"""
+    return np.stack([records[name] for name in NORMALS], axis=1)
 
 
 def sample_spacing(store: TileStore, statistics: CloudStatistics) -> tuple[float, np.ndarray]:
@@ -201,7 +220,7 @@ def label_tile(job: LabelJob, tile: int) -> None:
     records = halo.gather(store.records)
     points, masks = positions(records), Masks.load(scene, job.confidence)
     normals = unit_normals(
-        columns(records, ("nx", "ny", "nz")),
+        None if job.sides is Sides.ESTIMATE else columns(records, NORMALS),
         points,
         np.array([view.center for view in masks.views]),
         job.extent.low,

@@ -150,7 +150,11 @@ def test_splats_are_no_cloud_to_import(tmp_path):
 def test_what_we_write_is_what_we_read(tmp_path):
     rng = np.random.default_rng(0)
     arrays = {"means": rng.normal(size=(5, 3)), "normals": np.zeros((5, 3)), "sh_dc": rng.normal(size=(5, 3))}
-    arrays |= {"log_scales": -rng.random((5, 3)), "quats": rng.normal(size=(5, 4)), "sh_rest": np.zeros((5, 3, 3))}
+    arrays |= {
+        "log_scales": -rng.random((5, 3)),
+        "quats": rng.normal(size=(5, 4)),
+        "sh_rest": np.zeros((5, 3, 3)),
+    }
     arrays = {name: values.astype(np.float32) for name, values in arrays.items()}
     arrays["opacity_logits"] = rng.normal(size=5).astype(np.float32)
     write_splat_ply(tmp_path / "a.ply", arrays)
