@@ -41,6 +41,8 @@ def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported 
     if "positions" not in cloud.point or not len(cloud.point.positions):
         raise InputError(f"{path} holds no points")
     _check_positions(path, cloud.point.positions.numpy(), "remove those points first")
+    if path.suffix.lower() == ".ply":
+        _add_columns(cloud, path)
     _unify_colors(cloud)
     return cloud
 
@@ -65,6 +67,22 @@ def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
     if corners.min() < 0 or corners.max() >= len(mesh.vertex.positions):
         raise InputError(f"{path} has triangles of vertices that do not exist: repair the mesh first")
     return mesh
+
+
+def _add_columns(cloud, path: Path) -> None:
+    """Give a cloud the columns of a checked PLY that Open3D passes over: those of the older names of types."""
+    import open3d as o3d
+
+    header = read_header(path)
+    vertex = header.element("vertex")
+    kinds = {entry.name: entry.dtype for entry in vertex.properties if not entry.length} if vertex else {}
+    known = set(cloud.point)
+    for group, attribute in zip(TOGETHER, ("positions", "normals", "colors"), strict=True):
+        known |= set(group) if attribute in known else set()
+    missing = [name for name in kinds if name not in known]
+    found = read_columns(path, header, missing) if missing else None
+    for name, column in zip(missing, found.T if found is not None else (), strict=False):
+        cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(column.astype(kinds[name])[:, None]))
 
 
 def _unify_colors(cloud) -> None:

@@ -126,8 +126,8 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         executor.run("voting", partial(label_tile, job), store.tiles)
     write_field(job.results, store.tiles, settings.voxel_size, scene.votes_of(settings.output))
     counts = _write(output, cloud, job, scene.class_table().num_ids)
-    folder.remove()
     num_turned = sum(int(results.read(tile, "turned")[0]) for tile in store.tiles)
+    folder.remove()
     return summarize(counts, settings.voxel_size, masks.views, cloud.path, box, num_turned)
 
 

@@ -554,7 +554,7 @@ def test_hostile_laz_is_refused_by_label_too(site, tmp_path, name):
     elif name == "vlr":
         struct.pack_into("<H", content, record, 9)
     else:
-        content[offset + 200 : -600] = bytes(len(content) - 800 - offset)
+        del content[-len(content) // 3 :]
     (tmp_path / "a.laz").write_bytes(content)
     with pytest.raises(InputError):
         label.run(site, Label(cloud=tmp_path / "a.laz"))
