@@ -19,6 +19,7 @@ from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, to_camera
 from sc3d.georeferencing.georeference import Georeference, triple
 from sc3d.importers.project import Project, require_found, rigid
+from sc3d.io.crs import split_crs
 from sc3d.settings.reconstruction import Import
 
 logger = logging.getLogger(__name__)
@@ -149,8 +150,12 @@ def _georeference(file: Path) -> Georeference | None:
         raise InputError(
             f"{projection} or {offset_file} cannot be understood: a WKT of a CRS and three numbers are expected"
         ) from None
-    crs = crs.sub_crs_list[0] if crs.is_compound else crs
+    crs, height_unit = split_crs(crs)
     epsg = crs.to_epsg()
+    if height_unit is not None and abs(height_unit / crs.axis_info[0].unit_conversion_factor - 1) > 1e-9:
+        raise InputError(
+            f"{projection} has heights in another unit than eastings: export the project with one unit"
+        )
     if not crs.is_projected or epsg is None or offset.shape != (3,):
         logger.warning(
             "%s: %s has no EPSG code of a projected CRS: the place stays unknown", projection, crs.name

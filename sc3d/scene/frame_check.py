@@ -50,11 +50,11 @@ def describe(box: Box) -> str:
     return ", ".join(f"{axis} {low:.1f} to {high:.1f}" for axis, low, high in zip("xyz", *box, strict=True))
 
 
-def check_frame(path: Path, points: np.ndarray, views: list[View], sparse_points: np.ndarray) -> bool:
-    """Whether (N, 3) world points of a file lie where the scene is; a warning with both boxes if they do not."""
+def check_frame(path: Path, points: np.ndarray, views: list[View], sparse_points: np.ndarray) -> None:
+    """A warning with both boxes if (N, 3) world points of a file do not lie where the scene is."""
     box = box_of(points)
     if not views or not apart(box, scene_box(views, sparse_points)):
-        return True
+        return
     logger.warning(
         "%s lies elsewhere than the cameras, so it seems to be in another frame: its points are at %s;"
         " the cameras at %s",
@@ -62,4 +62,16 @@ def check_frame(path: Path, points: np.ndarray, views: list[View], sparse_points
         describe(box),
         describe(box_of(np.array([view.center for view in views]))),
     )
-    return False
+
+
+def check_together(path: Path, points: np.ndarray, others: np.ndarray) -> None:
+    """A warning with both boxes if a file's points (N, 3) lie elsewhere than those of its scene (M, 3)."""
+    box, other = box_of(points), box_of(others)
+    extent = REACH * float(np.linalg.norm(other[1] - other[0]))
+    if apart(box, (other[0] - extent, other[1] + extent)):
+        logger.warning(
+            "%s lies elsewhere than the cloud, so it seems to be in another frame: its points are at %s; the cloud at %s",
+            path,
+            describe(box),
+            describe(other),
+        )

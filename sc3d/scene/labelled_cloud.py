@@ -16,6 +16,7 @@ from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, orient_norm
 from sc3d.geometry.raycast import FirstSurface, RayTarget, Surface, first_surface, nearest_points
 from sc3d.geometry.voxel_traversal import VoxelSurface
 from sc3d.io.clouds import read_cloud, read_mesh
+from sc3d.scene.frame_check import check_together
 from sc3d.scene.labels import STATE_NAMES, Labels
 
 logger = logging.getLogger(__name__)
@@ -83,9 +84,9 @@ def read_surface(
     """
     if kind == "auto" and mesh.exists():
         read = read_mesh(mesh)
-        return Surface.from_mesh(
-            read.vertex.positions.numpy().astype(np.float64), read.triangle.indices.numpy(), origin
-        )
+        vertices = read.vertex.positions.numpy().astype(np.float64)
+        check_together(mesh, vertices, points)
+        return Surface.from_mesh(vertices, read.triangle.indices.numpy(), origin)
     if kind == "surfels":
         return Surface.from_cloud(points, normals, origin)
     return VoxelSurface.from_cloud(points, normals, SURFACE_VOXEL * spacing_of(points))

@@ -202,12 +202,12 @@ TEXT = {
 }
 
 
-@pytest.mark.parametrize("suffix", [".xyz", ".txt", ".csv", ".asc", ".pts"])
 @pytest.mark.parametrize("name", TEXT)
-def test_positions_of_text_in_all_dialects(tmp_path, name, suffix):
-    path = tmp_path / f"a{suffix}"
-    path.write_text(TEXT[name], encoding="utf-8", newline="")
-    np.testing.assert_array_equal(read_geometry(path).positions, POINTS)
+def test_positions_of_text_in_all_dialects(tmp_path, name):
+    for suffix in (".xyz", ".txt", ".csv", ".asc", ".pts"):
+        path = tmp_path / f"a{suffix}"
+        path.write_text(TEXT[name], encoding="utf-8", newline="")
+        np.testing.assert_array_equal(read_geometry(path).positions, POINTS)
 
 
 def test_text_of_utf_16(tmp_path):
