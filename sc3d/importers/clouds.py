@@ -29,6 +29,20 @@ logger = logging.getLogger(__name__)
 
 CLOUDS = {".ply", ".las", ".laz", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts", ".txt", ".csv", ".asc"}
 MESHES = {".ply", ".obj"}
+# clouds and meshes that are refused by name
+UNREAD = {
+    ".e57",
+    ".ptx",
+    ".rcp",
+    ".rcs",
+    ".fls",
+    ".stl",
+    ".glb",
+    ".gltf",
+    ".fbx",
+    ".dae",
+    ".off",
+} | OTHER_FORMATS
 # as PDAL and CloudCompare name it
 CLASSIFICATION = ("classification", "scalar_Classification", "scalar_classification", "Classification")
 # as CloudCompare and PDAL name them in LAS, and PCL in PCD
@@ -73,7 +87,9 @@ def read_geometry(path: Path) -> Geometry:
     elif suffix in OTHER_FORMATS:
         raise InputError(f"{path} {SPLATS}")
     else:
-        raise InputError(f"{path}: {', '.join(sorted(CLOUDS | MESHES))} can be read")
+        raise InputError(
+            f"{path}: {', '.join(sorted(CLOUDS | MESHES))} can be read: save it as LAS, LAZ or PLY (meshes: PLY or OBJ)"
+        )
     if not len(found.positions):
         raise InputError(f"{path} holds no points")
     if not np.isfinite(found.positions).all():

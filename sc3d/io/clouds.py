@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import re
 from collections.abc import Collection
 from contextlib import redirect_stdout
@@ -26,6 +27,9 @@ from sc3d.io.ply import (
 )
 from sc3d.io.splats import SPLATS, is_splat_ply
 
+logger = logging.getLogger(__name__)
+
+COARSE = 0.005  # steps of positions that are told, world units
 MAX_NAME = 200  # characters of an attribute
 TAKEN = {name for group in TOGETHER for name in group}  # columns of what Open3D reads together
 CHECKS = {".ply": check_ply, ".pcd": check_pcd}
@@ -147,6 +151,13 @@ def _check_positions(path: Path, positions: np.ndarray, advice: str) -> None:
         raise InputError(f"{path} has positions that are not finite numbers: {advice}")
     if np.abs(positions).max() > FARTHEST:
         raise InputError(f"{path} has positions more than {FARTHEST:g} from the origin: {advice}")
+    step = float(np.spacing(np.abs(positions).max())) if positions.dtype == np.float32 else 0.0
+    if step > COARSE:
+        logger.warning(
+            "%s has its positions as float32, which at such coordinates has steps of %.3g: write it with doubles",
+            path,
+            step,
+        )
 
 
 def _storable(geometry):

@@ -9,7 +9,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
-from sc3d.importers.clouds import CLOUDS, MESHES, is_mesh, read_geometry, to_open3d
+from sc3d.importers.clouds import CLOUDS, MESHES, UNREAD, is_mesh, read_geometry, to_open3d
 from sc3d.importers.frames import frame_of_scene, near_origin, place_geometries
 from sc3d.importers.model import write_project
 from sc3d.importers.photos import locate_photos
@@ -17,7 +17,6 @@ from sc3d.importers.project import project_files, read_project
 from sc3d.io.atomic import require_writable
 from sc3d.io.clouds import write_geometry
 from sc3d.io.images import require_place
-from sc3d.io.splats import OTHER_FORMATS
 from sc3d.runner import execute
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import, ImportCommand
@@ -42,7 +41,7 @@ def is_geometry(path: Path, settings: Import) -> bool:
     return settings.source == "cloud" or (
         settings.source == "auto"
         and path.is_file()
-        and path.suffix.lower() in CLOUDS | MESHES | OTHER_FORMATS
+        and path.suffix.lower() in CLOUDS | MESHES | UNREAD
         and not path.name.endswith("calibrated_camera_parameters.txt")
     )
 

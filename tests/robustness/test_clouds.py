@@ -267,6 +267,23 @@ def test_other_text_is_refused_with_what_to_do(tmp_path, text, match):
         read_geometry(tmp_path / "a.xyz")
 
 
+@pytest.mark.parametrize("suffix", [".e57", ".ptx", ".stl", ".glb"])
+def test_other_formats_are_refused_with_what_to_save(site, tmp_path, suffix):
+    (tmp_path / f"a{suffix}").write_bytes(bytes(64))
+    settings = Import(project=tmp_path / f"a{suffix}")
+    assert import_project.is_geometry(settings.project, settings)
+    with pytest.raises(InputError, match="save it as LAS"):
+        label.run(site, Label(cloud=tmp_path / f"a{suffix}"))
+
+
+def test_float32_at_utm_size_is_told(tmp_path, caplog):
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(ground(1.0).astype(np.float32)))
+    o3d.t.io.write_point_cloud(str(tmp_path / "a.ply"), cloud)
+    with caplog.at_level(logging.WARNING):
+        read_cloud(tmp_path / "a.ply")
+    assert "steps of 0.5" in caplog.text
+
+
 # ---- attributes of LAS and PLY
 
 ODD_NAMES = [
@@ -477,7 +494,7 @@ def labelled(scene, cloud, **options):
 
 @pytest.mark.parametrize("kind", ["crs", "none", "feet", "ply", "text"])
 def test_a_cloud_in_the_crs_is_labelled_as_after_import(site, tmp_path, kind):
-    points, code = ground(), {"crs": "EPSG:32615", "feet": "EPSG:32615+6360"}.get(kind)
+    points, code = ground(0.2), {"crs": "EPSG:32615", "feet": "EPSG:32615+6360"}.get(kind)
     if kind == "ply":
         path = write_ply(tmp_path / "a.ply", points, {})
     elif kind == "text":
@@ -499,7 +516,7 @@ def test_a_cloud_in_the_crs_is_labelled_as_after_import(site, tmp_path, kind):
 
 
 def test_a_cloud_in_the_crs_is_the_same_read_in_parts(site, tmp_path, monkeypatch):
-    path = write_las(tmp_path / "a.laz", ground(), pyproj.CRS("EPSG:32615"))
+    path = write_las(tmp_path / "a.laz", ground(0.2), pyproj.CRS("EPSG:32615"))
     seeds, _ = labelled(site, path)
     monkeypatch.setattr("sc3d.importers.given_cloud.fits", lambda *_: False)
     again, _ = labelled(site, path)
