@@ -188,7 +188,7 @@ def _read_obj(path: Path) -> Geometry:
     """
     vertices, faces = [], []
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
             for line in file:
                 if line.startswith("v "):
                     vertices.append([float(word) for word in line.split()[1:]])

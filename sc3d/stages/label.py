@@ -28,6 +28,7 @@ def run(scene: Scene, settings: Label) -> dict[str, object]:
     """Fuse the masks, in memory or, where the cloud does not fit, by tiles; a cloud of another program is brought
     into the world of the scene before.
     """
+    scene.warn_of_unplaced(scene.masks, *([best_confidence(scene)] if settings.use_confidence else []))
     if settings.cloud is None:
         return _label(scene, settings)
     with cloud_in_world(scene, settings.cloud, settings, settings.output or scene.seeds) as cloud:
