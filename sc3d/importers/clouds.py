@@ -209,7 +209,9 @@ def _read_obj(path: Path) -> Geometry:
 
 
 def _read_text(path: Path) -> Geometry:
-    """A cloud as text (`io.text_clouds`), by its header, or x y z and then colors or normals, by their values."""
+    """A cloud as text (`io.text_clouds`), by its header, or x y z and then colors or normals, by their
+    values.
+    """
     names, table = read_table(path)
     columns = dict(zip(names, table.T, strict=True)) if names else {}
     axes = [next((name for name in known if name in columns), "") for known in AXES]

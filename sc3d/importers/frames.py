@@ -89,8 +89,8 @@ def _from_geocentric(project: Project, epsg: int | None) -> Project:
 def enu_of_geocentric(
     middle: np.ndarray, to_geodetic: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[tuple[float, float, float], Similarity]:
-    """Origin (latitude, longitude, height) of a local ENU frame near a geocentric position, and the similarity
-    from geocentric coordinates minus that position to it.
+    """Origin (latitude, longitude, height) of a local ENU frame near a geocentric position, and the
+    similarity from geocentric coordinates minus that position to it.
 
     middle: (3,) m; to_geodetic: (N, 3) geocentric to (N, 3) latitude, longitude, height on WGS 84
     """
@@ -189,8 +189,8 @@ def move_to_world(positions: np.ndarray, epsg: int | None, georeference: Georefe
 def turn_to_world(
     positions: np.ndarray, normals: np.ndarray, epsg: int | None, georeference: Georeference | None
 ) -> np.ndarray:
-    """(N, 3) float32 unit normals at positions (N, 3) in what `frame_of` says, turned as the world is; those of no
-    length stay.
+    """(N, 3) float32 unit normals at positions (N, 3) in what `frame_of` says, turned as the world is;
+    those of no length stay.
     """
     if epsg is None or georeference is None:
         return normals

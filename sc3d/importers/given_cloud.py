@@ -1,5 +1,5 @@
-"""A cloud file of another program for a stage that works in the scene's world: one home for every way in which a
-cloud comes from outside.
+"""A cloud file of another program for a stage that works in the scene's world: one home for every way in
+which a cloud comes from outside.
 
 `sc3d import` keeps it (`importers.frames`, `importers.clouds`), `sc3d label --cloud` needs it for one run.
 """
@@ -36,8 +36,8 @@ PARTS = (".las", ".laz")  # can be read in parts, besides binary PLY
 
 @contextmanager
 def cloud_in_world(scene: Scene, path: Path, resources: Resources, output: Path) -> Iterator[Path]:
-    """A cloud file in the world of a scene: the same one, where it is a PLY in that frame, else a PLY made of it
-    beside `output`, which is there while the block runs.
+    """A cloud file in the world of a scene: the same one, where it is a PLY in that frame, else a PLY made
+    of it beside `output`, which is there while the block runs.
     """
     if not path.exists():
         raise InputError(f"{path} does not exist")

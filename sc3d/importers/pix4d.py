@@ -100,7 +100,9 @@ def _read_text(file: Path) -> str:
 
 
 def _header_length(lines: list[tuple[int, str]], file: Path) -> int:
-    """Lines in front of the first photo, empty ones not counted: up to the one that states the camera model."""
+    """Lines in front of the first photo, empty ones not counted: up to the one that states the camera
+    model.
+    """
     filled = [line for _, line in lines if line]
     found = [row for row, line in enumerate(filled[:12]) if line.lower().startswith("camera model")]
     if not found:

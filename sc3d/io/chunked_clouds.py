@@ -24,8 +24,8 @@ LAS_COLORS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 
 @dataclass(frozen=True)
 class CloudFile:
-    """A cloud on disk. dtype: of a record as it is given, fields x, y, z and whatever else the file has, colors
-    as bytes; stored: of a record in the file, and offset: bytes before the first one (PLY).
+    """A cloud on disk. dtype: of a record as it is given, fields x, y, z and whatever else the file has,
+    colors as bytes; stored: of a record in the file, and offset: bytes before the first one (PLY).
     """
 
     path: Path
@@ -66,7 +66,9 @@ class CloudFile:
         return self.dtype.names or ()
 
     def chunks(self) -> Iterator[tuple[int, np.ndarray]]:
-        """First row and records of each chunk; InputError at positions that are not finite or too far away."""
+        """First row and records of each chunk; InputError at positions that are not finite or too far
+        away.
+        """
         for start, records in self._read():
             for axis in "xyz":
                 if not (np.abs(records[axis]) <= FARTHEST).all():

@@ -36,8 +36,8 @@ CHECKS = {".ply": check_ply, ".pcd": check_pcd}
 
 
 def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported late
-    """Read a point cloud with all its attributes (PLY, PCD, XYZ), colors as uint8; InputError if it is damaged,
-    empty, made of Gaussians or has positions that are not finite or too far away.
+    """Read a point cloud with all its attributes (PLY, PCD, XYZ), colors as uint8; InputError if it is
+    damaged, empty, made of Gaussians or has positions that are not finite or too far away.
     """
     if path.suffix.lower() == ".ply" and path.is_file() and is_splat_ply(read_header(path)):
         raise InputError(f"{path} {SPLATS}")
@@ -74,7 +74,9 @@ def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
 
 
 def _add_columns(cloud, path: Path) -> None:
-    """Give a cloud the columns of a checked PLY that Open3D passes over: those of the older names of types."""
+    """Give a cloud the columns of a checked PLY that Open3D passes over: those of the older names of
+    types.
+    """
     import open3d as o3d
 
     header = read_header(path)
@@ -211,7 +213,9 @@ def _widened(values: np.ndarray) -> np.ndarray:
 
 
 def write_geometry(path: Path, geometry) -> None:
-    """Write a tensor point cloud or mesh, atomically; attributes get names, types and shapes that a PLY has."""
+    """Write a tensor point cloud or mesh, atomically; attributes get names, types and shapes that a PLY
+    has.
+    """
     import open3d as o3d
 
     geometry = _storable(geometry)

@@ -1,4 +1,6 @@
-"""Colors of points as other programs write them: 8 or 16 bits, fractions, floats up to 255; under several names."""
+"""Colors of points as other programs write them: 8 or 16 bits, fractions, floats up to 255; under several
+names.
+"""
 
 from __future__ import annotations
 

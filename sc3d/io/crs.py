@@ -1,7 +1,7 @@
 """The CRS of files: its horizontal part, and the unit of the heights; in LAS by WKT or GeoTIFF keys.
 
-Keys: http://geotiff.maptools.org/spec/geotiff6.html: 3072 is the projected CRS, 3076 its unit, 4096 the vertical
-CRS, 4099 the unit of heights; 32767 = defined elsewhere.
+Keys: http://geotiff.maptools.org/spec/geotiff6.html: 3072 is the projected CRS, 3076 its unit, 4096 the
+vertical CRS, 4099 the unit of heights; 32767 = defined elsewhere.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ def describe_crs(crs: pyproj.CRS, path: Path, height_unit: float | None = None) 
 
 
 def split_crs(crs: pyproj.CRS) -> tuple[pyproj.CRS, float | None]:
-    """The horizontal part of a CRS, be it compound, bound to another by TOWGS84, or with heights of its own; and
-    meters per unit of its heights, None = it does not say.
+    """The horizontal part of a CRS, be it compound, bound to another by TOWGS84, or with heights of its
+    own; and meters per unit of its heights, None = it does not say.
     """
     crs = _unbound(crs)
     if crs.is_compound:

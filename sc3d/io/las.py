@@ -40,8 +40,8 @@ STREAMED = -1  # the chunk table's position is at the end of the file
 
 class LasHeader(NamedTuple):
     """size: bytes, then num_vlrs records up to `offset`, where the points begin; form: point format, 128 more
-    if they are compressed; record: bytes of a point; evlrs: position and number of extended records; stream: where
-    LASzip's record begins, if the points are compressed without chunks, else 0.
+    if they are compressed; record: bytes of a point; evlrs: position and number of extended records;
+    stream: where LASzip's record begins, if the points are compressed without chunks, else 0.
     """
 
     size: int
@@ -74,8 +74,8 @@ def check_las(path: Path) -> LasHeader:
 
 @contextmanager
 def open_las(path: Path) -> Iterator[laspy.LasReader]:
-    """A reader of a LAS or LAZ file that is checked before; InputError for whatever is wrong with it, also while
-    it is read.
+    """A reader of a LAS or LAZ file that is checked before; InputError for whatever is wrong with it, also
+    while it is read.
     """
     import laspy
 

@@ -238,8 +238,8 @@ def read_records(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
 
 
 def read_columns(path: Path, header: Header, names: Sequence[str]) -> np.ndarray | None:
-    """(V, K) float64 of named properties of the vertices of a checked PLY; None unless the vertices come first
-    and have them all.
+    """(V, K) float64 of named properties of the vertices of a checked PLY; None unless the vertices come
+    first and have them all.
     """
     vertex = header.elements[0] if header.elements else None
     if vertex is None or vertex.name != "vertex" or vertex.has_lists:

@@ -1,9 +1,9 @@
 """Gaussians in the PLY that 3DGS viewers read, as plain arrays.
 
 Columns: x y z, nx ny nz, f_dc (3), f_rest (0, 9, 24 or 45, color channel by color channel), opacity (a
-logit), scale (3 logarithms), rot (wxyz). Others' variants: two scales (2DGS, https://github.com/hbb1/2d-gaussian-splatting:
-flat along the third axis), filter_3D (Mip-Splatting, https://github.com/autonomousvision/mip-splatting: a
-width that is added to the scales).
+logit), scale (3 logarithms), rot (wxyz). Others' variants: two scales (2DGS,
+https://github.com/hbb1/2d-gaussian-splatting: flat along the third axis), filter_3D (Mip-Splatting,
+https://github.com/autonomousvision/mip-splatting: a width that is added to the scales).
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ def read_splat_ply(
     model_origin: (3,) world, what to subtract from positions that are in the frame of the cameras' model, as
         those of other programs are: of files without the comment that `origin_comment` makes
     returns: float32 arrays means (N, 3), local frame; log_scales (N, 3); quats (N, 4) wxyz of any length
-        but 0; opacity_logits (N,); sh_dc (N, 3); sh_rest (N, K - 1, 3), K = 1, 4, 9, 16; and the comment lines
+        but 0; opacity_logits (N,); sh_dc (N, 3); sh_rest (N, K - 1, 3), K = 1, 4, 9, 16; and the comment
+        lines
     Raises InputError for another file, and for values that cannot be rendered.
     """
     _refuse_compressed(path)

@@ -22,8 +22,8 @@ BETWEEN_OR_COMMA = re.compile(r"[\s;|,]+")
 
 
 def read_table(path: Path) -> tuple[list[str], np.ndarray]:
-    """Names of the columns in small letters, [] if there is no header of as many, and (N, K) float64 values, K >= 3.
-    InputError for what is no table of numbers.
+    """Names of the columns in small letters, [] if there is no header of as many, and (N, K) float64
+    values, K >= 3. InputError for what is no table of numbers.
     """
     with path.open("rb") as file:
         encoding = "utf-16" if file.read(2) in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
@@ -80,6 +80,8 @@ def _is_data(line: str) -> bool:
 
 
 def _header(line: str) -> list[str]:
-    """CloudCompare has the names of the columns behind a comment mark: "//X Y Z R G B"; [] for other comments."""
+    """CloudCompare has the names of the columns behind a comment mark: "//X Y Z R G B"; [] for other
+    comments.
+    """
     words = BETWEEN_OR_COMMA.split(line.lstrip("/#%! ").strip())
     return words if [word.lower() for word in words[:3]] == ["x", "y", "z"] else []

@@ -81,8 +81,8 @@ def read_given_cloud(scene: Scene, file: Path | None) -> o3d.t.geometry.PointClo
 
 
 def require_in_view(path: Path, box: Box, masks: Masks, sparse_points: np.ndarray) -> None:
-    """InputError if no photo with a mask looks at the box around a cloud; a warning if the cloud lies elsewhere
-    than the scene.
+    """InputError if no photo with a mask looks at the box around a cloud; a warning if the cloud lies
+    elsewhere than the scene.
 
     box: world; sparse_points: (P, 3) world
     """

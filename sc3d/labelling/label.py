@@ -1,4 +1,6 @@
-"""`label` in memory: what a scene gives is read, fused and written. By tiles, with the same signature: `tiling.label`."""
+"""`label` in memory: what a scene gives is read, fused and written. By tiles, with the same signature:
+`tiling.label`.
+"""
 
 from __future__ import annotations
 
@@ -35,8 +37,8 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LabelSummary:
-    """Of a labelled cloud. counts: (states,) int64 points in each state; voxel_size: of the label field, world units;
-    num_turned: given normals that were turned around
+    """Of a labelled cloud. counts: (states,) int64 points in each state; voxel_size: of the label field,
+    world units; num_turned: given normals that were turned around
     """
 
     counts: np.ndarray

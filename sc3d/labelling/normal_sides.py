@@ -1,5 +1,5 @@
-"""On which side of the surface normals lie: programs that estimate them leave it to chance. The cameras tell: what a
-photo shows faces it.
+"""On which side of the surface normals lie: programs that estimate them leave it to chance. The cameras
+tell: what a photo shows faces it.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ RIGHT, INVERTED = 0.8, 0.2
 
 
 class Sides(Enum):
-    """What to do with the normals of a cloud: made anew, as they are, all turned around, each turned to the nearest
-    camera.
+    """What to do with the normals of a cloud: made anew, as they are, all turned around, each turned to the
+    nearest camera.
     """
 
     ESTIMATE = "estimate"
@@ -35,8 +35,8 @@ class Sides(Enum):
 
 
 def facing_share(points: np.ndarray, normals: np.ndarray, views: list[View]) -> float | None:
-    """Share of what photos see first of the points (N, 3) whose normals (N, 3) face the photo; None if they see too
-    few. World.
+    """Share of what photos see first of the points (N, 3) whose normals (N, 3) face the photo; None if they
+    see too few. World.
     """
     facing = count = 0
     for view in views[:: max(1, -(-len(views) // VIEWS))]:
@@ -55,8 +55,8 @@ def facing_share(points: np.ndarray, normals: np.ndarray, views: list[View]) -> 
 
 
 def judge_sides(points: np.ndarray, normals: np.ndarray, views: list[View], path: Path) -> Sides:
-    """What to do with the normals of a cloud, by some of its points (N, 3) and their normals (N, 3); a warning if
-    they are not right as they are.
+    """What to do with the normals of a cloud, by some of its points (N, 3) and their normals (N, 3); a
+    warning if they are not right as they are.
     """
     share = facing_share(points, normals, views)
     if share is None or share >= RIGHT:

@@ -1,5 +1,5 @@
-"""Whether what came from outside lies where the cameras are: files say where their points are, seldom in which
-frame.
+"""Whether what came from outside lies where the cameras are: files say where their points are, seldom in
+which frame.
 """
 
 from __future__ import annotations

@@ -177,7 +177,9 @@ def read_votes(cloud: o3d.t.geometry.PointCloud) -> np.ndarray | None:
 
 
 def spacing_of(points: np.ndarray) -> float:
-    """Sampling distance of the (N, 3) points, world units, from at most 100 000 of them; 1 if they coincide."""
+    """Sampling distance of the (N, 3) points, world units, from at most 100 000 of them; 1 if they
+    coincide.
+    """
     sample = points[:: max(1, len(points) // SPACING_SAMPLE)]
     return (
         point_spacing(NeighborIndex(points, points.min(axis=0)).nearest(sample, SPACING_NEIGHBORS + 1)[1])

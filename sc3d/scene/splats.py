@@ -12,11 +12,12 @@ from sc3d.scene.scene import Scene
 
 
 def read_scene_splats(scene: Scene) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The arrays of `gaussians.ply` (`io.splats.read_splat_ply`) and the (3,) world position of their local origin.
+    """The arrays of `gaussians.ply` (`io.splats.read_splat_ply`) and the (3,) world position of their local
+    origin.
 
-    A file of another program, which has no comment with the origin, is in the frame of the cameras' model. Raises
-    InputError that says what to run if there are none, or if they belong to other cameras than the scene's; warns if
-    they lie elsewhere.
+    A file of another program, which has no comment with the origin, is in the frame of the cameras' model.
+    Raises InputError that says what to run if there are none, or if they belong to other cameras than the
+    scene's; warns if they lie elsewhere.
     """
     scene.require(scene.gaussians, hint=f"run `sc3d train {scene.path}` first")
     origin = local_origin(scene.model.views)

@@ -1,4 +1,6 @@
-"""Projects, clouds and meshes of other programs -> sparse/0, images, georeference.json, cloud.ply, mesh.ply."""
+"""Projects, clouds and meshes of other programs -> sparse/0, images, georeference.json, cloud.ply,
+mesh.ply.
+"""
 
 from __future__ import annotations
 

@@ -25,8 +25,8 @@ def outputs(scene: Scene, settings: Label) -> list[Path]:
 
 
 def run(scene: Scene, settings: Label) -> dict[str, object]:
-    """Fuse the masks, in memory or, where the cloud does not fit, by tiles; a cloud of another program is brought
-    into the world of the scene before.
+    """Fuse the masks, in memory or, where the cloud does not fit, by tiles; a cloud of another program is
+    brought into the world of the scene before.
     """
     scene.warn_of_unplaced(scene.masks, *([best_confidence(scene)] if settings.use_confidence else []))
     if settings.cloud is None:

@@ -186,8 +186,8 @@ def _normals(records: np.ndarray) -> np.ndarray:
 
 
 def sample_spacing(store: TileStore, statistics: CloudStatistics) -> tuple[float, np.ndarray]:
-    """Sampling distance as `labelled_cloud.spacing_of` has it, and the points (S, 3) by which `default_voxel_size`
-    measures mask pixels.
+    """Sampling distance as `labelled_cloud.spacing_of` has it, and the points (S, 3) by which
+    `default_voxel_size` measures mask pixels.
     """
     rows, distances, footprint_rows, footprints = [], [], [], []
     num_points = sum(store.counts.values())
@@ -256,8 +256,8 @@ def label_tile(job: LabelJob, tile: int) -> None:
 
 
 def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (B, 3) int32 and counts of the field's blocks whose first point, by row, lies in the tile: each block
-    belongs to one tile.
+    """Positions (B, 3) int32 and counts of the field's blocks whose first point, by row, lies in the tile:
+    each block belongs to one tile.
     """
     grid = fusion.grid
     voxels = sort_by_voxel(points, grid.voxel_size, grid.origin)

@@ -84,7 +84,9 @@ class DisplaySplats:
         return self[chosen]
 
     def centers(self) -> o3d.t.geometry.PointCloud:
-        """The centers as a cloud: positions (world), colors, and label and confidence where there are labels."""
+        """The centers as a cloud: positions (world), colors, and label and confidence where there are
+        labels.
+        """
         import open3d as o3d
 
         cloud = o3d.t.geometry.PointCloud(
