@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from sc3d.georeferencing.georeference import (
 )
 from sc3d.importers.clouds import Geometry
 from sc3d.importers.project import Project, rigid
+from sc3d.scene.frame_check import check_frame
 from sc3d.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -87,8 +89,8 @@ def _from_geocentric(project: Project, epsg: int | None) -> Project:
 def enu_of_geocentric(
     middle: np.ndarray, to_geodetic: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[tuple[float, float, float], Similarity]:
-    """Origin (latitude, longitude, height) of a local ENU frame near a geocentric position, and the similarity
-    from geocentric coordinates minus that position to it.
+    """Origin (latitude, longitude, height) of a local ENU frame near a geocentric position, and the
+    similarity from geocentric coordinates minus that position to it.
 
     middle: (3,) m; to_geodetic: (N, 3) geocentric to (N, 3) latitude, longitude, height on WGS 84
     """
@@ -126,44 +128,76 @@ def frame_of_scene(
 
 
 def place_geometries(
-    geometries: dict[Path, Geometry], georeference: Georeference | None, views: list[View], epsg: int | None
+    geometries: dict[Path, Geometry],
+    georeference: Georeference | None,
+    views: list[View],
+    sparse_points: np.ndarray,
+    epsg: int | None,
 ) -> dict[Path, tuple[Geometry, str]]:
-    """The geometries in the scene's world, each with what its coordinates were taken for.
+    """The geometries in the scene's world, each with what its coordinates were taken for; a warning where one
+    lies elsewhere than the cameras and sparse points (P, 3).
 
     epsg: the CRS of those that state none
     """
     placed = {}
     for path, geometry in geometries.items():
-        positions, frame = to_world(geometry.positions, geometry.epsg or epsg, georeference, views, str(path))
-        placed[path] = replace(geometry, positions=positions), frame
+        taken = frame_of(geometry.positions, geometry.epsg or epsg, georeference, views, str(path))
+        moved = place_geometry(geometry, taken, georeference)
+        check_frame(path, moved.positions, views, sparse_points)
+        placed[path] = moved, "world" if taken is None else f"EPSG:{taken}"
     return placed
 
 
-def to_world(
-    positions: np.ndarray, epsg: int | None, georeference: Georeference | None, views: list[View], name: str
-) -> tuple[np.ndarray, str]:
-    """Positions of a cloud in the world of a scene, and what they were taken for: "world" or "EPSG:...".
+def place_geometry(geometry: Geometry, epsg: int | None, georeference: Georeference | None) -> Geometry:
+    """A geometry in what `frame_of` says, in the world."""
+    positions = move_to_world(geometry.positions, epsg, georeference)
+    attributes = dict(geometry.attributes)
+    if "normals" in attributes:
+        attributes["normals"] = turn_to_world(geometry.positions, attributes["normals"], epsg, georeference)
+    return replace(geometry, positions=positions, attributes=attributes)
 
-    epsg: CRS of the positions as its file or the user says; None = not stated: the world, unless only the
-        scene's CRS brings it to the cameras
+
+def frame_of(
+    positions: np.ndarray, epsg: int | None, georeference: Georeference | None, views: list[View], name: str
+) -> int | None:
+    """The CRS that positions of a cloud, or some of them, are in; None = the world of the scene already.
+
+    epsg: as its file or the user says; None = not stated: the world, unless only the scene's CRS brings it to
+        the cameras
     """
-    if epsg is not None:
-        if georeference is None:
-            raise InputError(
-                f"{name} is in EPSG:{epsg}, but nothing says where the scene's cameras are: run `sc3d georeference` on the scene first"
-            )
-        return georeference.from_crs(_reproject(positions, epsg, georeference)), f"EPSG:{epsg}"
     centers = np.array([view.center for view in views]).reshape(-1, 3)
-    if georeference is not None and len(centers) and _far(positions, centers):
-        moved = georeference.from_crs(positions)
-        if not _far(moved, centers):
-            return moved, f"EPSG:{georeference.epsg}"
-    if len(centers) and _far(positions, centers):
-        logger.warning(
-            "%s lies far from the cameras: it seems to be in another frame (--epsg says which CRS it is in)",
-            name,
+    if epsg is not None and georeference is not None:
+        return epsg
+    if epsg is not None and (not len(centers) or _far(positions, centers)):
+        raise InputError(
+            f"{name} is in EPSG:{epsg}, but nothing says where the scene's cameras are: run `sc3d georeference` on the scene first"
         )
-    return positions, "world"
+    if georeference is not None and len(centers) and _far(positions, centers):
+        with suppress(InputError):  # outside of the CRS
+            if not _far(georeference.from_crs(positions), centers):
+                return georeference.epsg
+    return None
+
+
+def move_to_world(positions: np.ndarray, epsg: int | None, georeference: Georeference | None) -> np.ndarray:
+    """Positions (N, 3) in what `frame_of` says, in the world."""
+    if epsg is None or georeference is None:
+        return positions
+    return georeference.from_crs(_reproject(positions, epsg, georeference))
+
+
+def turn_to_world(
+    positions: np.ndarray, normals: np.ndarray, epsg: int | None, georeference: Georeference | None
+) -> np.ndarray:
+    """(N, 3) float32 unit normals at positions (N, 3) in what `frame_of` says, turned as the world is;
+    those of no length stay.
+    """
+    if epsg is None or georeference is None:
+        return normals
+    ahead = move_to_world(positions + np.nan_to_num(normals.astype(np.float64)), epsg, georeference)
+    turned = ahead - move_to_world(positions, epsg, georeference)
+    length = np.linalg.norm(turned, axis=1, keepdims=True)
+    return np.divide(turned, length, out=np.zeros_like(turned), where=length > 0).astype(np.float32)
 
 
 def _reproject(positions: np.ndarray, epsg: int, georeference: Georeference) -> np.ndarray:

@@ -21,6 +21,7 @@ from sc3d.geometry.distortion import DistortionModel, Lenses
 from sc3d.georeferencing.georeference import Georeference, triple
 from sc3d.importers.frames import LARGE, near_origin
 from sc3d.importers.project import Project, require_found, rigid, some_names
+from sc3d.io.crs import split_crs
 from sc3d.settings.reconstruction import Import
 
 logger = logging.getLogger(__name__)
@@ -99,7 +100,9 @@ def _read_text(file: Path) -> str:
 
 
 def _header_length(lines: list[tuple[int, str]], file: Path) -> int:
-    """Lines in front of the first photo, empty ones not counted: up to the one that states the camera model."""
+    """Lines in front of the first photo, empty ones not counted: up to the one that states the camera
+    model.
+    """
     filled = [line for _, line in lines if line]
     found = [row for row, line in enumerate(filled[:12]) if line.lower().startswith("camera model")]
     if not found:
@@ -168,7 +171,7 @@ def _georeference(file: Path) -> Georeference | None:
         raise InputError(
             f"{projection} or {offset_file} cannot be understood: a WKT of a CRS and three numbers are expected"
         ) from None
-    crs = crs.sub_crs_list[0] if crs.is_compound else crs
+    crs, height_unit = split_crs(crs)
     if crs.is_engineering:
         logger.warning("%s: the project has local coordinates: the place stays unknown", projection)
         return None
@@ -178,4 +181,8 @@ def _georeference(file: Path) -> Georeference | None:
             "%s: %s has no EPSG code of a projected CRS: the place stays unknown", projection, crs.name
         )
         return None
+    if height_unit is not None and abs(height_unit / crs.axis_info[0].unit_conversion_factor - 1) > 1e-9:
+        raise InputError(
+            f"{projection} has heights in another unit than eastings: export the project with one unit"
+        )
     return Georeference(epsg, triple(offset))

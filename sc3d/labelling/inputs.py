@@ -11,10 +11,11 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import View
+from sc3d.geometry.cameras import View, may_see
 from sc3d.io.clouds import read_cloud
 from sc3d.labelling.density import GaussianField, gaussian_density, kernel_density
 from sc3d.labelling.observation import Mask
+from sc3d.scene.frame_check import Box, box_of, check_frame, describe
 from sc3d.scene.labelled_cloud import spacing_of
 from sc3d.scene.scene import Scene
 from sc3d.scene.splats import read_scene_splats
@@ -66,8 +67,8 @@ def best_confidence(scene: Scene) -> Path:
     return scene.confidence_refined if scene.confidence_refined.is_dir() else scene.confidence
 
 
-def read_given_cloud(scene: Scene, file: Path | None) -> o3d.t.geometry.PointCloud:
-    """The cloud in `file`, or that of the scene, or the vertices of its mesh."""
+def given_cloud_path(scene: Scene, file: Path | None) -> Path:
+    """`file`, or the cloud of the scene, or its mesh, whose vertices do as well."""
     source = file or scene.cloud
     if file is None and not source.exists():
         source = scene.mesh
@@ -75,7 +76,28 @@ def read_given_cloud(scene: Scene, file: Path | None) -> o3d.t.geometry.PointClo
         raise InputError(
             f"{scene.path} has neither cloud.ply nor mesh.ply: run `sc3d extract SCENE`, or pass --cloud FILE"
         )
-    return read_cloud(source)
+    return source
+
+
+def read_given_cloud(scene: Scene, file: Path | None) -> o3d.t.geometry.PointCloud:
+    """The cloud of `given_cloud_path`."""
+    return read_cloud(given_cloud_path(scene, file))
+
+
+def require_in_view(path: Path, box: Box, masks: Masks, sparse_points: np.ndarray) -> None:
+    """InputError if no photo with a mask looks at the box around a cloud; a warning if the cloud lies
+    elsewhere than the scene.
+
+    box: world; sparse_points: (P, 3) world
+    """
+    if any(may_see(view, *box) for view in masks.views):
+        check_frame(path, np.array(box), masks.views, sparse_points)
+        return
+    cameras = box_of(np.array([view.center for view in masks.views]))
+    raise InputError(
+        f"no photo with a mask looks at {path}: its points are at {describe(box)}, the cameras at {describe(cameras)}."
+        " Is it in another frame? `sc3d import FILE SCENE --epsg` says which CRS it is in"
+    )
 
 
 def default_voxel_size(points: np.ndarray, masks: Masks) -> float:

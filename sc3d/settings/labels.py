@@ -128,7 +128,7 @@ class Label(Resources):
     contradict them nearby are locked; weigh: such views count less as well.
     """
     cloud: Path | None = None
-    """Cloud to label; SCENE/cloud.ply otherwise."""
+    """Cloud to label, also of another program, as `sc3d import` reads it; SCENE/cloud.ply otherwise."""
     output: Path | None = None
     """Labelled cloud to write; SCENE/seeds.ply otherwise."""
     mechanisms: PaperMechanisms = PaperMechanisms()

@@ -1,13 +1,17 @@
-"""Projects, clouds and meshes of other programs -> sparse/0, images, georeference.json, cloud.ply, mesh.ply."""
+"""Projects, clouds and meshes of other programs -> sparse/0, images, georeference.json, cloud.ply,
+mesh.ply.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from sc3d.errors import InputError
 from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
-from sc3d.importers.clouds import CLOUDS, MESHES, is_mesh, read_geometry, to_open3d
+from sc3d.importers.clouds import CLOUDS, MESHES, UNREAD, is_mesh, read_geometry, to_open3d
 from sc3d.importers.frames import frame_of_scene, near_origin, place_geometries
 from sc3d.importers.model import write_project
 from sc3d.importers.photos import locate_photos
@@ -19,6 +23,8 @@ from sc3d.runner import execute
 from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import, ImportCommand
+
+NO_POINTS = np.zeros((0, 3))
 
 
 def main(command: ImportCommand) -> None:
@@ -38,7 +44,7 @@ def is_geometry(path: Path, settings: Import) -> bool:
     return settings.source == "cloud" or (
         settings.source == "auto"
         and path.is_file()
-        and path.suffix.lower() in CLOUDS | MESHES
+        and path.suffix.lower() in CLOUDS | MESHES | UNREAD
         and not path.name.endswith("calibrated_camera_parameters.txt")
     )
 
@@ -81,7 +87,8 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
         views, georeference = project.views, project.georeference
         if photos is not None:
             require_place(photos, scene.images)
-    placed = place_geometries(geometries, georeference, views, settings.epsg)
+    sparse_points = project.points if project is not None else scene.model.points if views else NO_POINTS
+    placed = place_geometries(geometries, georeference, views, sparse_points, settings.epsg)
     if project is not None:
         figures = write_project(scene, project, photos, [geometry for geometry, _ in placed.values()])
         figures |= _without_camera(project, photos)
