@@ -18,6 +18,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 from sc3d.commands import COMMANDS, MODULES, STAGES
 from sc3d.commands.renamed import MOVED, current
 from sc3d.errors import InputError, Sc3dError
+from sc3d.io.requirements import explain
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -59,7 +60,12 @@ def reporting_errors() -> Iterator[None]:
     except PermissionError as error:
         sys.exit(_fail(f"no permission for {error.filename}: check its permissions or choose another folder"))
     except (Sc3dError, OSError, MemoryError) as error:
-        sys.exit(_fail(f"{error or type(error).__name__}", status=1))
+        sys.exit(_fail(explain(error) or str(error) or type(error).__name__, status=1))
+    except (ImportError, AttributeError) as error:
+        reason = explain(error)
+        if reason is None:
+            raise
+        sys.exit(_fail(reason, status=1))
     except KeyboardInterrupt:
         sys.exit(
             _fail(
