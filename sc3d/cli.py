@@ -59,9 +59,11 @@ def reporting_errors() -> Iterator[None]:
         sys.exit(_fail(str(error)))
     except PermissionError as error:
         sys.exit(_fail(f"no permission for {error.filename}: check its permissions or choose another folder"))
-    except (Sc3dError, OSError, MemoryError) as error:
+    except Sc3dError as error:
+        sys.exit(_fail(str(error), status=1))
+    except (OSError, MemoryError) as error:
         sys.exit(_fail(explain(error) or str(error) or type(error).__name__, status=1))
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, RuntimeError) as error:
         reason = explain(error)
         if reason is None:
             raise

@@ -17,7 +17,7 @@ from sc3d.geometry.cameras import View
 from sc3d.geometry.neighbors import orient_normals
 from sc3d.geometry.raycast import FirstSurface, Surface, first_surface
 from sc3d.geometry.tsdf import DepthFusion, Part, cloud_in_order, drop_small_parts, near_mesh, pixel_squares
-from sc3d.io.atomic import temporary_name
+from sc3d.io.atomic import require_room, temporary_name
 from sc3d.settings.reconstruction import Extract
 from sc3d.splatting.consistency import blocking, consistent, pixel_rays
 from sc3d.splatting.evaluation import facing_depth
@@ -66,6 +66,9 @@ class DepthViews:
 
 def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -> Surfaces:
     """Fuse the rendered depth of all views; raises Sc3dError where the views show or share no surface."""
+    # depth, and what is sure of it
+    size = 8 * sum(view.width * view.height for view in data.views)
+    require_room(Path(tempfile.gettempdir()) / "depth", size)
     with tempfile.TemporaryDirectory(prefix=temporary_name("sc3d-depth")) as folder:
         maps = _DepthMaps(Path(folder), data)
         footprint = maps.render(gaussians)
@@ -87,7 +90,7 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
         for accept in (_agreed, _unopposed, _plausible):
             if _coverage(_joined(parts)[0], data.views) >= wanted:
                 break
-            for turn in range(ROUNDS):
+            for turn in range(min(ROUNDS, len(data.views))):
                 parts.append(
                     _complete(
                         maps, _joined(parts)[0], voxel_size, range(turn, len(data.views), ROUNDS), accept

@@ -10,7 +10,6 @@ sidecars.
 
 from __future__ import annotations
 
-import errno
 import importlib
 import logging
 import os
@@ -24,7 +23,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from sc3d.errors import InputError, Sc3dError
-from sc3d.io.atomic import remove_leftovers, require_inside, temporary_name
+from sc3d.io.atomic import full_folder, remove_leftovers, require_inside, require_writable, temporary_name
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.provenance import digest, peak_memory_mb, reset_peak_memory, versions
 from sc3d.scene.scene import Scene
@@ -55,7 +54,7 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
     _prepare(scene, outputs)
     started = time.perf_counter()
     reset_peak_memory()
-    with _replacing(outputs), _room(scene):
+    with _replacing(outputs), _room(scene, outputs):
         summary = _plain(stage.run(scene, settings))
     record |= {
         "versions": versions(),
@@ -63,7 +62,7 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
         "peak_memory_mb": peak_memory_mb(),
         "summary": summary,
     }
-    with _room(scene):
+    with _room(scene, outputs):
         for output in outputs:
             write_json(sidecar(output), record)
     _report(name, record, outputs)
@@ -71,8 +70,11 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
 
 
 def _prepare(scene: Scene, outputs: list[Path]) -> None:
-    """Refuse outputs that would be written through a link to elsewhere; remove what killed runs left behind."""
+    """Refuse outputs that cannot be written, or only through a link to elsewhere; remove what killed runs left
+    behind.
+    """
     for output in outputs:
+        require_writable(output.parent)
         require_inside(scene.path, output)
     for folder in {scene.path, Path(tempfile.gettempdir()), *outputs, *(output.parent for output in outputs)}:
         remove_leftovers(folder)
@@ -112,18 +114,20 @@ def _identity(path: Path) -> tuple[int, ...] | None:
 
 
 @contextmanager
-def _room(scene: Scene) -> Iterator[None]:
-    """Say that the disk is full where it is, in whatever words a library puts it."""
+def _room(scene: Scene, outputs: list[Path]) -> Iterator[None]:
+    """Say that a disk is full and which, in whatever words a library puts it: that of the file that was written,
+    or of the scene, the outputs or the temporary files.
+    """
     try:
         yield
     except (OSError, RuntimeError) as error:
-        if getattr(error, "errno", None) not in (errno.ENOSPC, errno.EDQUOT) and "disk is full" not in str(
-            error
-        ):
+        folders = [scene.path, *(output.parent for output in outputs), Path(tempfile.gettempdir())]
+        full = full_folder(error, folders)
+        if full is None:
             raise
-        name = getattr(error, "filename", None)
+        hint = ", or let TMPDIR name a folder with more room for temporary files" if full == folders[-1] else ""
         raise Sc3dError(
-            f"no space left in {Path(name).parent if name else scene.path}: make room and run the same command again; finished work is kept"
+            f"no space left in {full}: make room{hint}, and run the same command again; finished work is kept"
         ) from error
 
 

@@ -4,6 +4,7 @@ in a line that tells how to install them.
 
 from __future__ import annotations
 
+import errno
 import re
 from importlib import metadata
 
@@ -31,6 +32,9 @@ LIBRARIES = {
     "libz.so.1": "zlib1g",
 }
 ALWAYS = ("libGL.so.1", "libEGL.so.1", "libusb-1.0.so.0", "libvulkan.so.1")  # slim systems lack these
+NO_CACHE = "cannot cache function"  # numba
+OUT_OF_MEMORY = "not enough memory"  # torch
+LESS_MEMORY = "end other programs, use a smaller --max-size where there is one, or give label, propagate and evaluate a lower --max-memory, so that they work by tiles"
 INSTALL = "sudo apt-get install --no-install-recommends"
 DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "sklearn": "scikit-learn"}  # by module
 NEED = re.compile(
@@ -39,10 +43,14 @@ NEED = re.compile(
 
 
 def explain(error: BaseException) -> str | None:
-    """One line about a library or package that is missing or too old, and how to get it; None for errors of
-    other kinds.
+    """One line about what is missing or too old, and how to get it: a library, a package, memory, a place for
+    compiled kernels; None for errors of other kinds.
     """
     text = str(error)
+    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM or OUT_OF_MEMORY in text:
+        return f"not enough memory{f' ({text})' if text else ''}: {LESS_MEMORY}"
+    if NO_CACHE in text:
+        return f"compiled kernels have no place ({text}): let NUMBA_CACHE_DIR name a folder that can be written"
     if found := re.search(r"([\w.+-]+\.so[\w.]*): cannot open shared object file", text):
         return _missing_library(found[1])
     if found := re.search(r"version `([\w.]+)' not found \(required by ([^)]+)\)", text):

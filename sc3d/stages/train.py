@@ -11,7 +11,7 @@ from sc3d.geometry.blocks import split_blocks
 from sc3d.io.atomic import atomic_path, remove
 from sc3d.io.provenance import digest
 from sc3d.io.splats import origin_comment, write_splat_ply
-from sc3d.scene.scene import Scene, check_photos
+from sc3d.scene.scene import Scene, check_photos, require_views
 from sc3d.settings.train import Train
 from sc3d.splatting.blocks import BlockJob, train_blocks
 from sc3d.splatting.dataset import TrainingData, scene_data
@@ -33,6 +33,7 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
     in_blocks = settings.blocks > 1
     if not (in_blocks and settings.cluster):  # whose workers may have the GPU that this machine lacks
         pick_device(settings.device)  # complain before the work begins
+    require_views(scene)
     check_photos(scene, [view.name for view in scene.model.views])
     if len(scene.model.points) < 10:
         raise InputError(
