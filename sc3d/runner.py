@@ -125,7 +125,9 @@ def _room(scene: Scene, outputs: list[Path]) -> Iterator[None]:
         full = full_folder(error, folders)
         if full is None:
             raise
-        hint = ", or let TMPDIR name a folder with more room for temporary files" if full == folders[-1] else ""
+        hint = (
+            ", or let TMPDIR name a folder with more room for temporary files" if full == folders[-1] else ""
+        )
         raise Sc3dError(
             f"no space left in {full}: make room{hint}, and run the same command again; finished work is kept"
         ) from error

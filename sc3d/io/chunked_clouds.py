@@ -13,7 +13,7 @@ from sc3d.io.las import check_las
 from sc3d.io.limits import FARTHEST
 from sc3d.io.ply import check_ply
 
-RECORDS_AT_ONCE = 1_000_000  # rows held at a time
+RECORDS_AT_ONCE, BYTES_AT_ONCE = 1_000_000, 128 << 20  # rows held at a time
 LAS_FIELDS = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
 LAS_COLORS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 
@@ -56,9 +56,13 @@ class CloudFile:
         """Of the fields of a record."""
         return self.dtype.names or ()
 
-    def chunks(self) -> Iterator[tuple[int, np.ndarray]]:
-        """First row and records of each chunk; InputError at positions that are not finite or too far away."""
-        for start, records in self._read():
+    @property
+    def rows_at_once(self) -> int:
+        return rows_at_once(self.dtype)
+
+    def chunks(self, at_once: int = 0) -> Iterator[tuple[int, np.ndarray]]:
+        """First row and records of each chunk, of `at_once` rows if given; InputError at positions that are not finite or too far away."""
+        for start, records in self._read(at_once or self.rows_at_once):
             for axis in "xyz":
                 if not (np.abs(records[axis]) <= FARTHEST).all():
                     raise InputError(
@@ -66,22 +70,27 @@ class CloudFile:
                     )
             yield start, records
 
-    def _read(self) -> Iterator[tuple[int, np.ndarray]]:
+    def _read(self, at_once: int) -> Iterator[tuple[int, np.ndarray]]:
         if self.path.suffix.lower() in (".las", ".laz"):
-            yield from _read_las(self)
+            yield from _read_las(self, at_once)
             return
         with self.path.open("rb") as file:
             file.seek(self.offset)
-            for start in range(0, self.num_points, RECORDS_AT_ONCE):
-                yield start, np.fromfile(file, self.dtype, min(RECORDS_AT_ONCE, self.num_points - start))
+            for start in range(0, self.num_points, at_once):
+                yield start, np.fromfile(file, self.dtype, min(at_once, self.num_points - start))
 
 
-def _read_las(cloud: CloudFile) -> Iterator[tuple[int, np.ndarray]]:
+def rows_at_once(dtype: np.dtype) -> int:
+    """How many records to hold at a time."""
+    return min(RECORDS_AT_ONCE, max(1, BYTES_AT_ONCE // dtype.itemsize))
+
+
+def _read_las(cloud: CloudFile, at_once: int) -> Iterator[tuple[int, np.ndarray]]:
     import laspy
 
     start = 0
     with laspy.open(cloud.path) as file:
-        for points in file.chunk_iterator(RECORDS_AT_ONCE):
+        for points in file.chunk_iterator(at_once):
             records = np.empty(len(points), cloud.dtype)
             for axis in "xyz":
                 records[axis] = getattr(points, axis)

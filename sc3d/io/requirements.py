@@ -47,10 +47,16 @@ def explain(error: BaseException) -> str | None:
     compiled kernels; None for errors of other kinds.
     """
     text = str(error)
-    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM or OUT_OF_MEMORY in text:
+    if (
+        isinstance(error, MemoryError)
+        or getattr(error, "errno", None) == errno.ENOMEM
+        or OUT_OF_MEMORY in text
+    ):
         return f"not enough memory{f' ({text})' if text else ''}: {LESS_MEMORY}"
     if NO_CACHE in text:
-        return f"compiled kernels have no place ({text}): let NUMBA_CACHE_DIR name a folder that can be written"
+        return (
+            f"compiled kernels have no place ({text}): let NUMBA_CACHE_DIR name a folder that can be written"
+        )
     if found := re.search(r"([\w.+-]+\.so[\w.]*): cannot open shared object file", text):
         return _missing_library(found[1])
     if found := re.search(r"version `([\w.]+)' not found \(required by ([^)]+)\)", text):

@@ -16,6 +16,7 @@ from sc3d.io.clouds import read_cloud
 from sc3d.io.images import image_size, read_index_image
 from sc3d.labelling.density import GaussianField, gaussian_density, kernel_density
 from sc3d.labelling.observation import Mask
+from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import spacing_of
 from sc3d.scene.scene import Scene
 from sc3d.scene.splats import read_scene_splats
@@ -25,13 +26,14 @@ FOOTPRINT_SAMPLE = 1000
 
 @dataclass(frozen=True)
 class Masks:
-    """The masks of a scene: files by view name, confidence maps where there are any, and the views that have
-    a mask.
+    """The masks of a scene: files by view name, confidence maps where there are any, the views that have a mask,
+    and the channels of the classes.
     """
 
     files: dict[str, Path]
     confidences: dict[str, Path]
     views: list[View]
+    channels: Channels
 
     @classmethod
     def load(cls, scene: Scene, confidence: Path | None) -> Masks:
@@ -43,18 +45,22 @@ class Masks:
             hint="pass --classes FILE to `sc3d run`, or copy data/classes.json of the sc3d repository there and edit it",
         )
         scene.require(scene.masks, hint="run `sc3d segment SCENE` first, with --masks if you have some")
-        files = scene.mask_files(scene.masks, scene.class_table())
+        table = scene.class_table()
+        files = scene.mask_files(scene.masks, table)
         confidences = scene.mask_files(confidence) if confidence is not None and confidence.is_dir() else {}
         for name, path in confidences.items():
             if name in files and image_size(path) != image_size(files[name]):
                 raise InputError(f"{path} has another size than its mask: both must be the same")
-        return cls(files, confidences, [view for view in scene.model.views if view.name in files])
+        return cls(
+            files, confidences, [view for view in scene.model.views if view.name in files], table.channels
+        )
 
     def read(self, view: View) -> Mask:
-        """As `fuse` wants it."""
+        """As `fuse` wants it: channels, not ids."""
         confidence = self.confidences.get(view.name)
         sure = None if confidence is None else read_index_image(confidence)
-        return read_index_image(self.files[view.name]), sure
+        file = self.files[view.name]
+        return self.channels.from_ids(read_index_image(file), file), sure
 
 
 def best_confidence(scene: Scene) -> Path:

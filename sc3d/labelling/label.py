@@ -12,7 +12,7 @@ from sc3d.io.clouds import write_geometry
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.fusion import fuse
 from sc3d.labelling.inputs import Masks, best_confidence, default_voxel_size, point_density, read_given_cloud
-from sc3d.scene.labelled_cloud import point_arrays, read_surface, with_labels
+from sc3d.scene.labelled_cloud import Votes, point_arrays, read_surface, with_labels
 from sc3d.scene.labels import STATE_NAMES
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
@@ -51,10 +51,12 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         surface = read_surface(scene.mesh, points, normals, local_origin(masks.views), settings.surface)
     if settings.mechanisms.density:
         density = point_density(scene, points, settings.voxel_size)
-    num_ids = scene.class_table().num_ids
-    fusion = fuse(Cloud(points, normals, density), masks.views, masks.read, surface, num_ids, settings)
+    channels = masks.channels
+    fusion = fuse(Cloud(points, normals, density), masks.views, masks.read, surface, channels.count, settings)
     with atomic_path(scene.votes_of(settings.output)) as temporary:
-        fusion.grid.save(temporary)
-    write_geometry(settings.output or scene.seeds, with_labels(given, normals, fusion.labels, fusion.votes))
-    counts = np.bincount(fusion.labels.state, minlength=len(STATE_NAMES))
+        fusion.grid.save(temporary, channels.ids)
+    labels = replace(fusion.labels, label=channels.to_ids(fusion.labels.label))
+    seeds = with_labels(given, normals, labels, Votes(fusion.votes, channels))
+    write_geometry(settings.output or scene.seeds, seeds)
+    counts = np.bincount(labels.state, minlength=len(STATE_NAMES))
     return LabelSummary(counts, settings.voxel_size, len(masks.views))

@@ -260,7 +260,9 @@ def require_views(scene: Scene) -> None:
     if alone:
         logger.warning(
             "%d of %d photos share no sparse point with another, so that nothing checks their depth: %s",
-            len(alone), len(model.views), examples(alone),
+            len(alone),
+            len(model.views),
+            examples(alone),
         )
 
 

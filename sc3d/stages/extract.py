@@ -71,7 +71,9 @@ def _depth_range(model: SparseModel, means: np.ndarray) -> tuple[float, float]:
         depths.append(depth if tracked else depth[in_image(view, pixels) & (depth > 0)])
     found = np.concatenate(depths)
     if not len(found):
-        raise InputError("no photo sees a sparse point or a Gaussian: cameras and Gaussians do not belong together")
+        raise InputError(
+            "no photo sees a sparse point or a Gaussian: cameras and Gaussians do not belong together"
+        )
     near, far = np.quantile(found, [0.01, 0.99])
     return 0.7 * float(near), 1.2 * float(far)
 
