@@ -15,6 +15,11 @@ class MissingPackageError(Sc3dError):
     """An optional package is not installed; the message holds the pip line that installs it."""
 
 
+def left_out(names: Sequence[object], total: int, what: str) -> str:
+    """One line about what is left out: how many of how many, why, and the first few."""
+    return f"{len(names)} of {total} {what}: {examples(names)}"
+
+
 def examples(names: Sequence[object], most: int = 3) -> str:
     """The first few of some names, and how many more there are, for a line about what is left out."""
     rest = f" and {len(names) - most} more" if len(names) > most else ""

@@ -4,14 +4,15 @@ both.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import open3d as o3d
 
-from sc3d.errors import InputError
-from sc3d.geometry.cameras import View
+from sc3d.errors import InputError, left_out
+from sc3d.geometry.cameras import View, may_see
 from sc3d.io.clouds import read_cloud
 from sc3d.io.images import image_size, read_index_image
 from sc3d.labelling.density import GaussianField, gaussian_density, kernel_density
@@ -23,17 +24,20 @@ from sc3d.scene.splats import read_scene_splats
 
 FOOTPRINT_SAMPLE = 1000
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class Masks:
     """The masks of a scene: files by view name, confidence maps where there are any, the views that have a mask,
-    and the channels of the classes.
+    and the channels of the classes; without: names of the photos that have a camera and no mask.
     """
 
     files: dict[str, Path]
     confidences: dict[str, Path]
     views: list[View]
     channels: Channels
+    without: tuple[str, ...] = ()
 
     @classmethod
     def load(cls, scene: Scene, confidence: Path | None) -> Masks:
@@ -51,9 +55,24 @@ class Masks:
         for name, path in confidences.items():
             if name in files and image_size(path) != image_size(files[name]):
                 raise InputError(f"{path} has another size than its mask: both must be the same")
-        return cls(
-            files, confidences, [view for view in scene.model.views if view.name in files], table.channels
-        )
+        views = scene.model.views
+        masked = [view for view in views if view.name in files]
+        without = tuple(view.name for view in views if view.name not in files)
+        return cls(files, confidences, masked, table.channels, without)
+
+    def tell_of_left_out(self, low: np.ndarray, high: np.ndarray) -> None:
+        """One line for each reason why photos do not vote, or not as others do. low, high: (3,) box of the
+        cloud, world.
+        """
+        count = len(self.views) + len(self.without)
+        away = [view.name for view in self.views if not may_see(view, low, high)]
+        sure = [view.name for view in self.views if view.name not in self.confidences]
+        if self.without:
+            logger.info(left_out(self.without, count, "photos have no mask and do not vote"))
+        if away:
+            logger.warning(left_out(away, count, "photos do not see the cloud and do not vote"))
+        if self.confidences and sure:
+            logger.warning(left_out(sure, count, "photos have no confidence map; their masks count as sure"))
 
     def read(self, view: View) -> Mask:
         """As `fuse` wants it: channels, not ids."""

@@ -44,6 +44,7 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     masks = Masks.load(scene, best_confidence(scene) if settings.use_confidence else None)
     given = read_given_cloud(scene, settings.cloud)
     points, normals = point_arrays(given, np.array([view.center for view in masks.views]))
+    masks.tell_of_left_out(points.min(axis=0), points.max(axis=0))
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=default_voxel_size(points, masks))
     surface, density = None, None

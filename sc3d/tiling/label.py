@@ -100,6 +100,7 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     ]
     folder = WorkFolder(output, "label", decisive, settings)
     statistics = CloudStatistics.from_cloud(cloud)
+    masks.tell_of_left_out(statistics.extent.low, statistics.extent.high)
     margin = BLOCKS * BLOCK * (settings.voxel_size or VOXEL * statistics.spacing)
     grid = statistics.grid(max_points(settings, bytes_per_point(scene)), margin)
     store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
