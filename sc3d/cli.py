@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import logging
+import os
+import re
 import signal
 import sys
 from collections.abc import Iterator
@@ -23,7 +25,7 @@ from sc3d.io.requirements import explain
 
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and exit: 0 done, 1 failed, 2 bad input, 130 interrupted by Ctrl-C."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = expanded(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.stdout.write(usage())
         sys.exit(0 if arguments else 2)
@@ -38,6 +40,15 @@ def main(arguments: list[str] | None = None) -> None:
     command = parse(name, current(arguments[1:]))
     with reporting_errors():
         _dispatch(name, command)
+
+
+def expanded(arguments: list[str]) -> list[str]:
+    """Arguments with `~` at the start of a path as the home folder, which shells leave in `--masks=~/masks`."""
+    found = [re.fullmatch(r"(--[\w.-]+=)?(~(?:/.*)?)", argument) for argument in arguments]
+    return [
+        (match[1] or "") + os.path.expanduser(match[2]) if match else argument
+        for match, argument in zip(found, arguments, strict=True)
+    ]
 
 
 def start_logging() -> None:

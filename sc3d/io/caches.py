@@ -42,9 +42,9 @@ def kernel_cache() -> str:
 
 
 def _user_caches() -> Path:
-    """The user's cache folder; one that does not exist where no home folder is known."""
+    """The user's cache folder; one that cannot be where no home folder is known."""
     given = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(given if os.path.isabs(given) else "/nonexistent/.cache")
+    return Path(given if os.path.isabs(given) else "/dev/null/.cache")
 
 
 def can_be_made(folder: Path) -> bool:
