@@ -10,6 +10,7 @@ from sc3d.georeferencing.georeference import georeference_path, projected_crs, w
 from sc3d.io.atomic import require_writable
 from sc3d.io.images import find_photos, image_size, link_photos
 from sc3d.runner import execute
+from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Reconstruct, ReconstructCommand
 from sc3d.sfm import reconstruct
@@ -41,7 +42,7 @@ def outputs(scene: Scene, settings: Reconstruct) -> list[Path]:
 
 
 def run(scene: Scene, settings: Reconstruct) -> dict[str, object]:
-    names = [str(photo.relative_to(scene.images)) for photo in find_photos(scene.images)]
+    names = [photo_name(photo, scene.images) for photo in find_photos(scene.images)]
     if settings.epsg is not None:
         projected_crs(settings.epsg)
     control_points = read_control_points(settings.gcp, names) if settings.gcp else None
