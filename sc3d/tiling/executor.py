@@ -85,7 +85,7 @@ def open_executor(resources: Workers) -> Iterator[Executor]:
         return
     try:
         from distributed import Client, LocalCluster
-    except ImportError:
+    except ModuleNotFoundError:
         raise InputError("--workers and --cluster need Dask: pip install 'sc3d[cluster]'") from None
     logging.getLogger("distributed").setLevel(logging.WARNING)  # importing it sets INFO
     if resources.cluster:
