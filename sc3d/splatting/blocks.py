@@ -6,7 +6,7 @@ coarse Gaussians that are dropped afterwards: such a context costs the memory an
 save, and what it gets wrong the block's own Gaussians would make up for. What a pixel shows is told by the
 nearest sparse points that its photo sees, so a roof before the block counts as what it is: outside.
 
-Each block is one task, here or on Dask workers. Beside the checkpoint of block 3, `3.checkpoint`, lie its
+Each block is one task, here or on workers. Beside the checkpoint of block 3, `3.checkpoint`, lie its
 Gaussians, `3.ply`, and, written last, `3.json` with the rest: with that it is finished and not begun again.
 """
 
