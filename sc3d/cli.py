@@ -8,7 +8,7 @@ import logging
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,7 +24,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Run one command and exit: 0 done, 1 failed, 2 bad input, 130 interrupted by Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments or arguments[0] in ("-h", "--help"):
-        sys.stdout.write(usage())
+        with ending_with_reader():
+            sys.stdout.write(usage())
         sys.exit(0 if arguments else 2)
     name = arguments[0]
     if name in MOVED:
@@ -34,19 +35,34 @@ def main(arguments: list[str] | None = None) -> None:
     if name not in STAGES and name not in COMMANDS:
         sys.exit(_fail(f"unknown command {name!r}: one of {', '.join(sorted(STAGES | COMMANDS))}"))
     start_logging()
-    command = parse(name, current(arguments[1:]))
+    with ending_with_reader():
+        command = parse(name, current(arguments[1:]))
     with reporting_errors():
         _dispatch(name, command)
 
 
 def start_logging() -> None:
-    """Log to stderr, of other packages warnings only; `sc3d ... | head` ends quietly."""
-    if hasattr(signal, "SIGPIPE"):  # not on Windows
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    """Log to stderr, of other packages warnings only."""
     logging.basicConfig(format="%(message)s", stream=sys.stderr)
     for package in ("sc3d", "tools"):
         logging.getLogger(package).setLevel(logging.INFO)
     logging.captureWarnings(True)
+
+
+@contextmanager
+def ending_with_reader() -> Iterator[None]:
+    """For what is printed: `sc3d --help | head` ends quietly. Not for more than that: a server whose visitor
+    leaves, or a command whose worker dies, must not end.
+    """
+    if not hasattr(signal, "SIGPIPE"):  # Windows
+        yield
+        return
+    before = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        signal.signal(signal.SIGPIPE, before or signal.SIG_DFL)
 
 
 @contextmanager
@@ -119,5 +135,6 @@ def _dispatch(name: str, command: Any) -> None:
 
 
 def _fail(message: str, status: int = 2) -> int:
-    sys.stderr.write(f"sc3d: {' '.join(message.split())}\n")
+    with suppress(BrokenPipeError):
+        sys.stderr.write(f"sc3d: {' '.join(message.split())}\n")
     return status
