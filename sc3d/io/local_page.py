@@ -48,7 +48,9 @@ class LocalPage:
             return "this page is served under the address that sc3d names, and no other"
         if headers.get_all("Origin") and not self.is_own_origin(headers):
             return "requests from other origins are refused"
-        if (_only(headers, "Sec-Fetch-Site") or "none") not in ("same-origin", "none") and not _opens(headers):
+        if (_only(headers, "Sec-Fetch-Site") or "none") not in ("same-origin", "none") and not _opens(
+            headers
+        ):
             return "requests from other sites are refused"
         return None
 
