@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import logging
+import re
 import signal
 import sys
 from collections.abc import Iterator
@@ -18,6 +19,9 @@ from tyro.conf import OmitArgPrefixes, Positional
 from sc3d.commands import COMMANDS, MODULES, STAGES
 from sc3d.commands.renamed import MOVED, current
 from sc3d.errors import InputError, Sc3dError
+
+# numba reads it in whatever folder a command is called, also in a scene of somebody else
+NUMBA_FILE = ".numba_config.yaml"
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -34,6 +38,12 @@ def main(arguments: list[str] | None = None) -> None:
         )
     if name not in STAGES and name not in COMMANDS:
         sys.exit(_fail(f"unknown command {name!r}: one of {', '.join(sorted(STAGES | COMMANDS))}"))
+    if Path(NUMBA_FILE).exists():
+        sys.exit(
+            _fail(
+                f"{Path(NUMBA_FILE).absolute()} would tell numba where to load code from: start sc3d in another folder"
+            )
+        )
     start_logging()
     with ending_with_reader():
         command = parse(name, current(arguments[1:]))
@@ -43,10 +53,24 @@ def main(arguments: list[str] | None = None) -> None:
 
 def start_logging() -> None:
     """Log to stderr, of other packages warnings only."""
-    logging.basicConfig(format="%(message)s", stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(PlainText("%(message)s"))
+    logging.basicConfig(handlers=[handler])
     for package in ("sc3d", "tools"):
         logging.getLogger(package).setLevel(logging.INFO)
     logging.captureWarnings(True)
+
+
+class PlainText(logging.Formatter):
+    """Names of photos and classes may hold what a terminal takes for commands."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
+
+
+def printable(text: str) -> str:
+    """Text without control characters, but for line feeds and tabs."""
+    return re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "?", text)
 
 
 @contextmanager
@@ -136,5 +160,5 @@ def _dispatch(name: str, command: Any) -> None:
 
 def _fail(message: str, status: int = 2) -> int:
     with suppress(BrokenPipeError):
-        sys.stderr.write(f"sc3d: {' '.join(message.split())}\n")
+        sys.stderr.write(f"sc3d: {printable(' '.join(message.split()))}\n")
     return status

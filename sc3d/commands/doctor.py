@@ -6,11 +6,11 @@ import ctypes.util
 import logging
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 from sc3d.errors import Sc3dError
 from sc3d.io.provenance import versions
+from sc3d.io.python_process import run_python
 from sc3d.segmentation.models import find_weights
 from sc3d.settings.labels import Segment
 from sc3d.settings.outputs import Doctor
@@ -51,7 +51,7 @@ def main(command: Doctor) -> None:
 
 def _probe(code: str) -> str:
     try:
-        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+        result = run_python(code, timeout=120)
     except subprocess.TimeoutExpired:
         return "no answer within 120 s"
     if result.returncode == 0 and result.stdout.strip():

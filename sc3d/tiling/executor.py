@@ -101,7 +101,7 @@ def open_executor(resources: Workers) -> Iterator[Executor]:
         return
     pool = WorkerPool(resources.workers)
     try:
-        with _threads_per_process(max(1, (os.cpu_count() or 1) // resources.workers)):
+        with _environment(max(1, (os.cpu_count() or 1) // resources.workers)):
             yield LocalExecutor(pool)
     finally:
         pool.close()
@@ -131,11 +131,13 @@ def _dask_client(address: str) -> Any:
 
 
 @contextmanager
-def _threads_per_process(count: int) -> Iterator[None]:
-    """Of processes that are started in the block."""
-    names = "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, str(count)))
+def _environment(threads: int) -> Iterator[None]:
+    """Of processes that are started in the block: so many threads, and no modules from the folder in which the
+    command was called, which may be somebody else's scene.
+    """
+    given = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), str(threads)) | {"PYTHONSAFEPATH": "1"}
+    before = {name: os.environ.get(name) for name in given}
+    os.environ.update(given)
     try:
         yield
     finally:

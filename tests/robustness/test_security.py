@@ -24,7 +24,7 @@ from types import SimpleNamespace
 import psutil
 import pytest
 
-from sc3d.cli import main
+from sc3d.cli import PlainText, main
 from sc3d.errors import InputError, Sc3dError
 from sc3d.io import atomic
 from sc3d.io.atomic import claim, remove
@@ -709,3 +709,48 @@ def test_help_into_a_closed_pipe_ends_quietly(arguments):
     )  # fmt: skip
     os.close(start)
     assert process.returncode == -signal.SIGPIPE and not process.stderr
+
+
+# ---- commands that are called in somebody else's scene
+
+
+@pytest.fixture
+def trap(tmp_path, monkeypatch) -> Path:
+    """The current folder, full of modules that leave a mark when they are loaded."""
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    for name in ("multiprocessing", "numpy", "open3d", "signal", "sc3d"):
+        (folder / f"{name}.py").write_text(f"open({str(tmp_path / 'loaded')!r}, 'w')\nraise ImportError")
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 cannot be told")
+def test_workers_load_no_modules_from_the_current_folder(trap):
+    with open_executor(Workers(workers=1)) as executor:
+        assert executor.run("here", abs, [-3]) == [3]
+    assert not (trap.parent / "loaded").exists()
+
+
+def test_probes_load_no_modules_from_the_current_folder(trap):
+    from sc3d.io.python_process import run_python
+
+    assert run_python("import numpy; print(numpy.__version__)", 60).returncode == 0
+    assert not (trap.parent / "loaded").exists()
+
+
+def test_numba_is_not_told_by_a_file_of_the_scene(tmp_path, monkeypatch, capsys):
+    (tmp_path / ".numba_config.yaml").write_text("cache_dir: cache\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stopped:
+        main(["label", "."])
+    assert stopped.value.code == 2 and "in another folder" in capsys.readouterr().err
+
+
+def test_names_give_the_terminal_no_commands(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["label", str(tmp_path / "a\x1b]0;owned\x07b\x9b2J")])
+    said = capsys.readouterr().err
+    assert "a?]0;owned?b?2J" in said and not set(said) & set("\x1b\x07\x9b")
+    record = logging.LogRecord("sc3d", logging.WARNING, "", 1, "%s\nleft out", ("\x1b[2Ja.jpg",), None)
+    assert PlainText("%(message)s").format(record) == "?[2Ja.jpg\nleft out"
