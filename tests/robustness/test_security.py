@@ -360,10 +360,11 @@ def attacks(names: set[str]) -> Iterator[list[str]]:
     inside = {name for name in work if name.count("/") > 1 or not name.endswith("/")}
     yield from ([name] for name in sorted(names - inside) if name.endswith("/"))
     yield sorted(name for name in names - work if not name.endswith("/"))
-    if inside:
+    if inside:  # links to folders, and in one folder links to files
         folders = sorted(name for name in inside if name.endswith("/"))
-        yield folders or sorted(inside)
-        yield sorted(name for name in inside if not name.endswith("/") and "made-here" not in name)
+        real = tuple(folders[:1]) or min(inside)[: min(inside).index("/") + 1]
+        files = [name for name in inside if name.startswith(real) and not name.endswith("/")]
+        yield [*folders[1:], *sorted(files)]
 
 
 @pytest.mark.parametrize("name", STAGES)
