@@ -4,6 +4,8 @@ A stage module `sc3d/stages/<name>.py` offers three functions of (scene, setting
     inputs   -> paths whose content decides whether the stage must run again
     outputs  -> paths that it writes
     run      -> does the work; returns the figures for the summary and the sidecar
+and, where that is not all, one more:
+    besides  -> folders that it writes into without being known by them
 Stages never import one another; `execute` below is what they share: skip finished work, time it, write the
 sidecars.
 """
@@ -51,7 +53,8 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
     if previous is not None and not overwrite:
         logger.info("%s: up to date (--overwrite runs it again)", name)
         return previous["summary"]
-    _prepare(scene, outputs)
+    besides = stage.besides(scene, settings) if hasattr(stage, "besides") else []
+    _prepare(scene, outputs, besides)
     started = time.perf_counter()
     reset_peak_memory()
     with _replacing(outputs), _room(scene, outputs):
@@ -69,13 +72,14 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
     return summary
 
 
-def _prepare(scene: Scene, outputs: list[Path]) -> None:
+def _prepare(scene: Scene, outputs: list[Path], besides: list[Path]) -> None:
     """Refuse outputs that cannot be written, or only through a link to elsewhere; remove what killed runs left
     behind.
     """
     for output in outputs:
         require_writable(output.parent)
-        require_inside(scene.path, output)
+    for path in [*outputs, *besides]:
+        require_inside(scene.path, path)
     for folder in {scene.path, Path(tempfile.gettempdir()), *outputs, *(output.parent for output in outputs)}:
         remove_leftovers(folder)
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.io.atomic import require_inside
 from sc3d.io.images import find_photos, read_image, require_within
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.provenance import digest
@@ -41,6 +42,7 @@ class Session:
         read.
         """
         scene.require(scene.classes, scene.images, hint="the page needs classes.json and images/")
+        require_inside(scene.path, scene.strokes / "any.json")
         self._scene = scene
         self._settings = settings
         self.class_table = scene.class_table()

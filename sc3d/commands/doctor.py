@@ -14,6 +14,7 @@ from pathlib import Path
 from sc3d.errors import Sc3dError
 from sc3d.io.caches import kernel_cache
 from sc3d.io.provenance import versions
+from sc3d.io.python_process import run_python
 from sc3d.io.requirements import ALWAYS, INSTALL, LIBRARIES, outdated
 from sc3d.segmentation.models import find_weights
 from sc3d.settings.labels import Segment
@@ -63,7 +64,7 @@ def _room(folder: Path) -> str:
 
 def _probe(code: str) -> str:
     try:
-        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+        result = run_python(code, timeout=120)
     except subprocess.TimeoutExpired:
         return "no answer within 120 s"
     if result.returncode == 0 and result.stdout.strip():

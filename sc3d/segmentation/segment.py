@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from sc3d.io.atomic import discard, remove_leftovers
+from sc3d.io.atomic import claim, discard, remove_leftovers
 from sc3d.io.images import (
     find_photos,
     image_size,
@@ -99,7 +99,7 @@ def segment_scene(
     """
     folders = Folders(scene.masks, scene.confidence, scene.instances)
     marker, state = scene.path / "segment.unfinished.json", _state(scene, settings, class_table)
-    unfinished = marker.exists()
+    unfinished = claim(marker).exists()
     if unfinished and read_json(marker) == state:
         for folder in folders:
             for place in [folder, *folder.rglob("*")]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sc3d.errors import InputError, left_out
 from sc3d.geometry.blocks import split_blocks
-from sc3d.io.atomic import atomic_path, remove
+from sc3d.io.atomic import atomic_path, claim, remove
 from sc3d.io.images import find_photos
 from sc3d.io.provenance import digest
 from sc3d.io.splats import origin_comment, write_splat_ply
@@ -106,4 +106,4 @@ def _unfinished(scene: Scene, settings: Train) -> Path:
     for other in [*scene.path.glob("train.*.checkpoint"), *scene.path.glob("train.*.blocks")]:
         if other != mine:
             remove(other)
-    return mine
+    return claim(mine)

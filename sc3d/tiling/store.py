@@ -16,6 +16,7 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
 from sc3d.io.chunked_clouds import CloudFile, positions
+from sc3d.io.json_files import write_json
 from sc3d.labelling.cloud import STEPS, CloudExtent, histogram_median, position_histogram
 
 RASTER = 512  # cells per side in which points are counted, to choose the tiles
@@ -195,11 +196,7 @@ class TileStore:
                     _append(folder / f"{tile}.bin", records[rows])
                     _append(folder / f"{tile}.row", start + rows)
                 counts += found
-            temporary = folder / ".index.tmp"
-            temporary.write_text(
-                json.dumps({int(tile): int(counts[tile]) for tile in np.flatnonzero(counts)})
-            )
-            temporary.replace(index)
+            write_json(index, {int(tile): int(counts[tile]) for tile in np.flatnonzero(counts)})
         return cls(
             folder,
             grid,
