@@ -178,7 +178,7 @@ def _best_match(matches: list[tuple[int, str]]) -> str:
     if not matches:
         return "none matched in the others"
     count, other = max(matches)
-    return f"at most {count} matched in one other photo ({other}), {len(matches)} photos matched"
+    return f"at most {count} matched in one photo ({other}), matches with {len(matches)} photos in all"
 
 
 @contextmanager

@@ -194,13 +194,13 @@ def drop_wrong_marks(model: pycolmap.Reconstruction, points: ControlPoints) -> C
             apart.append(name)
     if marks:
         logger.warning(
-            "%d marks of ground control points are left out, as the others of the same point meet elsewhere: %s",
+            "marks that do not meet the others of the same ground control point are left out, %d: %s",
             len(marks),
             examples(marks),
         )
     if apart:
         logger.warning(
-            "%d ground control points are left out, as their marks do not meet in one place: %s",
+            "ground control points whose marks do not meet in one place are left out, %d: %s",
             len(apart),
             examples(apart),
         )
@@ -340,7 +340,7 @@ def _triangulate_all(model: pycolmap.Reconstruction, points: ControlPoints) -> t
     missing = [points.names[row] for row, seen in enumerate(points.observations) if len(seen) == 1]
     if missing:
         logger.warning(
-            "%d ground control points are left out, as fewer than two registered photos show them: %s",
+            "ground control points that fewer than two registered photos show are left out, %d: %s",
             len(missing),
             examples(missing),
         )

@@ -218,10 +218,10 @@ def agree(flight: Flight, centers: dict[str, np.ndarray]) -> Flight | None:
     wrong = np.array(names)[~kept].tolist()
     if wrong:
         logger.warning(
-            "GPS of %d of %d photos is wrong, by up to %.0f m, and left out: %s",
+            "GPS of %d of %d photos is wrong, by up to %s, and left out: %s",
             len(wrong),
             len(names),
-            np.linalg.norm(fit.apply(source) - target, axis=1)[~kept].max(),
+            _far(float(np.linalg.norm(fit.apply(source) - target, axis=1)[~kept].max())),
             examples(wrong),
         )
     agreed = flight.without(frozenset(wrong) | {name for name in flight.astray if name not in centers})
@@ -229,6 +229,10 @@ def agree(flight: Flight, centers: dict[str, np.ndarray]) -> Flight | None:
         logger.warning("the GPS positions that fit the cameras lie too close together: they are not used")
         return None
     return agreed
+
+
+def _far(meters: float) -> str:
+    return f"{meters:.0f} m" if meters < 10_000 else f"{meters / 1000:.0f} km"
 
 
 def _tolerance(flight: Flight, names: list[str]) -> float:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from sc3d.georeferencing.alignment import Similarity, main_plane, upside_down
-from sc3d.georeferencing.control_points import ControlPoints, align_to_control_points, transform
+from sc3d.georeferencing.control_fit import Accuracy
+from sc3d.georeferencing.control_points import (
+    ControlPoints,
+    align_to_control_points,
+    drop_wrong_marks,
+    match_control_points,
+    transform,
+)
 from sc3d.georeferencing.focal import anchor_focal, tells_focal
 from sc3d.georeferencing.georeference import Georeference, from_origin
 from sc3d.georeferencing.gps import Flight, agree, place, residuals
@@ -89,6 +96,26 @@ def _georeference(
     return from_origin(
         flight.origin, settings.epsg, settings.altitude_offset, {"gps": residuals(flight, _centers(model))}
     )
+
+
+def georeference_control_points(
+    model: pycolmap.Reconstruction,
+    points: ControlPoints,
+    epsg: int | None,
+    accuracy: Accuracy | None = None,
+) -> Georeference:
+    """Georeference of a model by control points, with a similarity in front; `model` is moved, what lies in its
+    frame elsewhere stays. InputError if they do not fit.
+
+    epsg: None = the CRS of the points, or the UTM zone
+    """
+    points = drop_wrong_marks(model, points)
+    found = match_control_points(model, points, accuracy)
+    transform(model, found.fit.similarity)
+    figures = {"control_points": found.figures(model, points)}
+    placed = from_origin(points.origin, epsg or points.epsg, figures=figures)
+    matrix = tuple(tuple(row) for row in found.fit.similarity.matrix.tolist())
+    return replace(placed, local_from_world=matrix)
 
 
 def _centers(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:

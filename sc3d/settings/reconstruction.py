@@ -69,6 +69,14 @@ class GeoreferenceOptions:
     """
     from_gps: bool = False
     """Replace the present georeference by one from GPS."""
+    gcp: Path | None = None
+    """Replace it by one from ground control points, in ODM's gcp_list.txt format; cameras and all that was made
+    from them stay as they are.
+    """
+    gcp_accuracy: tuple[float, float] | None = None
+    """Standard deviations of the ground control points, m: horizontal, vertical. None = estimated from how
+    they fit.
+    """
 
 
 @dataclass(frozen=True)
