@@ -17,11 +17,14 @@ from sc3d.errors import InputError
 from sc3d.georeferencing.alignment import Similarity, fit_similarity, fit_similarity_robust, subsets
 
 MIN_POINTS = 3
-MIN_SHARE = 0.6  # of the points must fit, if they fit loosely only; more than half if they fit well
+MIN_SHARE = (
+    0.6  # of the points must fit, if they are worse than the cameras; more than half if they are as good
+)
+FEW_BLUNDERS = 0.25  # share of points that may be wrong before the accuracy of all is in doubt
 LARGEST_RMS = 0.2  # of the extent of the points: nothing fits that fits no better,
 LARGEST_CHANCE = 0.01  # or that well by chance more often than this
 LINE = 0.02  # width over length of points on a line
-TILT = np.radians(15.0)  # points at one height are believed if the cameras stand no more askew on them
+TILT = np.radians(5.0)  # points at one height are believed if the cameras stand no more askew on them
 # of the norm of 2 and 3 normal deviates: its median, and what 1 % exceeds
 NORMAL_MEDIAN, NORMAL_LIMIT = {2: 1.177, 3: 1.538}, {2: 3.035, 3: 3.368}
 NUM_PARAMETERS = {2: 4, 3: 7}
@@ -65,8 +68,10 @@ def fit_control_points(
     errors: InputError if nothing fits, or the points lie on one line
     """
     found = _exact(source, target, up, tolerance, accuracy, level)
-    if found is None:
-        found = _loose(source, target, up, tolerance, accuracy, level)
+    if found is None or (~found.kept).mean() > FEW_BLUNDERS:
+        loose = _loose(source, target, up, tolerance, accuracy, level)
+        if loose is not None and (found is None or loose.kept.sum() > found.kept.sum()):
+            found = loose
     if found is None:
         raise InputError(_refusal(source, target, up, tolerance, accuracy, level, names))
     kept = target[found.kept]

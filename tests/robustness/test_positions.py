@@ -55,10 +55,14 @@ def names(count: int) -> list[str]:
     return [f"{row:02d}.jpg" for row in range(count)]
 
 
-def write_flight(folder: Path, positions: np.ndarray, wrong: dict[int, tuple], origin: tuple = MELBOURNE) -> None:
+def write_flight(
+    folder: Path, positions: np.ndarray, wrong: dict[int, tuple], origin: tuple = MELBOURNE
+) -> None:
     """Photos at ENU `positions`; `wrong`: shift in degrees and m by row."""
     for row, geodetic in enumerate(enu_to_geodetic(positions, origin)):
-        write_photo(folder / names(len(positions))[row], tuple(geodetic + np.array(wrong.get(row, (0, 0, 0)))))
+        write_photo(
+            folder / names(len(positions))[row], tuple(geodetic + np.array(wrong.get(row, (0, 0, 0))))
+        )
 
 
 def some_frame(positions: np.ndarray) -> dict[str, np.ndarray]:
@@ -192,7 +196,9 @@ class TestFiles:
         cut = tuple(float(np.trunc(value * step) / step) for value in place[:2])
         prefix = latitude.split(":")[0]
         xmp = f'{latitude}="{place[0]:+.8f}" {longitude}="{place[1]:+.8f}" {prefix}:AbsoluteAltitude="{place[2]:+.3f}"'
-        changes = {} if in_exif != "nothing" else {"GPSLatitude": None, "GPSLongitude": None, "GPSAltitude": None}
+        changes = (
+            {} if in_exif != "nothing" else {"GPSLatitude": None, "GPSLongitude": None, "GPSAltitude": None}
+        )
         tag = read_geotag(write_photo(tmp_path / "a.jpg", (*cut, 75.0), xmp, **changes))
         np.testing.assert_allclose(tag.geodetic, place, atol=1e-7)
 
