@@ -164,11 +164,17 @@ def _reasons(
     for pair, count in zip(pairs, inliers):
         first, second = (ids[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair))
         for name, other in ((first, second), (second, first)):
-            if count and name not in registered and other in registered:
+            if count:
                 matches.setdefault(name, []).append((count, other))
     reasons = {}
     for name in sorted(set(names) - registered):
-        reasons[name] = f"{features.get(name, 0)} features, " + _best_match(matches.get(name, []))
+        found = matches.get(name, [])
+        among = [match for match in found if match[1] not in registered]
+        reasons[name] = f"{features.get(name, 0)} features; matches with the registered: " + _best_match(
+            [match for match in found if match[1] in registered]
+        )
+        if among:
+            reasons[name] += f"; with others that are left out: {_best_match(among)}"
         if name in elsewhere:
             reasons[name] += f"; one of {elsewhere[name]} photos that fit one another but not the rest"
     return reasons
@@ -176,9 +182,9 @@ def _reasons(
 
 def _best_match(matches: list[tuple[int, str]]) -> str:
     if not matches:
-        return "none matched in the others"
+        return "none"
     count, other = max(matches)
-    return f"at most {count} matched in one photo ({other}), matches with {len(matches)} photos in all"
+    return f"{count} with {other}" + (f", fewer with {len(matches) - 1} more" if len(matches) > 1 else "")
 
 
 @contextmanager

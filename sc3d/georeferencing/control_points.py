@@ -118,8 +118,8 @@ def _geodetic(positions: np.ndarray, crs: pyproj.CRS, path: Path) -> np.ndarray:
 def check_control_points(
     points: ControlPoints, sizes: dict[str, tuple[int, int]], gps: tuple[float, float, float] | None
 ) -> None:
-    """Warnings of what can be seen before there are cameras: marks outside their photos, and points far from
-    the photos' GPS.
+    """What can be seen before there are cameras: InputError for marks outside their photos, a warning for
+    points far from the photos' GPS.
 
     sizes: (width, height) px by photo name; gps: latitude, longitude, height of the photos
     """
@@ -135,11 +135,11 @@ def check_control_points(
             "they belong to photos of another size"
         )
     if gps is not None:
-        away = float(np.linalg.norm(geodetic_to_enu(np.array([points.origin]), gps)[0, :2]))
+        away = float(np.linalg.norm(geodetic_to_enu(np.array([points.origin]), gps)))
         if away > FAR_FROM_GPS:
-            raise InputError(
-                f"the ground control points lie {away / 1000:.0f} km from the GPS of the photos: check their CRS and the order x y (east, north), "
-                "or leave the GPS out (--no-gps)"
+            logger.warning(
+                "the ground control points lie %.0f km from the GPS of the photos, one of them is wrong: check their CRS and the order x y (east, north)",
+                away / 1000,
             )
 
 
