@@ -115,6 +115,14 @@ def _geodetic(positions: np.ndarray, crs: pyproj.CRS, path: Path) -> np.ndarray:
     return geodetic
 
 
+def check_accuracy(file: Path | None, accuracy: Accuracy | None) -> None:
+    """InputError for an accuracy without control points, or one that is none."""
+    if accuracy is not None and file is None:
+        raise InputError("--gcp-accuracy needs --gcp")
+    if accuracy is not None and not all(0 < value < np.inf for value in accuracy):
+        raise InputError("--gcp-accuracy takes two standard deviations above 0, m: horizontal, vertical")
+
+
 def check_control_points(
     points: ControlPoints, sizes: dict[str, tuple[int, int]], gps: tuple[float, float, float] | None
 ) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sc3d.errors import InputError
-from sc3d.georeferencing.control_points import read_control_points
+from sc3d.georeferencing.control_points import check_accuracy, read_control_points
 from sc3d.georeferencing.georeference import (
     Georeference,
     georeference_path,
@@ -35,6 +35,7 @@ def outputs(scene: Scene, settings: GeoreferenceOptions) -> list[Path]:
 def run(scene: Scene, settings: GeoreferenceOptions) -> dict[str, object]:
     if settings.epsg is not None:
         projected_crs(settings.epsg)
+    check_accuracy(settings.gcp, settings.gcp_accuracy)
     if settings.gcp is not None and (settings.from_gps or settings.offset is not None):
         raise InputError("--gcp, --from-gps and --offset each say where the scene is: give one of them")
     present = None if settings.from_gps or settings.gcp else read_georeference(scene)

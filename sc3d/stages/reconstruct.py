@@ -9,7 +9,12 @@ from dataclasses import fields
 from pathlib import Path
 
 from sc3d.errors import InputError
-from sc3d.georeferencing.control_points import ControlPoints, check_control_points, read_control_points
+from sc3d.georeferencing.control_points import (
+    ControlPoints,
+    check_accuracy,
+    check_control_points,
+    read_control_points,
+)
 from sc3d.georeferencing.georeference import (
     from_origin,
     georeference_path,
@@ -52,6 +57,7 @@ def prepare(photos: Path, scene: Scene, settings: Reconstruct) -> None:
 
 def _check_place(photos: Path, sizes: dict[str, tuple[int, int]], settings: Reconstruct) -> None:
     """What would be refused after hours of work otherwise: control points and --epsg."""
+    check_accuracy(settings.gcp, settings.gcp_accuracy)
     points = _control_points(settings, list(sizes))
     if settings.epsg is not None:
         projected_crs(settings.epsg)

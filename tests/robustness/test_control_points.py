@@ -402,6 +402,9 @@ class TestKept:
         arguments = ("reconstruct", folder / "photos", folder / "scene", "--gcp", good)
         assert self.run(*arguments, "--epsg", "27700") == 2 and "United Kingdom" in capsys.readouterr().err
         assert self.run(*arguments, "--epsg", "7405") == 2 and "27700" in capsys.readouterr().err
+        for accuracy in (("0", "1"), ("nan", "1"), ("1", "-2")):
+            assert self.run(*arguments, "--gcp-accuracy", *accuracy) == 2
+        assert self.run(*arguments[:-2], "--gcp-accuracy", "1", "2") == 2
         assert calls == []
 
 
