@@ -14,10 +14,11 @@ import pycolmap
 from sc3d.errors import InputError
 from sc3d.georeferencing.alignment import Similarity, camera_up, upside_down
 from sc3d.georeferencing.control_fit import MIN_POINTS, Accuracy, ControlFit, fit_control_points
-from sc3d.georeferencing.gcp_list import PhotoNames, is_title, parse_crs, parse_mark, read_lines
+from sc3d.georeferencing.gcp_list import is_title, parse_crs, parse_mark, read_lines
 from sc3d.georeferencing.georeference import crs_to_geodetic, geodetic_to_enu, horizontal_crs
 from sc3d.georeferencing.gps import examples
 from sc3d.io.colmap import cam_from_world, registered_images
+from sc3d.scene.photo_names import PhotoNames
 
 if TYPE_CHECKING:
     import pyproj
@@ -57,8 +58,8 @@ def read_control_points(path: Path, photos: Sequence[str]) -> ControlPoints:
     """Read a `gcp_list.txt`: a line with the CRS, then `x y z px py photo [name]` per observation, apart by
     tabs, semicolons, commas or blanks.
 
-    photos: known names; a photo is found by its name, or by the last part of it, case aside where that leaves
-        one. InputError with the line for whatever cannot be understood.
+    photos: known names; a photo is found by its name, or by what is left of it without folders, suffix or
+        case where that is clear. InputError with the line for whatever cannot be understood.
     """
     lines = read_lines(path)
     crs = parse_crs(lines[0][1], path)

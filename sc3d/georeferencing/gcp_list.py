@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.scene.photo_names import PhotoNames
 
 if TYPE_CHECKING:
     import pyproj
@@ -30,28 +30,6 @@ class Mark:
     photo: str
     known: bool
     name: str
-
-
-class PhotoNames:
-    """Finds photos by what a file calls them: the name below the folder of photos, or its last part, which may
-    come with other folders, or in other case.
-    """
-
-    def __init__(self, photos: Sequence[str]) -> None:
-        self.photos = set(photos)
-        self.by_end: dict[str, list[str]] = {}
-        for photo in sorted(self.photos):
-            self.by_end.setdefault(Path(photo).name.casefold(), []).append(photo)
-
-    def find(self, written: str) -> list[str]:
-        """The photos that may be meant, one if it is clear."""
-        if written in self.photos:
-            return [written]
-        end = PureWindowsPath(written).name
-        found = self.by_end.get(end.casefold(), [])
-        exact = [photo for photo in found if Path(photo).name == end]
-        below = [photo for photo in exact or found if PureWindowsPath(written).match(photo)]
-        return below if len(below) == 1 else exact or found
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
@@ -106,7 +84,7 @@ def parse_mark(line: str, where: str, known: PhotoNames) -> Mark:
             f"{where}: `x y z px py photo [name]` with finite numbers is expected, not {line!r}"
         ) from None
     photo, name = _photo_and_name(fields[5:], known)
-    found = known.find(photo)
+    found = known.match(photo, changed=False)
     if len(found) > 1:
         raise InputError(
             f"{where}: {photo!r} may be {' or '.join(found[:3])}: write it with its folder, apart by tabs"
@@ -142,7 +120,7 @@ def _photo_and_name(words: list[str], known: PhotoNames) -> tuple[str, str]:
     """
     for count in range(len(words), 0, -1):
         photo = " ".join(words[:count]).strip("'\"")
-        if known.find(photo):
+        if known.match(photo, changed=False):
             return photo, " ".join(words[count:]).strip("'\" ")
     return words[0], " ".join(words[1:])
 

@@ -176,7 +176,7 @@ def _read_obj(path: Path) -> Geometry:
     """
     vertices, faces = [], []
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
             for line in file:
                 if line.startswith("v "):
                     vertices.append([float(word) for word in line.split()[1:]])
@@ -206,7 +206,7 @@ def _read_text(path: Path) -> Geometry:
     semicolons or tabs; a header is skipped.
     """
     rows = []
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
         for number, line in enumerate(file, start=1):
             words = line.replace(",", " ").replace(";", " ").split()
             if not words or words[0].startswith(("#", "//")):

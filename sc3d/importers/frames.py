@@ -5,6 +5,7 @@ already.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,22 +13,34 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.georeferencing.georeference import Georeference, projected_crs, read_georeference
+from sc3d.georeferencing.alignment import Similarity, fit_similarity
+from sc3d.georeferencing.georeference import (
+    Georeference,
+    from_origin,
+    geodetic_to_enu,
+    projected_crs,
+    read_georeference,
+    triple,
+)
 from sc3d.importers.clouds import Geometry
-from sc3d.importers.project import Project
+from sc3d.importers.project import Project, rigid
 from sc3d.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
 
 LARGE = 1e5  # coordinates beyond this belong to a CRS and lose millimeters in float32
 FAR = 20.0  # times the extent of the cameras: a cloud farther away than this is in another frame
+# m from the Earth's center: what lies on it; and m along its axis, more than any height in a projected CRS
+ON_EARTH, ALONG_AXIS = (6.33e6, 6.40e6), 2e4
 
 
 def near_origin(project: Project, epsg: int | None) -> Project:
-    """A project with large coordinates moved near the origin, world = CRS - offset; any other unchanged.
-    `epsg`: the CRS of the coordinates.
+    """A project with large coordinates moved near the origin: world = CRS - offset, or ENU for geocentric
+    ones; any other unchanged. `epsg`: the CRS of the coordinates; of exports where they are geocentric.
     """
     centers = np.array([view.center for view in project.views])
+    if project.georeference is None and _is_geocentric(centers):
+        return _from_geocentric(project, epsg)
     if project.georeference is not None or np.abs(np.median(centers, axis=0)).max() < LARGE:
         return project
     if epsg is None:
@@ -44,6 +57,53 @@ def near_origin(project: Project, epsg: int | None) -> Project:
         georeference=Georeference(epsg, tuple(offset.tolist())),
         offset=offset,
     )
+
+
+def _is_geocentric(centers: np.ndarray) -> bool:
+    middle = np.median(centers, axis=0)
+    distance = float(np.linalg.norm(middle))
+    return ON_EARTH[0] < distance < ON_EARTH[1] and abs(float(middle[2])) > ALONG_AXIS
+
+
+def _from_geocentric(project: Project, epsg: int | None) -> Project:
+    import pyproj
+
+    logger.warning(
+        "the cameras of this %s project are in geocentric coordinates: read as those of WGS 84 (EPSG:4978)",
+        project.program,
+    )
+    geodetic = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979")
+    middle = np.median([view.center for view in project.views], axis=0)
+    origin, enu = enu_of_geocentric(middle, lambda points: np.stack(geodetic.transform(*points.T), axis=1))
+    return replace(
+        project,
+        views=[moved_view(view, middle, enu) for view in project.views],
+        points=enu.apply(project.points - middle),
+        georeference=from_origin(origin, epsg),
+        model=None,
+    )
+
+
+def enu_of_geocentric(
+    middle: np.ndarray, to_geodetic: Callable[[np.ndarray], np.ndarray]
+) -> tuple[tuple[float, float, float], Similarity]:
+    """Origin (latitude, longitude, height) of a local ENU frame near a geocentric position, and the similarity
+    from geocentric coordinates minus that position to it.
+
+    middle: (3,) m; to_geodetic: (N, 3) geocentric to (N, 3) latitude, longitude, height on WGS 84
+    """
+    # points that show how one frame lies in the other
+    frame = middle + 1000 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
+    geodetic = to_geodetic(frame)
+    origin = triple(round(float(value), digits) for value, digits in zip(geodetic[0], (6, 6, 0)))
+    return origin, fit_similarity(frame - middle, geodetic_to_enu(geodetic, origin))
+
+
+def moved_view(view: View, middle: np.ndarray, moved: Similarity) -> View:
+    """A view after a similarity of coordinates minus `middle`."""
+    center = moved.apply((view.center - middle)[None])[0]
+    pose = rigid(view.cam_from_world[:3, :3] @ moved.rotation.T, center, view.name)
+    return replace(view, cam_from_world=pose)
 
 
 def whole_offset(points: np.ndarray) -> np.ndarray:

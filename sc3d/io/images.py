@@ -104,26 +104,23 @@ def _find_scan(data: mmap.mmap) -> int:
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
 
-def find_photos(folder: Path) -> list[Path]:
-    """Photos of a folder and its subfolders, by name; InputError if there are none, two share a stem, or one
-    is a link that leads elsewhere.
-    """
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder: give the folder that holds the photos")
-    photos = sorted(
+def list_photos(folder: Path) -> list[Path]:
+    """Photos of a folder and its subfolders, by path."""
+    return sorted(
         file
         for file in folder.rglob("*")
         if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".") and file.is_file()
     )
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """As `list_photos`; InputError if there are none, or one is a link that leads elsewhere."""
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder: give the folder that holds the photos")
+    photos = list_photos(folder)
     if not photos:
         raise InputError(f"no photos in {folder}: JPEG, PNG or TIFF files are expected")
-    by_stem: dict[str, Path] = {}
     for photo in photos:
-        other = by_stem.setdefault(photo.stem, photo)
-        if other is not photo:
-            raise InputError(
-                f"{other} and {photo} share the name {photo.stem!r}, by which masks are found: rename one"
-            )
         require_within(photo, folder)
     return photos
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -61,7 +60,7 @@ def comparison(data: ReportData, view: View, labelled: LabelledSurface | None) -
     """Captions and data URIs of one photo: the photo, the given mask, the fused labels and the truth, as far
     as they exist.
     """
-    scene, stem = data.scene, Path(view.name).stem
+    scene = data.scene
     scale = min(1.0, _PHOTO_SIZE / max(view.width, view.height))
     size = max(1, round(view.width * scale)), max(1, round(view.height * scale))
     panels = []
@@ -76,13 +75,13 @@ def comparison(data: ReportData, view: View, labelled: LabelledSurface | None) -
         return panels
     palette = data.class_table.palette
     for caption, file in (
-        ("given mask", scene.masks / f"{stem}.png"),
+        ("given mask", data.mask_files.get(view.name)),
         ("fused labels", None),
-        ("truth", data.truth / f"{stem}.png"),
+        ("truth", data.truth_files.get(view.name)),
     ):
-        if file is None and labelled is not None:
+        if caption == "fused labels" and labelled is not None:
             labels, _ = labelled.see(view, size)
-        elif file is not None and file.exists():
+        elif file is not None:
             labels = cv2.resize(read_index_image(file), size, interpolation=cv2.INTER_NEAREST)
         else:
             continue

@@ -5,18 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from sc3d.errors import InputError
 from sc3d.io.atomic import discard, remove_leftovers
 from sc3d.io.images import find_photos, image_size, read_image, write_image
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.provenance import digest
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.photo_names import PhotoNames, photo_name
 from sc3d.scene.scene import Scene, check_mask_aspect
 from sc3d.segmentation.instances import Instance, write_instances
 from sc3d.settings.labels import Segment
@@ -71,7 +72,7 @@ class SegmentSummary:
 
 
 class Folders(NamedTuple):
-    """Where the results of each photo go, as `<photo stem>.png`, `.png` and `.json`."""
+    """Where the results of each photo go, named like it (see `sc3d.scene.photo_names`)."""
 
     masks: Path
     confidence: Path
@@ -90,11 +91,12 @@ def segment_scene(
     unfinished = marker.exists()
     if unfinished and read_json(marker) == state:
         for folder in folders:
-            remove_leftovers(folder)
+            for place in [folder, *folder.rglob("*")]:
+                remove_leftovers(place)
     else:
         _set_aside(folders, "unfinished" if unfinished else "before")
     write_json(marker, state)
-    summary = segment_photos(find_photos(scene.images), folders, segmenter, class_table)
+    summary = segment_photos(find_photos(scene.images), folders, segmenter, class_table, images=scene.images)
     marker.unlink()
     return summary
 
@@ -106,7 +108,7 @@ def _state(scene: Scene, settings: Segment, class_table: ClassTable) -> object:
     decisive = replace(settings, device="auto", download=False, model_dir=None)
     strokes = digest(settings.strokes or scene.strokes) if settings.backend == "strokes" else ""
     photos = [
-        (str(photo.relative_to(scene.images)), photo.stat().st_size, photo.stat().st_mtime_ns)
+        (photo_name(photo, scene.images), photo.stat().st_size, photo.stat().st_mtime_ns)
         for photo in find_photos(scene.images)
     ]
     seen = hashlib.blake2b(repr(photos).encode(), digest_size=16).hexdigest()
@@ -131,62 +133,61 @@ def segment_photos(
     segmenter: Segmenter,
     class_table: ClassTable,
     overwrite: bool = False,
+    images: Path | None = None,
 ) -> SegmentSummary:
     """Write a mask and a confidence map for every photo, and its instances if the segmenter tells objects
     apart.
 
+    images: folder below which the photos are named; None = the one that they have in common
     Photos that have a mask are skipped unless `overwrite`, so an interrupted run goes on where it stopped,
     whatever stopped it.
-    Raises InputError before the work starts if a photo cannot be opened, two share a stem, or an old mask
-    does not fit its photo.
+    Raises InputError before the work starts if a photo cannot be opened, or an old mask does not fit its photo.
     """
     from tqdm import tqdm
 
-    todo = _check_photos(photos, folders.masks, overwrite)
+    images = images or Path(os.path.commonpath([photo.parent for photo in photos]))
+    names = PhotoNames(photo_name(photo, images) for photo in photos)
+    todo = _check_photos(images, names, folders.masks, overwrite)
     pending, num_pixels, num_instances = set(todo), np.zeros(256, np.int64), 0
     for photo in tqdm(todo, desc="segment", unit="photo", disable=None):
-        image = read_image(photo)
+        image = read_image(images / photo)
         result = Segmentation(*segmenter.segment(image))
         for array in (result.labels, result.confidence):
             if array.shape != image.shape[:2] or array.dtype != np.uint8:
                 raise ValueError(
                     f"the segmenter returned {array.shape} {array.dtype} for a photo of {image.shape[:2]}"
                 )
-        _write(photo, folders, result, class_table)
+        _write(photo, names, folders, result, class_table)
         num_pixels += np.bincount(result.labels.ravel(), minlength=256)
         num_instances += len(result.instances or ())
     return SegmentSummary(
-        [photo.name for photo in todo],
-        [photo.name for photo in photos if photo not in pending],
+        todo,
+        [photo for photo in names.names if photo not in pending],
         num_pixels,
         num_instances,
     )
 
 
-def _write(photo: Path, folders: Folders, result: Segmentation, class_table: ClassTable) -> None:
+def _write(
+    photo: str, names: PhotoNames, folders: Folders, result: Segmentation, class_table: ClassTable
+) -> None:
     """The mask comes last: that it exists says that the photo is finished."""
-    objects = folders.instances / f"{photo.stem}.json"
+    objects = names.path(folders.instances, photo, ".json")
     if result.instances is not None:
-        write_instances(objects, photo.name, result.labels.shape, result.instances, class_table)
+        write_instances(objects, photo, result.labels.shape, result.instances, class_table)
     else:
         objects.unlink(missing_ok=True)  # of masks that are replaced
-    write_image(folders.confidence / f"{photo.stem}.png", result.confidence)
-    write_image(folders.masks / f"{photo.stem}.png", result.labels)
+    write_image(names.path(folders.confidence, photo), result.confidence)
+    write_image(names.path(folders.masks, photo), result.labels)
 
 
-def _check_photos(photos: list[Path], out_masks: Path, overwrite: bool) -> list[Path]:
+def _check_photos(images: Path, names: PhotoNames, out_masks: Path, overwrite: bool) -> list[str]:
     """Photos that have no mask yet, after a look at the header of all of them."""
-    by_stem: dict[str, Path] = {}
     todo = []
-    for photo in photos:
-        size = image_size(photo)
-        other = by_stem.setdefault(photo.stem, photo)
-        if other is not photo:
-            raise InputError(
-                f"{other} and {photo} share the name {photo.stem!r}, by which masks are found: rename one"
-            )
-        mask = out_masks / f"{photo.stem}.png"
-        if overwrite or not mask.exists():
+    for photo in names.names:
+        size = image_size(images / photo)
+        mask = names.find(out_masks, photo)
+        if overwrite or mask is None:
             todo.append(photo)
         else:
             check_mask_aspect(mask, image_size(mask), size)

@@ -20,8 +20,12 @@ class Segment:
     prompts with Grounding DINO and SAM 2 or with SAM 3.
     """
     masks: Path | None = None
-    """Masks made elsewhere: a folder of PNGs <photo stem>.png, a folder of LabelMe JSONs, a COCO JSON, or a
+    """Masks made elsewhere: a folder of PNGs named like the photos, a folder of LabelMe JSONs, a COCO JSON, or a
     CVAT XML (files).
+    """
+    name_pattern: str | None = None
+    """How --masks are named where that is not clear: {photo} stands for the name of the photo and * for anything,
+    such as '{photo}_gtFine_labelIds.png' or '*-{photo}'; files that do not fit are left out (files).
     """
     format: Literal["auto", "index", "color", "labelme", "coco", "cvat"] = "auto"
     """Format of --masks (files): index = PNG with one id per pixel, color = PNG in the colors of the class
@@ -32,7 +36,7 @@ class Segment:
     {"wall": "building", "7": "road"} (files).
     """
     confidence: Path | None = None
-    """Folder of confidence maps <photo stem>.png (files); optional."""
+    """Folder of confidence maps, PNGs named like the photos (files); optional."""
     strokes: Path | None = None
     """Folder of strokes and polygons per class, LabelMe JSON or PNG in the colors of the class table;
     SCENE/strokes otherwise (strokes).

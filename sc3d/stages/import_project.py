@@ -11,11 +11,12 @@ from sc3d.importers.clouds import CLOUDS, MESHES, is_mesh, read_geometry, to_ope
 from sc3d.importers.frames import frame_of_scene, near_origin, place_geometries
 from sc3d.importers.model import write_project
 from sc3d.importers.photos import locate_photos
-from sc3d.importers.project import project_files, read_project
+from sc3d.importers.project import Project, project_files, read_project, some_names, warn_of_left_out
 from sc3d.io.atomic import require_writable
 from sc3d.io.clouds import write_geometry
-from sc3d.io.images import require_place
+from sc3d.io.images import find_photos, require_place
 from sc3d.runner import execute
+from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import, ImportCommand
 
@@ -53,6 +54,15 @@ def outputs(scene: Scene, settings: Import) -> list[Path]:
     return ([] if settings.project in settings.cloud else [scene.sparse]) + list(dict.fromkeys(geometry))
 
 
+def _without_camera(project: Project, photos: Path | None) -> dict[str, object]:
+    """How many photos of the folder have no camera, and the first of them."""
+    if photos is None:
+        return {}
+    used = {view.name for view in project.views}
+    names = [name for photo in find_photos(photos) if (name := photo_name(photo, photos)) not in used]
+    return {"photos_without_camera": f"{len(names)} ({some_names(names)})"} if names else {}
+
+
 def run(scene: Scene, settings: Import) -> dict[str, object]:
     geometries = {path: read_geometry(path) for path in settings.cloud}
     kinds = [geometry.triangles is None for geometry in geometries.values()]
@@ -67,12 +77,14 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
         project, photos = locate_photos(
             near_origin(read_project(settings.project, settings), settings.epsg), settings.images
         )
+        warn_of_left_out(project, settings.project)
         views, georeference = project.views, project.georeference
         if photos is not None:
             require_place(photos, scene.images)
     placed = place_geometries(geometries, georeference, views, settings.epsg)
     if project is not None:
         figures = write_project(scene, project, photos, [geometry for geometry, _ in placed.values()])
+        figures |= _without_camera(project, photos)
         georeference_path(scene).unlink(missing_ok=True)
     if georeference is not None:
         write_georeference(scene, georeference)

@@ -24,5 +24,6 @@ def outputs(scene: Scene, settings: Label) -> list[Path]:
 
 def run(scene: Scene, settings: Label) -> dict[str, object]:
     """Fuse the masks, in memory or, where the cloud does not fit, by tiles."""
+    scene.warn_of_unplaced(scene.masks, *([best_confidence(scene)] if settings.use_confidence else []))
     label = label_scene if label_fits(scene, settings) else label_scene_by_tiles
     return label(scene, settings).figures()

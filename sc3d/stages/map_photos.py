@@ -7,6 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sc3d.io.images import find_photos
+from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Mapping
 from sc3d.sfm import map_photos
@@ -21,5 +22,5 @@ def outputs(scene: Scene, settings: Mapping) -> list[Path]:
 
 
 def run(scene: Scene, settings: Mapping) -> dict[str, object]:
-    names = [str(photo.relative_to(scene.images)) for photo in find_photos(scene.images)]
+    names = [photo_name(photo, scene.images) for photo in find_photos(scene.images)]
     return map_photos(scene.images, names, scene.mapped, settings)

@@ -27,6 +27,7 @@ from sc3d.io.atomic import require_writable
 from sc3d.io.colmap import load_model, registered_images, write_model
 from sc3d.io.images import find_photos, image_size, link_photos
 from sc3d.runner import execute
+from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Mapping, Reconstruct, ReconstructCommand
 
@@ -47,7 +48,7 @@ def reconstruct(scene: Scene, settings: Reconstruct, overwrite: bool) -> None:
 def prepare(photos: Path, scene: Scene, settings: Reconstruct) -> None:
     """Check all photos and control points, then make SCENE/images a link to the folder of photos."""
     files = find_photos(photos)
-    sizes = {str(file.relative_to(photos)): image_size(file) for file in files}
+    sizes = {photo_name(file, photos): image_size(file) for file in files}
     if len(files) < 2:
         raise InputError(f"{photos} holds one photo: at least two that overlap are needed")
     _check_place(photos, sizes, settings)
@@ -84,7 +85,7 @@ def outputs(scene: Scene, settings: Reconstruct) -> list[Path]:
 
 
 def run(scene: Scene, settings: Reconstruct) -> dict[str, object]:
-    names = [str(photo.relative_to(scene.images)) for photo in find_photos(scene.images)]
+    names = [photo_name(photo, scene.images) for photo in find_photos(scene.images)]
     control_points = _control_points(settings, names)
     flight = read_flight(scene.images, names, quiet=True) if settings.gps else None
     model = load_model(scene.mapped)

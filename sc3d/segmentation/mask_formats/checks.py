@@ -8,14 +8,14 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import IMAGE_SUFFIXES
 from sc3d.io.limits import MAX_MASK_PIXELS
+from sc3d.scene.photo_names import PhotoNames, photo_name, stem
 from sc3d.scene.scene import check_mask_aspect
 from sc3d.segmentation.mask_formats.mapping import ClassMapping
 
@@ -43,14 +43,25 @@ class Checks:
     example and their number.
     """
 
-    def __init__(self, photo_sizes: dict[str, tuple[int, int]], classes: ClassMapping) -> None:
-        """photo_sizes: (width, height) px by photo name, no two of one stem."""
+    def __init__(
+        self,
+        photo_sizes: dict[str, tuple[int, int]],
+        classes: ClassMapping,
+        names: PhotoNames | None = None,
+        folder: Path = Path(),
+    ) -> None:
+        """photo_sizes: (width, height) px by photo name; names: those photos, None = with the rules that programs
+        follow; folder: the files' own
+        """
         self.classes = classes
+        self.names = PhotoNames(photo_sizes) if names is None else names
+        self.folder = folder
         self._photo_sizes = photo_sizes
-        self._names = {Path(name).stem: name for name in photo_sizes}
         self._mismatches: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
+        self._advice: dict[str, str] = {}
         self._skipped: Counter[str] = Counter()
+        self._left_out: list[Path] = []
         self._unknown: dict[str, str] = {}
 
     def add(self, kind: str, example: str) -> None:
@@ -62,25 +73,54 @@ class Checks:
         """Count annotations that have no area."""
         self._skipped.update(kinds)
 
+    def fits(self, file: Path) -> bool:
+        """Whether a file is named as --name-pattern says, if there is one; others are counted."""
+        pattern = self.names.pattern
+        if pattern is None or pattern.photos(photo_name(file, self.folder)):
+            return True
+        self._left_out.append(file)
+        return False
+
     def photo(self, candidates: tuple[str, ...], origin: str) -> str | None:
-        """Name of the photo that has the stem of one of the file names."""
-        found = {
-            name
-            for name in (self._names.get(stem(candidate)) for candidate in candidates)
-            if name is not None
-        }
-        if not found:
+        """Name of the photo that the file names mean, or the file itself, where it is among them."""
+        matches = self._matches(candidates, origin, False) or self._matches(candidates, origin, True)
+        if not matches:
             example = next(iter(self._photo_sizes), "none")
             self.add(
                 "photo",
-                f"{_where(candidates[0], origin)} belongs to no photo: {len(self._names)} photos are known, such as {example}",
+                f"{_where(candidates[0], origin)} belongs to no photo: {len(self._photo_sizes)} photos are known, such as {example}",
             )
-        elif len(found) > 1:
+            self._advice.setdefault("photo", _printable(self.names.advice(candidates[0][-MAX_TEXT:])))
+            return None
+        common = set.intersection(*map(set, matches))
+        if len(common) == 1:
+            return common.pop()
+        if common:
+            self.add(
+                "several",
+                f"{_where(candidates[0], origin)} may belong to {self.names.choices(sorted(common), '')}",
+            )
+        else:
+            told = " or ".join(sorted({name for found in matches for name in found}))
             self.add(
                 "ambiguous",
-                f"{origin} is named after a photo, but says that it belongs to another: {' or '.join(sorted(found))}",
+                f"{origin} is named after a photo, but says that it belongs to another: {told}",
             )
-        return found.pop() if len(found) == 1 else None
+        return None
+
+    def _matches(self, candidates: tuple[str, ...], origin: str, changed: bool) -> list[tuple[str, ...]]:
+        """What `_match` finds for the names that mean any photo."""
+        found = [self._match(candidate, origin, changed) for candidate in candidates]
+        return [photos for photos in found if photos]
+
+    def _match(self, candidate: str, origin: str, changed: bool) -> tuple[str, ...]:
+        """Photos that a name may mean; the folder of the file that it stands in may decide."""
+        place = photo_name(Path(origin), self.folder)
+        if candidate == origin:
+            return self.names.match_file(place, self.folder, changed)
+        found = self.names.match(candidate, changed)
+        folder = place.rpartition("/")[0]
+        return self.names.match(f"{folder}/{candidate}", changed) if len(found) > 1 and folder else found
 
     def size(self, name: str, stated: tuple[Any, Any] | None, origin: str) -> tuple[int, int] | None:
         """(width, height) px of the mask of a photo: as stated if that fits the photo, the photo's own if
@@ -131,10 +171,20 @@ class Checks:
             )
         if self._mismatches:
             texts = [
-                text + (f" ({self._counts[kind]} times)" if self._counts[kind] > 1 else "")
+                text
+                + (f" ({self._counts[kind]} times)" if self._counts[kind] > 1 else "")
+                + self._advice.get(kind, "")
                 for kind, text in self._mismatches.items()
             ]
             raise InputError(f"cannot import {source}: " + "; ".join(texts))
+        if self._left_out and self.names.pattern is not None:
+            logger.warning(
+                "%s: %d files do not fit --name-pattern %r and are left out, such as %s",
+                source,
+                len(self._left_out),
+                self.names.pattern.text,
+                self._left_out[0].name,
+            )
         if self._skipped:
             skipped = ", ".join(f"{kind} ({count})" for kind, count in sorted(self._skipped.items()))
             logger.warning("%s: annotations without an area were skipped: %s", source, skipped)
@@ -150,11 +200,3 @@ def _printable(text: str) -> str:
 def _where(name: str, origin: str) -> str:
     """The photo in a file of many, or the file of one."""
     return origin if stem(origin) == stem(name) else f"{name[-80:]} in {origin}"
-
-
-def stem(name: str) -> str:
-    """File name without folders (of any system) and without the suffix of an image; other dots belong to the
-    name.
-    """
-    path = PureWindowsPath(name)
-    return path.stem if path.suffix.lower() in IMAGE_SUFFIXES | {".json", ".webp", ".bmp"} else path.name

@@ -13,6 +13,7 @@ from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path, discard
 from sc3d.io.images import image_size, open_image, read_index_image, write_image
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.photo_names import PhotoNames
 from sc3d.scene.scene import Scene, match_masks, photo_sizes
 from sc3d.segmentation.mask_formats.checks import CheckedMask
 from sc3d.segmentation.mask_formats.source import MaskFiles, read_masks
@@ -24,17 +25,28 @@ logger = logging.getLogger(__name__)
 def import_scene_masks(scene: Scene, settings: Segment, class_table: ClassTable) -> dict[str, object]:
     """Masks of `--masks` into the scene, or a look at those that are there; returns figures for the summary."""
     if settings.masks is None:
-        if settings.mapping is not None or settings.format not in ("auto", "index"):
-            raise InputError("--mapping and --format say how to read --masks, which is missing")
+        told = settings.mapping, settings.name_pattern
+        if told != (None, None) or settings.format not in ("auto", "index"):
+            raise InputError(
+                "--mapping, --format and --name-pattern say how to read --masks, which is missing"
+            )
         if not scene.masks.is_dir():
             raise InputError(
                 "--masks FOLDER is needed (or --backend strokes, grounded-sam or sam3, which make masks)"
             )
-        return {"masks": len(scene.mask_files(scene.masks, class_table)), "source": "already in the scene"}
-    source, sizes = MaskFiles(settings.masks, settings.format, settings.mapping), photo_sizes(scene.images)
+        found = scene.mask_files(scene.masks, class_table)
+        scene.warn_of_unplaced(scene.masks, scene.confidence)
+        return {"masks": len(found), "source": "already in the scene"}
+    source, sizes = mask_source(settings, settings.masks), photo_sizes(scene.images)
     names = import_masks(source, scene.masks, sizes, class_table, settings.confidence, scene.confidence)
     warn_of_turned([scene.photo(name) for name in names])
+    scene.warn_of_unplaced(scene.masks, scene.confidence)
     return {"masks": len(names), "confidence": settings.confidence is not None}
+
+
+def mask_source(settings: Segment, path: Path) -> MaskFiles:
+    """The masks in `path`, to be read as the settings say."""
+    return MaskFiles(path, settings.format, settings.mapping, settings.name_pattern)
 
 
 def import_masks(
@@ -51,7 +63,7 @@ def import_masks(
     source: masks in any format; a bare path is looked at
     scene_masks, scene_confidence: folders to write; each is replaced as a whole
     photo_sizes: (width, height) px by photo name
-    confidence: folder of `<photo stem>.png`
+    confidence: folder of PNGs named like the photos
     returns: names of the photos that have a mask, in order
 
     Raises InputError before anything is written if a file does not fit. With `scene_confidence` but no
@@ -62,7 +74,11 @@ def import_masks(
         raise InputError("confidence maps are given, but not where in the scene they belong")
     source = source if isinstance(source, MaskFiles) else MaskFiles(source)
     in_place = source.path.resolve() == scene_masks.resolve()
-    if in_place and (source.mapping is not None or source.format not in ("auto", "index")):
+    if in_place and (
+        source.mapping is not None
+        or source.name_pattern is not None
+        or source.format not in ("auto", "index")
+    ):
         raise InputError(
             f"{source.path} is the scene's own folder, which holds ids of the class table: masks to convert belong elsewhere"
         )
@@ -74,9 +90,9 @@ def import_masks(
         _check_target(confidence, scene_confidence)
     with ExitStack() as folders:  # all is written before anything replaces what is there
         if maps and confidence and scene_confidence and confidence.resolve() != scene_confidence.resolve():
-            _copy(maps, folders.enter_context(atomic_path(scene_confidence)))
+            _copy(maps, folders.enter_context(atomic_path(scene_confidence)), PhotoNames(photo_sizes))
         if not in_place:  # in place, they are already there and checked
-            _draw(masks, folders.enter_context(atomic_path(scene_masks)))
+            _draw(masks, folders.enter_context(atomic_path(scene_masks)), PhotoNames(photo_sizes))
             if not maps and scene_confidence is not None:
                 discard(scene_confidence)
     return sorted(masks)
@@ -140,15 +156,15 @@ def _check_target(source: Path | None, target: Path) -> None:
         raise InputError(f"{source} lies inside {target}, which would be replaced: move it elsewhere")
 
 
-def _copy(files: dict[str, Path], folder: Path) -> None:
+def _copy(files: dict[str, Path], folder: Path, names: PhotoNames) -> None:
     folder.mkdir()
-    for file in files.values():
-        write_image(folder / file.name, read_index_image(file))
+    for name, file in files.items():
+        write_image(names.path(folder, name), read_index_image(file))
 
 
-def _draw(masks: dict[str, CheckedMask], folder: Path) -> None:
+def _draw(masks: dict[str, CheckedMask], folder: Path, names: PhotoNames) -> None:
     from tqdm import tqdm
 
     folder.mkdir()
     for name, mask in tqdm(masks.items(), desc="import", unit="photo", disable=None):
-        write_image(folder / f"{Path(name).stem}.png", mask.read())
+        write_image(names.path(folder, name), mask.read())

@@ -1,4 +1,4 @@
-"""PNGs with one id or one color per pixel, `<photo stem>.png`; values are taken exactly, nothing is guessed.
+"""PNGs with one id or one color per pixel, named like the photos; values are taken exactly, nothing is guessed.
 
 Ids are those of the class table, or those of a mapping: then also 16-bit, such as ADE20K's and Cityscapes'.
 Colors are those of the class table or of a mapping; a color between two classes, as JPEG and smooth scaling
@@ -24,7 +24,9 @@ COLORED = {"RGB", "RGBA"}
 
 def check_png(file: Path, colored: bool, checks: Checks) -> Iterator[tuple[str, CheckedMask]]:
     """The photo and mask of a PNG, after a look at all its pixels; mismatches go to `checks`."""
-    name = checks.photo((file.name,), str(file))
+    if not checks.fits(file):
+        return
+    name = checks.photo((str(file),), str(file))
     size = None if name is None else checks.size(name, image_size(file), str(file))
     if name is None or size is None:
         return

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.photo_names import NamePattern, PhotoNames, files_of_photos
 from sc3d.segmentation.mask_formats.annotations import to_mask
 from sc3d.segmentation.mask_formats.checks import CheckedMask, Checks
 from sc3d.segmentation.mask_formats.coco import read_coco
@@ -32,11 +33,13 @@ class MaskFiles:
     path: a folder, or a JSON or XML file
     format: auto, index, color, labelme, coco or cvat
     mapping: JSON file of the ids, names or colors in them and the classes that they stand for
+    name_pattern: how they are named, see `sc3d.scene.photo_names.NamePattern`
     """
 
     path: Path
     format: str = "auto"
     mapping: Path | None = None
+    name_pattern: str | None = None
 
 
 def read_masks(
@@ -47,22 +50,29 @@ def read_masks(
     photo_sizes: (width, height) px by photo name
     Raises InputError, in one line, for everything that does not fit.
     """
-    kind = detect(source.path) if source.format == "auto" else source.format
-    checks = Checks(photo_sizes, read_mapping(source.mapping, class_table))
+    pattern = None if source.name_pattern is None else NamePattern(source.name_pattern)
+    names = PhotoNames(photo_sizes, pattern)
+    kind = detect(source.path, names) if source.format == "auto" else source.format
+    folder = source.path if source.path.is_dir() else source.path.parent
+    checks = Checks(photo_sizes, read_mapping(source.mapping, class_table), names, folder)
     masks: dict[str, CheckedMask] = {}
-    for file in _files(source.path, kind):
+    for file in _files(source.path, kind, names):
         try:
             for name, mask in _read(file, kind, checks):
                 if name in masks:
                     checks.add(
-                        "double", f"{name} has a mask in {masks[name].origin} and another in {mask.origin}"
+                        "double",
+                        f"{name} has a mask in {masks[name].origin} and another in {mask.origin}; --name-pattern says which are meant",
                     )
                 masks.setdefault(name, mask)
         except InputError as error:
             checks.add("file", str(error))
     checks.finish(source.path)
     if not masks:
-        raise InputError(f"no masks in {source.path}: no annotation with an area is there")
+        raise InputError(
+            f"no masks in {source.path}: no annotation with an area is there"
+            + ("" if pattern is None else f", or no name fits --name-pattern {pattern.text!r}")
+        )
     logger.info("%s: %s masks for %d of %d photos", source.path, kind, len(masks), len(photo_sizes))
     return dict(sorted(masks.items()))
 
@@ -77,12 +87,12 @@ def _read(file: Path, kind: str, checks: Checks) -> Iterator[tuple[str, CheckedM
             yield found
 
 
-def detect(path: Path) -> str:
-    """Format of a file or folder, by what is in it; InputError if nothing is known."""
-    annotated = next(filter(None, map(_kind, _find(path, (".json", ".xml")))), None)
+def detect(path: Path, names: PhotoNames = PhotoNames(())) -> str:
+    """Format of a file or folder of the photos `names`, by what is in it; InputError if nothing is known."""
+    annotated = next(filter(None, map(_kind, _find(path, (".json", ".xml"), names))), None)
     if annotated:
         return annotated
-    pngs = _find(path, (".png",)) if path.is_dir() else []
+    pngs = _find(path, (".png",), names) if path.is_dir() else []
     if pngs:
         return "color" if all(is_colored(file) for file in pngs) else "index"
     if path.suffix.lower() in (".zip", ".gz", ".7z"):
@@ -102,8 +112,8 @@ def _kind(file: Path) -> str | None:
     return "labelme" if b'"shapes"' in content else None
 
 
-def _files(path: Path, kind: str) -> list[Path]:
-    files = _find(path, (SUFFIXES[kind],))
+def _files(path: Path, kind: str, names: PhotoNames) -> list[Path]:
+    files = _find(path, (SUFFIXES[kind],), names)
     if not files or (kind in ("index", "color") and not path.is_dir()):
         what = (
             f"a folder of {SUFFIXES[kind]} files named like the photos is"
@@ -114,15 +124,16 @@ def _files(path: Path, kind: str) -> list[Path]:
     return files
 
 
-def _find(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """The file itself, or the files of a folder by name; annotations also in folders below, PNGs not, because
-    those may be photos.
+def _find(path: Path, suffixes: tuple[str, ...], names: PhotoNames) -> list[Path]:
+    """The file itself, or the files of a folder by name; annotations also in all folders below, PNGs only in those
+    that are named like folders of the photos, because others may hold photos.
     """
     if not path.is_dir():
         return [path] if path.is_file() and path.suffix.lower() in suffixes else []
-    found = path.iterdir() if suffixes == (".png",) else path.rglob("*")
+    if suffixes == (".png",):
+        return files_of_photos(path, names, suffixes)
     return sorted(
         file
-        for file in found
+        for file in path.rglob("*")
         if file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file()
     )

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -21,6 +21,7 @@ from sc3d.errors import InputError
 from sc3d.io.images import find_photos, image_size, open_image
 from sc3d.io.json_files import read_json
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.photo_names import PhotoNames, files_of_photos, photo_name
 from sc3d.scene.scene import check_mask_aspect
 
 BACKGROUND = "_background_"  # LabelMe's own name for it
@@ -87,24 +88,16 @@ def read_strokes(folder: Path, photos_folder: Path, class_table: ClassTable) -> 
     Raises InputError for a folder without strokes, files that belong to no photo, cannot be read or name
     unknown classes or colors.
     """
-    files = (
-        sorted(
-            file
-            for file in folder.iterdir()
-            if file.suffix.lower() in (".json", ".png") and file.name[0] != "."
-        )
-        if folder.is_dir()
-        else []
-    )
+    names = PhotoNames(photo_name(photo, photos_folder) for photo in find_photos(photos_folder))
+    files = files_of_photos(folder, names, (".json", ".png"))
     if not files:
         raise InputError(
             f"no strokes in {folder}: draw some with `sc3d annotate SCENE`, or put LabelMe JSON or PNG files there"
         )
-    photos = {photo.stem: photo for photo in find_photos(photos_folder)}
     found: dict[Path, PhotoStrokes] = {}
     for file in files:
         content = read_json(file) if file.suffix.lower() == ".json" else None
-        photo = _photo_of(file, content, photos)
+        photo = photos_folder / _photo_of(file, folder, content, names)
         size = image_size(photo)
         shapes = () if content is None else parse_shapes(content, file, size, class_table)
         picture = None if content is not None else _read_picture(file, size, class_table)
@@ -171,17 +164,23 @@ def _is_number(value: object) -> bool:
     )
 
 
-def _photo_of(file: Path, content: object, photos: dict[str, Path]) -> Path:
-    """The photo whose stem is that of `imagePath`, or else that of the file."""
-    path = content.get("imagePath") if isinstance(content, dict) else None
-    # PureWindowsPath splits at / and \
-    stems = [*([PureWindowsPath(path).stem] if isinstance(path, str) else []), file.stem]
-    photo = next((photos[stem] for stem in stems if stem in photos), None)
-    if photo is None:
-        raise InputError(
-            f"{file} belongs to no photo: {len(photos)} photos are known, such as {next(iter(photos.values())).name}"
-        )
-    return photo
+def _photo_of(file: Path, folder: Path, content: object, names: PhotoNames) -> str:
+    """The photo that `imagePath` names, with the folder of the file where that is not clear, or else the one that
+    the file is named after.
+    """
+    path, place = content.get("imagePath") if isinstance(content, dict) else None, photo_name(file, folder)
+    for changed in (False, True):
+        found = names.match(path, changed) if isinstance(path, str) else ()
+        if len(found) != 1:
+            own = names.match_file(place, folder, changed)
+            found = tuple(name for name in own if name in found) or found or own
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise InputError(f"{file} may belong to {names.choices(found, file.suffix)}: rename it")
+    raise InputError(
+        f"{file} belongs to no photo: {len(names)} photos are known, such as {names.names[0]}{names.advice(place)}"
+    )
 
 
 def _read_picture(file: Path, size: tuple[int, int], class_table: ClassTable) -> np.ndarray:

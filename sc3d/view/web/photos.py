@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -37,8 +36,8 @@ def photo_pictures(scene: Scene, view: View, table: ClassTable | None, max_size:
         photo = cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA)
     except InputError:
         missing.append("photo")
-    file = scene.masks / f"{Path(view.name).stem}.png"
-    if table is not None and file.exists():
+    file = scene.mask_file(scene.masks, view.name)
+    if table is not None and file is not None:
         labels = cv2.resize(read_index_image(file), size, interpolation=cv2.INTER_NEAREST)
         mask = overlay(photo, labels, table)
     else:
