@@ -53,6 +53,11 @@ class Scene:
         return self.path / "sparse" / "0"
 
     @property
+    def mapped(self) -> Path:
+        """The model before it is brought to its place."""
+        return self.path / "mapped"
+
+    @property
     def gaussians(self) -> Path:
         return self.path / "gaussians.ply"
 
