@@ -38,8 +38,8 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
     if not (in_blocks and settings.cluster):  # whose workers may have the GPU that this machine lacks
         pick_device(settings.device)  # complain before the work begins
     require_views(scene)
-    _tell_of_left_out(scene)
     check_photos(scene, [view.name for view in scene.model.views])
+    _tell_of_left_out(scene)
     if len(scene.model.points) < 10:
         raise InputError(
             f"{scene.sparse} has {len(scene.model.points)} sparse points, too few to start from: run `sc3d reconstruct` with more overlap"
