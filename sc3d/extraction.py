@@ -56,12 +56,14 @@ class DepthViews:
     views: pinhole; image: index to (H, W, 3) uint8 RGB of the view's size
     neighbors: per view, rows of views that see the same surface; depth_range: nearest and farthest depth,
         world units
+    opaque: index to (H, W) bool pixels whose depth counts, None = all
     """
 
     views: list[View]
     image: Callable[[int], np.ndarray]
     neighbors: list[np.ndarray]
     depth_range: tuple[float, float]
+    opaque: Callable[[int], np.ndarray | None] = lambda row: None
 
 
 def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -> Surfaces:
@@ -250,6 +252,9 @@ class _DepthMaps:
         for row, view in enumerate(tqdm(self.data.views, desc="depth", unit="view", disable=None)):
             depth, (nearest, farthest) = facing_depth(gaussians, view, MAX_ANGLE), self.data.depth_range
             depth[(depth <= nearest) | (depth >= farthest)] = 0
+            opaque = self.data.opaque(row)
+            if opaque is not None:
+                depth[~opaque] = 0
             np.save(self.folder / f"{row}.npy", depth)
             if (depth > 0).any():
                 footprints.append(float(np.median(depth[depth > 0])) / view.focal)

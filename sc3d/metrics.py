@@ -15,7 +15,6 @@ from tqdm import tqdm
 
 from sc3d.geometry.cameras import View
 from sc3d.geometry.raycast import FirstSurface
-from sc3d.io.images import read_index_image
 from sc3d.io.json_files import write_json
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
@@ -252,13 +251,13 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
     views = [view for view in scene.model.views if view.name in truth_files]
     per_photo, reliabilities = {}, []
     for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
-        truth = read_index_image(truth_files[view.name])
+        truth = scene.read_mask(truth_files[view.name], view.name)
         rows, first = surface.rows(view, truth.shape[::-1], truth > 0)
         pixels = EvaluationPixels.from_photo(truth, rows, depth_edge_band(first.range, settings.band))
         near, elsewhere = pixels.confusions(pixels.look_up(labels.label), table.num_ids)
         found = {"labels": near + elsewhere, "labels_near_edges": near, "labels_elsewhere": elsewhere}
         if view.name in mask_files:
-            mask = read_index_image(mask_files[view.name])
+            mask = scene.read_mask(mask_files[view.name], view.name)
             mask = cv2.resize(mask, truth.shape[::-1], interpolation=cv2.INTER_NEAREST)
             found["masks"] = Confusion.from_labels(truth, mask, table.num_ids)
         per_photo[view.name] = found

@@ -23,6 +23,7 @@ from sc3d.georeferencing.georeference import Georeference, from_origin
 from sc3d.georeferencing.gps import Flight, place, read_flight, residuals
 from sc3d.io.atomic import require_room, telling_of_full_disk, temporary_name
 from sc3d.io.colmap import registered_images, write_model
+from sc3d.io.readable_photos import readable_photos
 from sc3d.settings.reconstruction import Reconstruct
 
 logger = logging.getLogger(__name__)
@@ -70,10 +71,11 @@ def reconstruct(
         work = Path(folder)
         database = work / "database.db"
         with telling_of_full_disk(database):
-            _extract(database, images, names, settings)
+            readable, masks = readable_photos(images, names, work)
+            _extract(database, images, names, settings, readable, masks)
             _write_priors(database, flight)
             _match(database, len(names), settings)
-            model = _map(database, images, work, settings, len(names), flight is not None)
+            model = _map(database, readable, work, settings, len(names), flight is not None)
         free = settings.focal == "refine" or (settings.focal == "auto" and tells_focal(model))
         focal = {} if free else anchor_focal(model, images, flight)
         georeference = _georeference(model, flight, control_points, settings)
@@ -83,7 +85,10 @@ def reconstruct(
     )
 
 
-def _extract(database: Path, images: Path, names: list[str], settings: Reconstruct) -> None:
+def _extract(
+    database: Path, images: Path, names: list[str], settings: Reconstruct, readable: Path, masks: Path | None
+) -> None:
+    """Cameras from the photos in `images`, features from those in `readable` where `masks` are not 0."""
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = settings.max_size
     options.sift.max_num_features = settings.max_features
@@ -92,9 +97,10 @@ def _extract(database: Path, images: Path, names: list[str], settings: Reconstru
     pycolmap.Database.open(database).close()
     # else ids follow the threads that are done first
     pycolmap.import_images(database, images, pycolmap.CameraMode.AUTO, names, reader)
+    reader.mask_path = masks or ""
     with _progress(database, "keypoints", len(names), "features", "photo"):
         pycolmap.extract_features(
-            database, images, names, pycolmap.CameraMode.AUTO, reader, options, pycolmap.Device.cpu
+            database, readable, names, pycolmap.CameraMode.AUTO, reader, options, pycolmap.Device.cpu
         )
 
 

@@ -58,7 +58,7 @@ def check(command: Run, segment: Segment) -> None:
         )
     class_table = read_classes(classes)
     if segment.backend == "files":
-        from sc3d.segmentation.mask_formats.import_masks import check_masks
+        from sc3d.segmentation.mask_formats.import_masks import check_masks, mask_source
         from sc3d.segmentation.mask_formats.source import MaskFiles
 
         masks = segment.masks or Scene(command.scene).masks
@@ -66,9 +66,7 @@ def check(command: Run, segment: Segment) -> None:
             raise InputError(
                 "--masks PATH is needed (or --segment.backend strokes, grounded-sam or sam3, which make masks)"
             )
-        source = (
-            MaskFiles(masks, segment.format, segment.mapping) if segment.masks else MaskFiles(masks, "index")
-        )
-        check_masks(source, sizes, class_table, segment.confidence)
+        source = mask_source(segment, masks) if segment.masks else MaskFiles(masks, "index")
+        check_masks(source, sizes, class_table, segment.confidence, command.photos)
     if command.truth is not None:
-        match_masks(command.truth, sizes, class_table)
+        match_masks(command.truth, sizes, class_table, photos=command.photos)

@@ -17,8 +17,10 @@ import open3d as o3d
 from sc3d.errors import InputError
 from sc3d.georeferencing.georeference import (
     Georeference,
+    crs_to_geodetic,
     projected_crs,
     read_georeference,
+    warn_outside,
     write_georeference,
 )
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
@@ -100,6 +102,8 @@ def find_projection(scene: Scene, settings: Export) -> MapProjection:
     georeference = read_georeference(scene)
     if georeference is not None:
         projection = MapProjection(georeference, settings.epsg or georeference.epsg)
+        if projection.epsg != georeference.epsg:
+            _warn_outside(projection)
     elif settings.epsg:
         projection = MapProjection(Georeference(settings.epsg, (0.0, 0.0, 0.0)), settings.epsg)
     else:
@@ -107,6 +111,14 @@ def find_projection(scene: Scene, settings: Export) -> MapProjection:
         return MapProjection()
     _ = projection.crs  # an unknown code is an error before any work
     return projection
+
+
+def _warn_outside(projection: MapProjection) -> None:
+    """Where the CRS of `--epsg` is not made for the scene."""
+    georeference = projection.georeference
+    if georeference is not None and projection.epsg is not None:
+        place = crs_to_geodetic(np.array([georeference.offset]), georeference.crs)[0]
+        warn_outside(projection.epsg, *place[:2])
 
 
 @lru_cache(maxsize=8)

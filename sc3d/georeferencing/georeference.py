@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.io.crs import split_crs
 from sc3d.io.json_files import read_json, write_json
 
 if TYPE_CHECKING:
@@ -124,17 +125,27 @@ def from_origin(
         np.zeros((1, 3))
     )[0]
     offset = triple(np.round(here))
-    area = projected_crs(zone).area_of_use
-    if area is not None and not (
-        area.south <= origin[0] <= area.north and area.west <= origin[1] <= area.east
-    ):
-        logger.warning(
-            "EPSG:%d is made for %s: the scene at latitude %.4f, longitude %.4f lies outside",
-            zone,
-            area.name,
-            *origin[:2],
-        )
+    warn_outside(zone, origin[0], origin[1])
     return Georeference(zone, offset, origin, altitude_offset=altitude_offset, figures=figures or {})
+
+
+def warn_outside(epsg: int, latitude: float, longitude: float) -> None:
+    """A warning if a place, degrees, is outside of the area for which a CRS is made."""
+    area = projected_crs(epsg).area_of_use
+    if area is None or (area.south <= latitude <= area.north and _within(longitude, area.west, area.east)):
+        return
+    logger.warning(
+        "EPSG:%d is made for %s: the scene at latitude %.4f, longitude %.4f lies outside",
+        epsg,
+        area.name,
+        latitude,
+        longitude,
+    )
+
+
+def _within(longitude: float, west: float, east: float) -> bool:
+    """Areas may cross the 180th meridian."""
+    return west <= longitude <= east if west <= east else longitude >= west or longitude <= east
 
 
 def triple(values: Iterable[float]) -> tuple[float, float, float]:
@@ -216,6 +227,12 @@ def projected_crs(epsg: int) -> pyproj.CRS:
         raise InputError(
             f"EPSG:{epsg} is unknown: give the code of a projected CRS, such as 32615 for WGS 84 / UTM zone 15N"
         ) from None
+    if crs.is_compound or len(crs.axis_info) > 2:
+        horizontal = split_crs(crs)[0]
+        raise InputError(
+            f"EPSG:{epsg} ({crs.name}) is a CRS of heights too, which are not converted here: give its horizontal part,"
+            f" {horizontal.name}" + (f", EPSG:{horizontal.to_epsg()}" if horizontal.to_epsg() else "")
+        )
     if not crs.is_projected:
         raise InputError(
             f"EPSG:{epsg} ({crs.name}) is not a projected CRS: choose one with eastings and northings, such as a UTM zone"
@@ -252,10 +269,12 @@ def geodetic_to_enu(geodetic: np.ndarray, origin: tuple[float, float, float]) ->
 
 def crs_to_geodetic(points: np.ndarray, crs: pyproj.CRS) -> np.ndarray:
     """(N, 3) easting, northing, height (unit of the CRS), or longitude, latitude, height of a geographic CRS,
-    to latitude, longitude, height (m).
+    to latitude, longitude, height (m). A compound CRS says in which unit its heights are.
     """
     points = np.asarray(points, np.float64)
-    unit = crs.axis_info[0].unit_conversion_factor if crs.is_projected else 1.0
+    crs, unit = split_crs(crs)
+    if unit is None:
+        unit = crs.axis_info[0].unit_conversion_factor if crs.is_projected else 1.0
     longitude, latitude = _transformer("EPSG:4326", crs).transform(
         points[:, 0], points[:, 1], direction="INVERSE"
     )

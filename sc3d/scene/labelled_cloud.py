@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,7 +16,10 @@ from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, orient_norm
 from sc3d.geometry.raycast import FirstSurface, RayTarget, Surface, first_surface, nearest_points
 from sc3d.geometry.voxel_traversal import VoxelSurface
 from sc3d.io.clouds import read_cloud, read_mesh
+from sc3d.scene.frame_check import check_together
 from sc3d.scene.labels import STATE_NAMES, Labels
+
+logger = logging.getLogger(__name__)
 
 NORMAL_NEIGHBORS = 30
 SPACING_SAMPLE, SPACING_NEIGHBORS = 100_000, 8
@@ -45,14 +49,24 @@ def unit_normals(
         `NeighborIndex`
     """
     if given is not None:
-        normals = given.astype(np.float32)
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        if np.isfinite(lengths).all() and (lengths > 0).all():
-            return normals / lengths
+        normals, usable = given.astype(np.float32), usable_normals(given)
+        if usable.all():
+            return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        logger.warning(
+            "%d of %d normals have no length or are not finite: all are estimated",
+            (~usable).sum(),
+            len(normals),
+        )
     neighbors, _ = NeighborIndex(points, origin).nearest(points, NORMAL_NEIGHBORS)
     if neighbors.shape[1] < 3:
         raise InputError(f"the cloud has {len(points)} points: normals need at least 3")
     return orient_normals(points, estimate_normals(points, neighbors), centers)
+
+
+def usable_normals(normals: np.ndarray) -> np.ndarray:
+    """(N,) bool normals (N, 3) that have a direction."""
+    lengths = np.linalg.norm(normals.astype(np.float32), axis=1)
+    return np.isfinite(lengths) & (lengths > 0)
 
 
 def read_surface(
@@ -70,9 +84,9 @@ def read_surface(
     """
     if kind == "auto" and mesh.exists():
         read = read_mesh(mesh)
-        return Surface.from_mesh(
-            read.vertex.positions.numpy().astype(np.float64), read.triangle.indices.numpy(), origin
-        )
+        vertices = read.vertex.positions.numpy().astype(np.float64)
+        check_together(mesh, vertices, points)
+        return Surface.from_mesh(vertices, read.triangle.indices.numpy(), origin)
     if kind == "surfels":
         return Surface.from_cloud(points, normals, origin)
     return VoxelSurface.from_cloud(points, normals, SURFACE_VOXEL * spacing_of(points))
@@ -163,7 +177,9 @@ def read_votes(cloud: o3d.t.geometry.PointCloud) -> np.ndarray | None:
 
 
 def spacing_of(points: np.ndarray) -> float:
-    """Sampling distance of the (N, 3) points, world units, from at most 100 000 of them; 1 if they coincide."""
+    """Sampling distance of the (N, 3) points, world units, from at most 100 000 of them; 1 if they
+    coincide.
+    """
     sample = points[:: max(1, len(points) // SPACING_SAMPLE)]
     return (
         point_spacing(NeighborIndex(points, points.min(axis=0)).nearest(sample, SPACING_NEIGHBORS + 1)[1])

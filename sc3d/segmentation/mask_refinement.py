@@ -7,7 +7,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
@@ -16,7 +15,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.io.atomic import atomic_path, discard
-from sc3d.io.images import write_image
+from sc3d.io.images import read_orientation, write_image
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.fusion import fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size, read_given_cloud
@@ -128,12 +127,16 @@ def refine_scene(scene: Scene, settings: Segment) -> Refinement:
             "--refine works on the masks that are in the scene: make them first, then run `sc3d segment SCENE --refine`"
         )
     masks = Masks.load(scene, scene.confidence)
+    scene.warn_of_unplaced(scene.masks, scene.confidence)
     refinement = refine(load_refinement_inputs(scene, masks), masks.views, masks.read)
     if refinement.helps:
         with atomic_path(scene.confidence_refined) as folder:
             folder.mkdir()
             for view in tqdm(masks.views, desc="writing confidence", unit="photo", disable=None):
-                write_image(folder / f"{Path(view.name).stem}.png", refinement.confidence(view, masks.read))
+                file = scene.photo_names.path(folder, view.name)
+                write_image(
+                    file, refinement.confidence(view, masks.read), read_orientation(scene.photo(view.name))
+                )
     else:
         discard(scene.confidence_refined)
     return refinement

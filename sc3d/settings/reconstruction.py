@@ -114,8 +114,10 @@ class Import:
     """
     epsg: int | None = None
     """CRS of coordinates whose file does not state one."""
-    tolerance: float = 0.01
-    """Largest error, px, from lens parameters that no COLMAP model has; a project that needs more is refused.
+    tolerance: float = 1.0
+    """Largest error, px, from lens parameters that no COLMAP model has (skew, Metashape's additional
+    corrections, high radial terms); below it they are left out with a warning, a project that needs more is
+    refused.
     """
     project: Annotated[Path, Suppress] = Path()
     """Set by the command."""

@@ -12,7 +12,6 @@ from sc3d.extraction import DepthViews, center_cloud, extract_surface
 from sc3d.geometry.cameras import project, resample, undistorted
 from sc3d.geometry.view_selection import neighbor_views
 from sc3d.io.clouds import write_geometry
-from sc3d.io.images import read_image
 from sc3d.scene.scene import Scene, check_photos
 from sc3d.settings.reconstruction import Extract
 from sc3d.splatting.dataset import load_gaussians
@@ -38,11 +37,13 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
     views = [undistorted(view.shifted(origin), settings.max_size) for view in model.views]
 
     def image(row: int) -> np.ndarray:
-        return resample(
-            read_image(scene.photo(model.views[row].name)), model.views[row].shifted(origin), views[row]
-        )
+        return resample(scene.read_photo(model.views[row].name), model.views[row].shifted(origin), views[row])
 
-    data = DepthViews(views, image, neighbor_views(model.tracks, model.points, centers), _depth_range(model))
+    def opaque(row: int) -> np.ndarray | None:
+        return scene.opaque_pixels(model.views[row].shifted(origin), views[row])
+
+    neighbors = neighbor_views(model.tracks, model.points, centers)
+    data = DepthViews(views, image, neighbors, _depth_range(model), opaque)
     surfaces = extract_surface(gaussians, data, settings)
     write_geometry(scene.mesh, _placed(surfaces.mesh, origin))
     write_geometry(scene.cloud, _placed(surfaces.cloud, origin))
