@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import logging
+import os
 import re
 import signal
 import sys
@@ -19,6 +20,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 from sc3d.commands import COMMANDS, MODULES, STAGES
 from sc3d.commands.renamed import MOVED, current
 from sc3d.errors import InputError, Sc3dError
+from sc3d.io.requirements import explain
 
 # numba reads it in whatever folder a command is called, also in a scene of somebody else
 NUMBA_FILE = ".numba_config.yaml"
@@ -26,7 +28,7 @@ NUMBA_FILE = ".numba_config.yaml"
 
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and exit: 0 done, 1 failed, 2 bad input, 130 interrupted by Ctrl-C."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = expanded(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         with ending_with_reader():
             sys.stdout.write(usage())
@@ -49,6 +51,15 @@ def main(arguments: list[str] | None = None) -> None:
         command = parse(name, current(arguments[1:]))
     with reporting_errors():
         _dispatch(name, command)
+
+
+def expanded(arguments: list[str]) -> list[str]:
+    """Arguments with `~` at the start of a path as the home folder, which shells leave in `--masks=~/masks`."""
+    found = [re.fullmatch(r"(--[\w.-]+=)?(~(?:/.*)?)", argument) for argument in arguments]
+    return [
+        (match[1] or "") + os.path.expanduser(match[2]) if match else argument
+        for match, argument in zip(found, arguments, strict=True)
+    ]
 
 
 def start_logging() -> None:
@@ -98,8 +109,15 @@ def reporting_errors() -> Iterator[None]:
         sys.exit(_fail(str(error)))
     except PermissionError as error:
         sys.exit(_fail(f"no permission for {error.filename}: check its permissions or choose another folder"))
-    except (Sc3dError, OSError, MemoryError) as error:
-        sys.exit(_fail(f"{error or type(error).__name__}", status=1))
+    except Sc3dError as error:
+        sys.exit(_fail(str(error), status=1))
+    except (OSError, MemoryError) as error:
+        sys.exit(_fail(explain(error) or str(error) or type(error).__name__, status=1))
+    except (ImportError, AttributeError, RuntimeError) as error:
+        reason = explain(error)
+        if reason is None:
+            raise
+        sys.exit(_fail(reason, status=1))
     except KeyboardInterrupt:
         sys.exit(
             _fail(

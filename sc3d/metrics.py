@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
+from sc3d.errors import left_out
 from sc3d.geometry.cameras import View
 from sc3d.geometry.raycast import FirstSurface
 from sc3d.io.json_files import write_json
@@ -21,6 +23,8 @@ from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Evaluate
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -249,6 +253,7 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
     table, truth_files = scene.class_table(), truth_masks(scene, settings)
     mask_files = scene.mask_files(scene.masks, table) if scene.masks.is_dir() else {}
     views = [view for view in scene.model.views if view.name in truth_files]
+    _tell_of_left_out(scene, [view.name for view in views], mask_files)
     per_photo, reliabilities = {}, []
     for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
         truth = scene.read_mask(truth_files[view.name], view.name)
@@ -276,6 +281,18 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
         metrics | {"reliability": overall.summary() if overall else {}, "per_photo": photos},
     )
     return EvaluationSummary(totals, overall.ece if overall else None)
+
+
+def _tell_of_left_out(scene: Scene, judged: list[str], mask_files: dict[str, Path]) -> None:
+    names = [view.name for view in scene.model.views]
+    untold = sorted(set(names) - set(judged))
+    bare = [name for name in judged if name not in mask_files]
+    if untold:
+        logger.info(left_out(untold, len(names), "photos have no truth and are not judged"))
+    if mask_files and bare:
+        logger.warning(
+            left_out(bare, len(judged), "photos with truth have no mask; masks are judged without")
+        )
 
 
 def truth_masks(scene: Scene, settings: Evaluate) -> dict[str, Path]:

@@ -14,7 +14,7 @@ from sc3d.scene.class_table import read_classes
 from sc3d.scene.scene import Scene, match_masks, photo_sizes
 from sc3d.settings.labels import Evaluate, Segment
 from sc3d.settings.outputs import Report, Run
-from sc3d.stages.reconstruct import prepare
+from sc3d.stages.reconstruct import prepare, reconstruct
 
 logger = logging.getLogger(__name__)
 
@@ -28,12 +28,11 @@ def main(command: Run) -> None:
         confidence=command.confidence or command.segment.confidence,
     )
     check(command, segment)
-    prepare(command.photos, scene)
+    prepare(command.photos, scene, command.reconstruct)
     if command.classes is not None:
         with atomic_path(scene.classes) as temporary:
             shutil.copyfile(command.classes, temporary)
     stages = [
-        ("reconstruct", command.reconstruct),
         ("train", command.train),
         ("extract", command.extract),
         ("segment", replace(segment, refine=False)),
@@ -43,6 +42,7 @@ def main(command: Run) -> None:
     ]
     if command.truth is not None:
         stages.append(("evaluate", Evaluate(truth=command.truth)))
+    reconstruct(scene, command.reconstruct, command.overwrite)
     for name, settings in [*stages, ("report", Report())]:
         execute(name, scene, settings, command.overwrite)
     logger.info("run: %.0f s; look at %s", time.perf_counter() - started, scene.report)

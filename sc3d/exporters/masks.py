@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import cv2
 import numpy as np
 from tqdm import tqdm
 
+from sc3d.errors import left_out
 from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
 from sc3d.io.images import read_orientation, write_image
@@ -17,6 +19,8 @@ from sc3d.settings.outputs import Export
 from sc3d.view.contact_sheet import side_by_side
 
 SHOWN, PANEL = 4, 600  # photos in masks.jpg, and the width of each picture there, px
+
+logger = logging.getLogger(__name__)
 
 
 def outputs(scene: Scene, settings: Export) -> list[Path]:
@@ -42,6 +46,9 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
             write_image(scene.photo_names.path(confidence_folder, view.name), confidence, orientation)
             covered.append(float((mask > 0).mean()))
     write_image(sheet, _comparison(scene, views))
+    empty = [view.name for view, share in zip(views, covered, strict=True) if not share]
+    if empty:
+        logger.warning(left_out(empty, len(views), "photos see no label; their masks are empty"))
     return {"photos": len(views), "labelled_pixels": f"{np.mean(covered):.1%}"}
 
 

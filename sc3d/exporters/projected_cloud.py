@@ -17,10 +17,11 @@ import open3d as o3d
 from sc3d.errors import InputError
 from sc3d.georeferencing.georeference import (
     Georeference,
+    check_area,
     crs_to_geodetic,
     projected_crs,
     read_georeference,
-    warn_outside,
+    triple,
     write_georeference,
 )
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
@@ -103,7 +104,8 @@ def find_projection(scene: Scene, settings: Export) -> MapProjection:
     if georeference is not None:
         projection = MapProjection(georeference, settings.epsg or georeference.epsg)
         if projection.epsg != georeference.epsg:
-            _warn_outside(projection)
+            place = crs_to_geodetic(np.array([georeference.offset]), georeference.crs)[0]
+            check_area(projected_crs(settings.epsg or georeference.epsg), triple(place))
     elif settings.epsg:
         projection = MapProjection(Georeference(settings.epsg, (0.0, 0.0, 0.0)), settings.epsg)
     else:
@@ -111,14 +113,6 @@ def find_projection(scene: Scene, settings: Export) -> MapProjection:
         return MapProjection()
     _ = projection.crs  # an unknown code is an error before any work
     return projection
-
-
-def _warn_outside(projection: MapProjection) -> None:
-    """Where the CRS of `--epsg` is not made for the scene."""
-    georeference = projection.georeference
-    if georeference is not None and projection.epsg is not None:
-        place = crs_to_geodetic(np.array([georeference.offset]), georeference.crs)[0]
-        warn_outside(projection.epsg, *place[:2])
 
 
 @lru_cache(maxsize=8)

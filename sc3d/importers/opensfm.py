@@ -19,7 +19,7 @@ import pycolmap
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, Lenses, NoModelError
-from sc3d.georeferencing.control_points import parse_crs
+from sc3d.georeferencing.gcp_list import parse_crs
 from sc3d.georeferencing.georeference import Georeference, from_origin, triple
 from sc3d.importers.project import Project, require_found, rigid, some_names
 from sc3d.io.json_files import read_json

@@ -11,6 +11,7 @@ import platform
 import re
 import shutil
 import stat
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -170,6 +171,21 @@ def _free_bytes(folder: Path) -> int | None:
         return None
     free = found.f_bfree if os.geteuid() == 0 else found.f_bavail
     return free * found.f_frsize if found.f_blocks else None
+
+
+FULL = re.compile(r"disk is full|No space left|quota exceeded|requested and \d+ written", re.IGNORECASE)
+
+
+def full_folder(error: Exception, folders: list[Path]) -> Path | None:
+    """Which folder has no room left, if that is what an error says: that of the file it names, else that of the
+    folders with the least room; None for other errors.
+    """
+    if getattr(error, "errno", None) not in (errno.ENOSPC, errno.EDQUOT) and not FULL.search(str(error)):
+        return None
+    name = getattr(error, "filename", None)
+    if name and not isinstance(name, int):
+        return Path(os.fsdecode(name)).parent
+    return min(folders, key=lambda folder: room if (room := _free_bytes(folder)) is not None else sys.maxsize)
 
 
 @contextmanager

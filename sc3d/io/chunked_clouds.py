@@ -17,7 +17,7 @@ from sc3d.io.limits import FARTHEST
 from sc3d.io.ply import check_ply
 from sc3d.io.splats import SPLATS, is_splat_ply
 
-RECORDS_AT_ONCE = 1_000_000  # rows held at a time
+RECORDS_AT_ONCE, BYTES_AT_ONCE = 1_000_000, 128 << 20  # rows held at a time
 LAS_FIELDS = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
 LAS_COLORS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 
@@ -65,11 +65,15 @@ class CloudFile:
         """Of the fields of a record."""
         return self.dtype.names or ()
 
-    def chunks(self) -> Iterator[tuple[int, np.ndarray]]:
-        """First row and records of each chunk; InputError at positions that are not finite or too far
-        away.
+    @property
+    def rows_at_once(self) -> int:
+        return rows_at_once(self.dtype)
+
+    def chunks(self, at_once: int = 0) -> Iterator[tuple[int, np.ndarray]]:
+        """First row and records of each chunk, of `at_once` rows if given; InputError at positions that are
+        not finite or too far away.
         """
-        for start, records in self._read():
+        for start, records in self._read(at_once or self.rows_at_once):
             for axis in "xyz":
                 if not (np.abs(records[axis]) <= FARTHEST).all():
                     raise InputError(
@@ -77,8 +81,8 @@ class CloudFile:
                     )
             yield start, records
 
-    def _read(self) -> Iterator[tuple[int, np.ndarray]]:
-        for start, columns in self._stored():
+    def _read(self, at_once: int) -> Iterator[tuple[int, np.ndarray]]:
+        for start, columns in self._stored(at_once):
             if isinstance(columns, np.ndarray) and columns.dtype == self.dtype:
                 yield start, columns
                 continue
@@ -88,15 +92,15 @@ class CloudFile:
                 records[name] = to_bytes(source, self._brightest) if name in COLORS else source
             yield start, records
 
-    def _stored(self) -> Iterator[tuple[int, Mapping[str, np.ndarray] | np.ndarray]]:
+    def _stored(self, at_once: int) -> Iterator[tuple[int, Mapping[str, np.ndarray] | np.ndarray]]:
         """First row and columns of each chunk as they are in the file."""
         if self.stored is None:
-            yield from _read_las(self)
+            yield from _read_las(self, at_once)
             return
         with self.path.open("rb") as file:
             file.seek(self.offset)
-            for start in range(0, self.num_points, RECORDS_AT_ONCE):
-                yield start, np.fromfile(file, self.stored, min(RECORDS_AT_ONCE, self.num_points - start))
+            for start in range(0, self.num_points, at_once):
+                yield start, np.fromfile(file, self.stored, min(at_once, self.num_points - start))
 
     def _source(self, name: str) -> str:
         """Name in the file."""
@@ -110,11 +114,16 @@ class CloudFile:
         return max(
             (
                 float(np.nan_to_num(columns[name].astype(np.float64)).max(initial=0))
-                for _, columns in self._stored()
+                for _, columns in self._stored(self.rows_at_once)
                 for name in names
             ),
             default=0.0,
         )
+
+
+def rows_at_once(dtype: np.dtype) -> int:
+    """How many records to hold at a time."""
+    return min(RECORDS_AT_ONCE, max(1, BYTES_AT_ONCE // dtype.itemsize))
 
 
 def _with_bytes(record: np.dtype) -> np.dtype:
@@ -127,11 +136,11 @@ def _with_bytes(record: np.dtype) -> np.dtype:
     return record if found == COLORS and record["red"] == np.uint8 else np.dtype(fields)
 
 
-def _read_las(cloud: CloudFile) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+def _read_las(cloud: CloudFile, at_once: int) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     start = 0
     with open_las(cloud.path) as file:
         scale = read_las_crs(file.header, cloud.path).height_scale
-        for points in file.chunk_iterator(RECORDS_AT_ONCE):
+        for points in file.chunk_iterator(at_once):
             columns = {axis: np.asarray(getattr(points, axis)) for axis in "xyz"}
             columns["z"] = columns["z"] * scale
             yield start, columns | {name: np.asarray(points[name]) for name in cloud.names[3:]}

@@ -15,6 +15,7 @@ from sc3d.errors import InputError
 if TYPE_CHECKING:
     import laspy
     import pyproj
+    from pyproj._crs import Axis
 
 logger = logging.getLogger(__name__)
 
@@ -68,15 +69,19 @@ def describe_crs(crs: pyproj.CRS, path: Path, height_unit: float | None = None) 
 
 def split_crs(crs: pyproj.CRS) -> tuple[pyproj.CRS, float | None]:
     """The horizontal part of a CRS, be it compound, bound to another by TOWGS84, or with heights of its
-    own; and meters per unit of its heights, None = it does not say.
+    own; and meters per unit of its heights, negative if it counts depths, None = it does not say.
     """
     crs = _unbound(crs)
     if crs.is_compound:
         horizontal, vertical = (_unbound(part) for part in crs.sub_crs_list[:2])
-        return horizontal, float(vertical.axis_info[0].unit_conversion_factor)
+        return horizontal, _meters_up(vertical.axis_info[0])
     if crs.is_geocentric or len(crs.axis_info) < 3:
         return crs, None
-    return crs.to_2d(), float(crs.axis_info[2].unit_conversion_factor)
+    return crs.to_2d(), _meters_up(crs.axis_info[2])
+
+
+def _meters_up(axis: Axis) -> float:
+    return float(axis.unit_conversion_factor) * (-1 if axis.direction == "down" else 1)
 
 
 def _unbound(crs: pyproj.CRS) -> pyproj.CRS:

@@ -359,7 +359,7 @@ def used_range(folder: Path) -> tuple[int, int] | None:
 
 def photo_bits(path: Path) -> int:
     """Bits per channel of a photo, 8 or 16; InputError for others, such as floating point."""
-    with open_image(path, "photo") as image:
+    with open_image(path) as image:
         bits = bits_of(image)
     if bits not in (8, 16):
         kind = "floating point" if bits == FLOAT else f"{bits} bits"

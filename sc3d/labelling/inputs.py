@@ -4,17 +4,19 @@ both.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import open3d as o3d
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, left_out
 from sc3d.geometry.cameras import View, may_see
 from sc3d.io.clouds import read_cloud
 from sc3d.labelling.density import GaussianField, gaussian_density, kernel_density
 from sc3d.labelling.observation import Mask
+from sc3d.scene.channels import Channels
 from sc3d.scene.frame_check import Box, box_of, check_frame, describe
 from sc3d.scene.labelled_cloud import spacing_of
 from sc3d.scene.scene import Scene
@@ -22,17 +24,21 @@ from sc3d.scene.splats import read_scene_splats
 
 FOOTPRINT_SAMPLE = 1000
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class Masks:
-    """The masks of a scene: files by view name, confidence maps where there are any, and the views that have
-    a mask.
+    """The masks of a scene: files by view name, confidence maps where there are any, the views that have a mask,
+    and the channels of the classes; without: names of the photos that have a camera and no mask.
     """
 
     files: dict[str, Path]
     confidences: dict[str, Path]
     views: list[View]
     scene: Scene
+    channels: Channels
+    without: tuple[str, ...] = ()
 
     @classmethod
     def load(cls, scene: Scene, confidence: Path | None) -> Masks:
@@ -44,18 +50,37 @@ class Masks:
             hint="pass --classes FILE to `sc3d run`, or copy data/classes.json of the sc3d repository there and edit it",
         )
         scene.require(scene.masks, hint="run `sc3d segment SCENE` first, with --masks if you have some")
-        files = scene.mask_files(scene.masks, scene.class_table())
+        table = scene.class_table()
+        files = scene.mask_files(scene.masks, table)
         confidences = scene.mask_files(confidence) if confidence is not None and confidence.is_dir() else {}
         for name, path in confidences.items():
             if name in files and scene.mask_size(path, name) != scene.mask_size(files[name], name):
                 raise InputError(f"{path} has another size than its mask: both must be the same")
-        return cls(files, confidences, [view for view in scene.model.views if view.name in files], scene)
+        views = scene.model.views
+        masked = [view for view in views if view.name in files]
+        without = tuple(view.name for view in views if view.name not in files)
+        return cls(files, confidences, masked, scene, table.channels, without)
+
+    def tell_of_left_out(self, low: np.ndarray, high: np.ndarray) -> None:
+        """One line for each reason why photos do not vote, or not as others do. low, high: (3,) box of the
+        cloud, world.
+        """
+        count = len(self.views) + len(self.without)
+        away = [view.name for view in self.views if not may_see(view, low, high)]
+        sure = [view.name for view in self.views if view.name not in self.confidences]
+        if self.without:
+            logger.info(left_out(self.without, count, "photos have no mask and do not vote"))
+        if away:
+            logger.warning(left_out(away, count, "photos do not see the cloud and do not vote"))
+        if self.confidences and sure:
+            logger.warning(left_out(sure, count, "photos have no confidence map; their masks count as sure"))
 
     def read(self, view: View) -> Mask:
-        """As `fuse` wants it."""
+        """As `fuse` wants it: channels, not ids."""
         confidence = self.confidences.get(view.name)
         sure = None if confidence is None else self.scene.read_confidence(confidence, view.name)
-        return self.scene.read_mask(self.files[view.name], view.name), sure
+        file = self.files[view.name]
+        return self.channels.from_ids(self.scene.read_mask(file, view.name), file), sure
 
     def size(self, view: View) -> tuple[int, int]:
         """(width, height) px of the mask of a view."""

@@ -27,7 +27,7 @@ from sc3d.labelling.inputs import (
 )
 from sc3d.labelling.normal_sides import judge_sides, sample_step, with_sides
 from sc3d.scene.frame_check import Box, box_of, describe
-from sc3d.scene.labelled_cloud import point_arrays, read_surface, usable_normals, with_labels
+from sc3d.scene.labelled_cloud import Votes, point_arrays, read_surface, usable_normals, with_labels
 from sc3d.scene.labels import STATE_NAMES, UNSEEN
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
@@ -89,6 +89,7 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     require_in_view(path, box, masks, scene.model.points)
     points, normals = point_arrays(given, np.array([view.center for view in masks.views]))
     normals, num_turned = _on_the_right_side(given, points, normals, masks.views, path)
+    masks.tell_of_left_out(*box)
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=default_voxel_size(points, masks))
     surface, density = None, None
@@ -96,12 +97,14 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         surface = read_surface(scene.mesh, points, normals, local_origin(masks.views), settings.surface)
     if settings.mechanisms.density:
         density = point_density(scene, points, settings.voxel_size)
-    num_ids = scene.class_table().num_ids
-    fusion = fuse(Cloud(points, normals, density), masks.views, masks.read, surface, num_ids, settings)
+    channels = masks.channels
+    fusion = fuse(Cloud(points, normals, density), masks.views, masks.read, surface, channels.count, settings)
     with atomic_path(scene.votes_of(settings.output)) as temporary:
-        fusion.grid.save(temporary)
-    write_geometry(settings.output or scene.seeds, with_labels(given, normals, fusion.labels, fusion.votes))
-    counts = np.bincount(fusion.labels.state, minlength=len(STATE_NAMES))
+        fusion.grid.save(temporary, channels.ids)
+    labels = replace(fusion.labels, label=channels.to_ids(fusion.labels.label))
+    seeds = with_labels(given, normals, labels, Votes(fusion.votes, channels))
+    write_geometry(settings.output or scene.seeds, seeds)
+    counts = np.bincount(labels.state, minlength=len(STATE_NAMES))
     return summarize(counts, settings.voxel_size, masks.views, path, box, num_turned)
 
 

@@ -28,6 +28,7 @@ logger = logging.getLogger(__name__)
 _CELL = 2.0  # side of the cells that areas are counted in, point spacings
 _STAGES = (
     "synthesize",
+    "map_photos",
     "reconstruct",
     "train",
     "extract",

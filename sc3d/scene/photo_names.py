@@ -127,7 +127,7 @@ class PhotoNames:
         clear; None if there is none.
         """
         path = PurePosixPath(name)
-        keys = dict.fromkeys([self._keys[name], str(path.with_suffix("")), path.stem])
+        keys = dict.fromkeys([self._keys.get(name, name), str(path.with_suffix("")), path.stem])
         clear = (key for key in keys if self.match_file(f"{key}{suffix}") == (name,))
         return next((file for key in clear if (file := folder / f"{key}{suffix}").is_file()), None)
 

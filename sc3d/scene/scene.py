@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.io.images import (
     broken_link,
     check_photo,
@@ -51,6 +51,11 @@ class Scene:
     @property
     def sparse(self) -> Path:
         return self.path / "sparse" / "0"
+
+    @property
+    def mapped(self) -> Path:
+        """The model before it is brought to its place."""
+        return self.path / "mapped"
 
     @property
     def gaussians(self) -> Path:
@@ -399,6 +404,36 @@ def check_mask_aspect(file: Path | str, mask_size: tuple[int, int], photo_size: 
     if abs(width * photo_height - height * photo_width) * scale > max(photo_width, photo_height):
         raise InputError(
             f"{file} is {width}x{height}, but its photo is {photo_width}x{photo_height}: the aspect must be the same within 1 px"
+        )
+
+
+def require_views(scene: Scene) -> None:
+    """InputError unless two photos at least have a camera, and, where the model tells what they see, two see the
+    same: no surface comes from less. What sees nothing that others see is told.
+    """
+    model = scene.model
+    if len(model.views) < 2:
+        raise InputError(
+            f"{scene.sparse} has {len(model.views)} photos with a camera: a surface needs at least 2 that overlap; take more photos, or run `sc3d reconstruct` again"
+        )
+    if not any(len(track) for track in model.tracks):
+        return
+    times = np.bincount(np.concatenate(model.tracks), minlength=len(model.points))
+    alone = [
+        view.name
+        for view, track in zip(model.views, model.tracks, strict=True)
+        if not (times[track] > 1).any()
+    ]
+    if len(alone) == len(model.views):
+        raise InputError(
+            f"no two photos of {scene.sparse} see the same sparse point: a surface needs at least 2 that overlap"
+        )
+    if alone:
+        logger.warning(
+            "%d of %d photos share no sparse point with another, so that nothing checks their depth: %s",
+            len(alone),
+            len(model.views),
+            examples(alone),
         )
 
 

@@ -40,19 +40,19 @@ ReadMask = Callable[[View], Mask]
 class RefinementInputs:
     """A cloud with its surface, and the settings by which masks become labels.
 
-    colors: (N, 3) uint8 or None; seen: the surface, whatever labels it has; num_ids: largest class id + 1
+    colors: (N, 3) uint8 or None; seen: the surface, whatever labels it has; num_channels: classes + 1, as labels and masks here are channels
     """
 
     cloud: Cloud
     colors: np.ndarray | None
     seen: LabelledSurface
-    num_ids: int
+    num_channels: int
     label: Label
     propagate: Propagate = Propagate()
 
     def labels(self, views: list[View], read: ReadMask) -> Labels:
         """Labels of all points from the masks of some views."""
-        fusion = fuse(self.cloud, views, read, self.seen.surface, self.num_ids, self.label)
+        fusion = fuse(self.cloud, views, read, self.seen.surface, self.num_channels, self.label)
         return propagate(
             LabelledPoints(self.cloud.points, fusion.labels, fusion.votes, self.colors),
             self.cloud.normals,
@@ -85,7 +85,7 @@ def load_refinement_inputs(scene: Scene, masks: Masks) -> RefinementInputs:
         Cloud(points, normals),
         colors,
         seen,
-        scene.class_table().num_ids,
+        masks.channels.count,
         Label(voxel_size=default_voxel_size(points, masks)),
     )
 
@@ -183,6 +183,6 @@ def _agreement(inputs: RefinementInputs, labels: Labels, views: list[View], read
     for view in tqdm(views, desc="photos left out", unit="photo", disable=None):
         mask = read(view)[0]
         parts.append(
-            Confusion.from_labels(mask, inputs.render(labels, view, mask.shape[::-1])[0], inputs.num_ids)
+            Confusion.from_labels(mask, inputs.render(labels, view, mask.shape[::-1])[0], inputs.num_channels)
         )
-    return total(parts, inputs.num_ids).mean_iou
+    return total(parts, inputs.num_channels).mean_iou

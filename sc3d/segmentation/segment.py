@@ -116,7 +116,7 @@ def _state(scene: Scene, settings: Segment, class_table: ClassTable) -> object:
     """What decides the masks, as JSON: everything but where the models lie and run. Photos are told by size
     and time, as they are read often.
     """
-    decisive = replace(settings, device="auto", download=False, model_dir=None)
+    decisive = replace(settings, device="auto", download=False, model_dir=None, strokes=None)
     strokes = digest(settings.strokes or scene.strokes) if settings.backend == "strokes" else ""
     photos = [
         (photo_name(photo, scene.images), photo.stat().st_size, photo.stat().st_mtime_ns)

@@ -9,10 +9,10 @@ import open3d as o3d
 
 from sc3d.errors import InputError
 from sc3d.extraction import DepthViews, center_cloud, extract_surface
-from sc3d.geometry.cameras import project, resample, undistorted
+from sc3d.geometry.cameras import in_image, project, resample, undistorted
 from sc3d.geometry.view_selection import neighbor_views
 from sc3d.io.clouds import write_geometry
-from sc3d.scene.scene import Scene, check_photos
+from sc3d.scene.scene import Scene, SparseModel, check_photos, require_views
 from sc3d.settings.reconstruction import Extract
 from sc3d.splatting.dataset import load_gaussians
 
@@ -33,6 +33,7 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
         cloud = center_cloud(gaussians, centers - origin, settings.min_opacity)
         write_geometry(scene.cloud, _placed(cloud, origin))
         return {"points": len(cloud.point.positions)}
+    require_views(scene)
     check_photos(scene, [view.name for view in model.views])
     views = [undistorted(view.shifted(origin), settings.max_size) for view in model.views]
 
@@ -42,8 +43,9 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
     def opaque(row: int) -> np.ndarray | None:
         return scene.opaque_pixels(model.views[row].shifted(origin), views[row])
 
+    means = gaussians.means.detach().numpy() + origin
     neighbors = neighbor_views(model.tracks, model.points, centers)
-    data = DepthViews(views, image, neighbors, _depth_range(model), opaque)
+    data = DepthViews(views, image, neighbors, _depth_range(model, means), opaque)
     surfaces = extract_surface(gaussians, data, settings)
     write_geometry(scene.mesh, _placed(surfaces.mesh, origin))
     write_geometry(scene.cloud, _placed(surfaces.cloud, origin))
@@ -56,18 +58,23 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
     }
 
 
-def _depth_range(model) -> tuple[float, float]:
-    """0.7 times the 1st and 1.2 times the 99th percentile of the sparse points' depths."""
-    depths = [
-        project(view, model.points[track])[1]
-        for view, track in zip(model.views, model.tracks, strict=True)
-        if len(track)
-    ]
-    if not depths:
+def _depth_range(model: SparseModel, means: np.ndarray) -> tuple[float, float]:
+    """0.7 times the 1st and 1.2 times the 99th percentile of the sparse points' depths, in the photos that see
+    them; of all that lie in a photo, if the model does not tell; of the Gaussians' means (N, 3), world, if there
+    are no sparse points.
+    """
+    tracked = any(len(track) for track in model.tracks)
+    points = model.points if len(model.points) else means
+    depths = []
+    for view, track in zip(model.views, model.tracks, strict=True):
+        pixels, depth = project(view, points[track] if tracked else points)
+        depths.append(depth if tracked else depth[in_image(view, pixels) & (depth > 0)])
+    found = np.concatenate(depths)
+    if not len(found):
         raise InputError(
-            "the COLMAP model has no tracks: sparse points with the photos that see them are needed"
+            "no photo sees a sparse point or a Gaussian: cameras and Gaussians do not belong together"
         )
-    near, far = np.quantile(np.concatenate(depths), [0.01, 0.99])
+    near, far = np.quantile(found, [0.01, 0.99])
     return 0.7 * float(near), 1.2 * float(far)
 
 

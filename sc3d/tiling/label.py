@@ -14,8 +14,8 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.geometry.neighbors import NeighborIndex, point_spacing
-from sc3d.geometry.voxels import BLOCK, VOXELS, sort_by_voxel, unpack_blocks, voxel_origin
-from sc3d.io.chunked_clouds import CloudFile, columns, positions
+from sc3d.geometry.voxels import BLOCK, VOXELS, file_header, sort_by_voxel, unpack_blocks, voxel_origin
+from sc3d.io.chunked_clouds import CloudFile, columns, positions, rows_at_once
 from sc3d.io.ply import write_records
 from sc3d.labelling.cloud import Cloud, CloudExtent
 from sc3d.labelling.fusion import Fusion, fuse
@@ -29,6 +29,7 @@ from sc3d.labelling.inputs import (
 )
 from sc3d.labelling.label import LabelSummary, summarize
 from sc3d.labelling.normal_sides import Sides, judge_sides, sample_step, with_sides
+from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import (
     SPACING_NEIGHBORS,
     SPACING_SAMPLE,
@@ -49,7 +50,8 @@ from sc3d.tiling.work_folder import WorkFolder
 logger = logging.getLogger(__name__)
 
 NORMALS = ("nx", "ny", "nz")
-BYTES = 420  # of a point while its tile votes
+LEAST_BYTES = 420  # of a point while its tile votes
+BYTES, VOTE_BYTES = 180, 40  # the same without its votes, and of each channel of these
 VOXEL = 2.2  # of a label voxel, in point spacings, while neither is known exactly
 SAMPLE_MARGIN = 20.0  # around a tile whose spacing is measured, point spacings
 # margin of a tile: the rest of a block that its border cuts, and the block beyond, which verification looks
@@ -83,8 +85,15 @@ def label_fits(scene: Scene, settings: Label) -> bool:
     count = num_points(source)
     if count is None or not source.exists():
         return True  # cannot be read in parts
-    needed = count * BYTES + mesh_triangles(scene.mesh) * TRIANGLE
+    needed = count * bytes_per_point(scene) + mesh_triangles(scene.mesh) * TRIANGLE
     return fits(needed, settings)
+
+
+def bytes_per_point(scene: Scene) -> int:
+    """Of memory while a tile votes: most goes to the votes, of which each class has a channel."""
+    if not scene.classes.exists():
+        return LEAST_BYTES  # which `Masks.load` refuses
+    return max(LEAST_BYTES, BYTES + VOTE_BYTES * scene.class_table().channels.count)
 
 
 def label_scene(scene: Scene, settings: Label) -> LabelSummary:
@@ -109,8 +118,9 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     statistics = CloudStatistics.from_cloud(cloud)
     box = statistics.extent.low, statistics.extent.high
     require_in_view(cloud.path, box, masks, scene.model.points)
+    masks.tell_of_left_out(*box)
     margin = BLOCKS * BLOCK * (settings.voxel_size or VOXEL * statistics.spacing)
-    grid = statistics.grid(max_points(settings, BYTES), margin)
+    grid = statistics.grid(max_points(settings, bytes_per_point(scene)), margin)
     store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
     spacing, sample = sample_spacing(store, statistics)
     if not settings.voxel_size:
@@ -123,8 +133,9 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         results = Results(folder.subfolder("results"), store)
         job = LabelJob(scene.path, settings, statistics.extent, store, results, maps, confidence, sides)
         executor.run("voting", partial(label_tile, job), store.tiles)
-    write_field(job.results, store.tiles, settings.voxel_size, scene.votes_of(settings.output))
-    counts = _write(output, cloud, job, scene.class_table().num_ids)
+    header = file_header(settings.voxel_size, masks.channels.ids)
+    write_field(job.results, store.tiles, header, scene.votes_of(settings.output))
+    counts = _write(output, cloud, job, masks.channels)
     num_turned = sum(int(results.read(tile, "turned")[0]) for tile in store.tiles)
     folder.remove()
     return summarize(counts, settings.voxel_size, masks.views, cloud.path, box, num_turned)
@@ -234,14 +245,14 @@ def label_tile(job: LabelJob, tile: int) -> None:
         masks.views,
         masks.read,
         job.maps,
-        scene.class_table().num_ids,
+        masks.channels.count,
         job.settings,
     )
     core = halo.core
     labels = fusion.labels
     job.results.write(
         tile,
-        label=labels.label[core],
+        label=masks.channels.to_ids(labels.label)[core],
         confidence=labels.confidence[core],
         state=labels.state[core],
         num_views=labels.num_views[core].astype(np.int32),
@@ -263,14 +274,14 @@ def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.nd
     return mine, grid.grid.attribute(grid.ATTRIBUTE).numpy()[grid.slots(mine)]
 
 
-def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndarray:
+def _write(path: Path, cloud: CloudFile, job: LabelJob, channels: Channels) -> np.ndarray:
     """The cloud with the labels of its tiles; returns the number of points in each state."""
     added = [
         ("label", "u1"),
         ("confidence", "f4"),
         ("state", "u1"),
         ("num_views", "i4"),
-        *((f"{VOTES}{label}", "f4") for label in range(num_ids)),
+        *((f"{VOTES}{label}", "f4") for label in channels.ids),
     ]
     names = {name for name, _ in added} | {"nx", "ny", "nz"}
     kept = [
@@ -282,15 +293,19 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndar
     counts = np.zeros(len(STATE_NAMES), np.int64)
 
     def chunks():
-        fused = job.results.in_order(["label", "confidence", "state", "num_views", "votes", "normals"])
-        for (_, records), values in zip(cloud.chunks(), fused, strict=True):
+        names, at_once = (
+            ["label", "confidence", "state", "num_views", "votes", "normals"],
+            rows_at_once(dtype),
+        )
+        fused = job.results.in_order(names, at_once)
+        for (_, records), values in zip(cloud.chunks(at_once), fused, strict=True):
             result = np.empty(len(records), dtype)
             for name, _ in kept:
                 result[name] = records[name]
             for column, name in enumerate(("nx", "ny", "nz")):
                 result[name] = values["normals"][:, column]
-            for label in range(num_ids):
-                result[f"{VOTES}{label}"] = values["votes"][:, label]
+            for channel, label in enumerate(channels.ids):
+                result[f"{VOTES}{label}"] = values["votes"][:, channel]
             for name in ("label", "confidence", "state", "num_views"):
                 result[name] = values[name]
             counts[:] += np.bincount(values["state"], minlength=len(STATE_NAMES))

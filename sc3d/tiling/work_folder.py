@@ -27,7 +27,7 @@ class WorkFolder:
             sorted(
                 (name, str(value))
                 for name, value in asdict(settings).items()
-                if name not in ignored | {"output"}
+                if name not in ignored | {"output"} and not isinstance(value, Path)  # which are inputs
             )
         ]
         state = hashlib.sha256(
@@ -64,8 +64,10 @@ class WorkFolder:
 
 
 def _identity(path: Path) -> tuple:
-    """Of a file, or of all files of a folder: names, sizes and times."""
+    """Of a file, or of all files of a folder: names from there on, sizes and times; wherever it lies."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    return str(path), tuple(
-        (str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file()
+    return path.name, tuple(
+        (file.relative_to(path).as_posix(), file.stat().st_size, file.stat().st_mtime_ns)
+        for file in files
+        if file.is_file()
     )

@@ -200,7 +200,9 @@ def _read_sidecars(folder: Path) -> object:
     from sc3d.scene.scene import Scene
 
     record = {"stage": "label", "settings": {"consensus": 0.66}, "inputs": {"cloud.ply": "00"}}
-    return _finished(record, [folder / "seeds.ply"]), load_report_data(Scene(folder)).records
+    return _finished(record, [folder / "seeds.ply"], Scene(folder), set()), load_report_data(
+        Scene(folder)
+    ).records
 
 
 def _read_weights(folder: Path) -> object:

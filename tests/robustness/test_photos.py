@@ -29,6 +29,7 @@ from sc3d.io.orientation import turned
 from sc3d.io.provenance import digest
 from sc3d.io.readable_photos import readable_photos
 from sc3d.scene.scene import Scene, check_photos
+from sc3d.settings.reconstruction import Reconstruct
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import scene_data
 from sc3d.stages.reconstruct import prepare
@@ -126,7 +127,7 @@ def test_photos_that_are_cut_off_are_refused_at_the_start(tmp_path, name):
     content = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(content[: len(content) * 3 // 4])
     with pytest.raises(InputError, match=f"{name}.*(cut off|damaged)"):
-        prepare(tmp_path, Scene(tmp_path.parent / "scene"))
+        prepare(tmp_path, Scene(tmp_path.parent / "scene"), Reconstruct())
 
 
 @pytest.mark.parametrize(
@@ -150,7 +151,7 @@ def test_other_formats_are_counted(tmp_path, caplog):
     for number in range(5):
         (tmp_path / f"IMG_{number}.HEIC").write_bytes(b"x")
     Image.fromarray(pixels()).save(tmp_path / "c.webp")
-    prepare(tmp_path, Scene(tmp_path.parent / "scene"))
+    prepare(tmp_path, Scene(tmp_path.parent / "scene"), Reconstruct())
     assert "left out 6 of a format that is not read" in caplog.text and "IMG_0.HEIC" in caplog.text
     for name in ("a", "b"):
         (tmp_path / f"{name}.jpg").unlink()
@@ -162,7 +163,7 @@ def test_pages_are_counted(tmp_path, caplog):
     photo = Image.fromarray(pixels())
     for name in ("a", "b"):
         photo.save(tmp_path / f"{name}.tif", save_all=True, append_images=[photo])
-    prepare(tmp_path, Scene(tmp_path.parent / "scene"))
+    prepare(tmp_path, Scene(tmp_path.parent / "scene"), Reconstruct())
     assert "2 TIFF files have several pages, of which the first is used" in caplog.text
 
 
@@ -170,10 +171,10 @@ def test_tiny_and_huge_photos_are_refused(tmp_path):
     for name, size in (("a", SIZE), ("b", SIZE), ("dot", (1, 1))):
         Image.new("RGB", size).save(tmp_path / f"{name}.png")
     with pytest.raises(InputError, match=r"dot.png is smaller than 16 px: take it out"):
-        prepare(tmp_path, Scene(tmp_path.parent / "scene"))
+        prepare(tmp_path, Scene(tmp_path.parent / "scene"), Reconstruct())
     Image.new("1", (20_000, 20_000)).save(tmp_path / "dot.png")
     with pytest.raises(InputError, match="megapixels"):
-        prepare(tmp_path, Scene(tmp_path.parent / "scene"))
+        prepare(tmp_path, Scene(tmp_path.parent / "scene"), Reconstruct())
 
 
 # depth
@@ -224,10 +225,10 @@ def test_other_depths_are_refused_at_the_start(tmp_path, kind):
         Image.fromarray(pixels()).save(tmp_path / f"{name}.jpg")
     cv2.imwrite(str(tmp_path / "c.tif"), pixels()[..., 0].astype(kind))
     with pytest.raises(InputError, match=r"c.tif.*(floating point|32 bits|8 or 16)"):
-        prepare(tmp_path, Scene(tmp_path.parent / "scene"))
+        prepare(tmp_path, Scene(tmp_path.parent / "scene"), Reconstruct())
     cv2.imwrite(str(tmp_path / "c.tif"), pixels().astype(kind))
     with pytest.raises(InputError, match=r"c.tif.*(floating point|32 bits|8 or 16)"):
-        prepare(tmp_path, Scene(tmp_path.parent / "scene"))
+        prepare(tmp_path, Scene(tmp_path.parent / "scene"), Reconstruct())
 
 
 # alpha
@@ -312,7 +313,7 @@ def made_by_sc3d(path: Path, name: str) -> None:
 def test_a_scene_inside_the_folder_of_photos(tmp_path):
     photos = folder_of_photos(tmp_path / "photos")
     before, scene = digest(photos), Scene(photos / "out")
-    prepare(photos, scene)
+    prepare(photos, scene, Reconstruct())
     assert digest(scene.images) == before
     made_by_sc3d(scene.sparse.parent, "0")
     for name in ("train.jpg", "masks/a.png", "export/masks/b.png", "shot.png"):

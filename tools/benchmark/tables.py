@@ -267,7 +267,9 @@ def _fused(place: Place, masks: Masks, label: Label) -> Fusion:
     label = label.resolved
     cloud = with_density(place, label.voxel_size) if label.mechanisms.density else place.cloud
     surface = place.surface if label.depth_filter else None
-    return fuse(cloud, masks.views, masks.read, surface, place.num_ids, label)
+    fusion = fuse(cloud, masks.views, masks.read, surface, masks.channels.count, label)
+    ids = masks.channels.to_ids(fusion.labels.label)
+    return replace(fusion, labels=replace(fusion.labels, label=ids))
 
 
 def _propagated(

@@ -318,7 +318,7 @@ def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
 def _check_packages() -> None:
     try:
         import sklearn  # noqa: F401
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingPackageError(
             "the backend strokes needs scikit-learn: pip install scikit-learn"
         ) from None

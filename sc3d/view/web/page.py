@@ -161,7 +161,7 @@ def load_viser() -> ModuleType:
     """Import viser; MissingPackageError says how to install it."""
     try:
         import viser
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingPackageError("the viewer in the browser needs viser: pip install 'sc3d[web]'") from None
     return viser
 
