@@ -235,6 +235,7 @@ def packed(tmp_path_factory) -> Path:
     scene.classes.write_text(json.dumps([entry | {"asprs": 6 if entry["id"] == 1 else 3} for entry in table]))
     scene.strokes.mkdir()
     (scene.strokes / "photo_0.json").write_text('{"shapes": []}')
+    shutil.copytree(scene.sparse, scene.mapped)
     execute("train", scene, train.Train(iterations=2, max_gaussians=500, checkpoint_every=0))
     execute("label", scene, labels.Label())
     execute("propagate", scene, labels.Propagate())
@@ -242,7 +243,7 @@ def packed(tmp_path_factory) -> Path:
 
 
 STAGES = [
-    "synthesize", "reconstruct", "georeference", "train", "train blocks", "extract", "segment", "refine", "label",
+    "synthesize", "map photos", "reconstruct", "georeference", "train", "train blocks", "extract", "segment", "refine", "label",
     "label tiled", "propagate", "propagate tiled", "evaluate", "evaluate tiled", "report", "export",
 ]  # fmt: skip
 
@@ -257,6 +258,7 @@ def stage_runs() -> dict[str, tuple[str, object]]:
     place = {"epsg": 32632, "offset": (5e5, 5e6, 0.0)}
     return {
         "synthesize": ("synthesize", synthesize.Synthesize(views=2, width=64, num_points=500)),
+        "map photos": ("map_photos", reconstruction.Mapping()),
         "reconstruct": ("reconstruct", reconstruction.Reconstruct()),
         "georeference": ("georeference", reconstruction.GeoreferenceOptions(**place)),
         "train": ("train", train.Train(**small)),
@@ -285,8 +287,7 @@ def here(packed, monkeypatch):
     from sc3d.segmentation.mask_refinement import Refinement
     from sc3d.segmentation.segment import Segmentation
     from sc3d.segmentation.strokes.backend import Strokes
-    from sc3d.sfm import Reconstructed
-    from sc3d.stages import reconstruct
+    from sc3d.stages import map_photos
     from sc3d.tiling import evaluate, label, propagate
     from sc3d.tiling.executor import SerialExecutor
 
@@ -298,15 +299,15 @@ def here(packed, monkeypatch):
         monkeypatch.setattr(module, "open_executor", serial)
     model = load_model(packed / "sparse" / "0")
 
-    def cameras(images, names, sparse, settings, control_points):
-        write_model(sparse, model)
-        return Reconstructed({}, None)
+    def cameras(images, names, output, settings):
+        write_model(output, model)
+        return {}
 
     def segment(image):
         ones = np.ones(image.shape[:2], np.uint8)
         return Segmentation(ones, ones, ())
 
-    monkeypatch.setattr(reconstruct, "reconstruct", cameras)
+    monkeypatch.setattr(map_photos, "map_photos", cameras)
     monkeypatch.setattr(Strokes, "fit", lambda *_: SimpleNamespace(segment=segment))
     monkeypatch.setattr(Refinement, "helps", True)
     monkeypatch.setattr(report, "sections", lambda *_: [], raising=False)
