@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pycolmap
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.georeferencing.alignment import Similarity, camera_up, upside_down
 from sc3d.georeferencing.control_fit import MIN_POINTS, Accuracy, ControlFit, fit_control_points
 from sc3d.georeferencing.gcp_list import is_title, parse_crs, parse_mark, read_lines
 from sc3d.georeferencing.georeference import crs_to_geodetic, geodetic_to_enu
-from sc3d.georeferencing.gps import examples
 from sc3d.io.colmap import cam_from_world, registered_images
 from sc3d.io.crs import split_crs
 from sc3d.scene.photo_names import PhotoNames

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.georeferencing.alignment import (
     Similarity,
     fit_similarity_robust,
@@ -134,11 +134,6 @@ def _counted(reasons: dict[str, str]) -> str:
     kinds.pop("without a position", None)
     parts = [f"{len(found)} {why}: {examples(found)}" for why, found in kinds.items()]
     return f" ({'; '.join(parts)})" if parts else ""
-
-
-def examples(names: list[str], most: int = 3) -> str:
-    """The first few of some names, and how many more there are."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _astray(tags: dict[str, Geotag]) -> frozenset[str]:

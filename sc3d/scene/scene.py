@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_NUM_EXAMPLES = 3  # photos that a line names
-
 
 @dataclass(frozen=True)
 class Scene:
@@ -256,14 +254,12 @@ class Scene:
             unplaced |= names
             counts += [f"{folder.name} {len(names)}"] if names else []
         if unplaced:
-            examples = ", ".join(sorted(unplaced)[:_NUM_EXAMPLES])
             logger.warning(
                 "%d photos have no camera, as they did not register: "
-                "what belongs to them is left out (%s), such as %s%s",
+                "what belongs to them is left out (%s), such as %s",
                 len(unplaced),
                 ", ".join(counts),
-                examples,
-                " ..." if len(unplaced) > _NUM_EXAMPLES else "",
+                examples(sorted(unplaced)),
             )
 
 
