@@ -141,7 +141,9 @@ def _cut(workload: FusionWorkload, num_points: int | None, num_views: int) -> Fu
 
 def _label(workload: FusionWorkload) -> Fusion:
     settings = Label(voxel_size=workload.voxel_size)
-    return fuse(workload.cloud, workload.views, workload.read, workload.surface, workload.num_channels, settings)
+    return fuse(
+        workload.cloud, workload.views, workload.read, workload.surface, workload.num_channels, settings
+    )
 
 
 def _propagate(workload: FusionWorkload, fusion: Fusion) -> Labels:
