@@ -23,4 +23,5 @@ def left_out(names: Sequence[object], total: int, what: str) -> str:
 def examples(names: Sequence[object], most: int = 3) -> str:
     """The first few of some names, and how many more there are, for a line about what is left out."""
     rest = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(str(name) for name in names[:most]) + rest
+    first = [name if (name := str(each)).isprintable() else repr(name) for each in names[:most]]
+    return ", ".join(first) + rest

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.geometry.cameras import View
 from sc3d.georeferencing.georeference import georeference_path
-from sc3d.importers.project import Project, require_found, some_names
+from sc3d.importers.project import Project, require_found
 from sc3d.io.colmap import (
     cam_from_world,
     copy_cameras,
@@ -131,5 +131,5 @@ def _warn_of_others(path: Path, chosen: Path) -> None:
         len(names),
         ", ".join(told),
         len(lost),
-        f" ({some_names(lost)}): import that folder itself for these" if lost else "",
+        f" ({examples(lost)}): import that folder itself for these" if lost else "",
     )

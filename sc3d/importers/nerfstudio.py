@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, Lenses
 from sc3d.importers.photos import names_in, photo_folder, plain_name
-from sc3d.importers.project import Project, rigid, some_names
+from sc3d.importers.project import Project, rigid
 from sc3d.io.clouds import read_cloud
 from sc3d.io.images import image_size
 from sc3d.io.json_files import read_json
@@ -110,7 +110,7 @@ def _warn_of_others(path: Path, file: Path) -> None:
     """Blender's synthetic scenes have their photos in three files."""
     others = sorted(other.name for other in file.parent.glob("transforms_*.json") if other != file)
     if path.is_dir() and file.name != FILES[0] and others:
-        logger.warning("%s: only %s is read, left out: %s", path, file.name, some_names(others))
+        logger.warning("%s: only %s is read, left out: %s", path, file.name, examples(others))
 
 
 def _poses(content: dict, file: Path) -> list[np.ndarray]:
@@ -157,7 +157,7 @@ def _warn_of_lenses(content: dict, file: Path) -> None:
             file,
             len(ignored),
             len(frames),
-            some_names(ignored),
+            examples(ignored),
         )
     if any(any(table.get("rolling_shutter") or []) for table in (content, *frames)):
         logger.warning("%s: its photos have a rolling shutter: each is read as if exposed at once", file)

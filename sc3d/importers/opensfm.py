@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, Lenses, NoModelError
 from sc3d.georeferencing.gcp_list import parse_crs
 from sc3d.georeferencing.georeference import Georeference, from_origin, triple
-from sc3d.importers.project import Project, require_found, rigid, some_names
+from sc3d.importers.project import Project, require_found, rigid
 from sc3d.io.json_files import read_json
 from sc3d.settings.reconstruction import Import
 
@@ -113,7 +113,7 @@ def _warn_of_others(parts: list[dict], taken: dict, file: Path) -> None:
             len(taken["shots"]),
             ", ".join(str(len(part["shots"])) for part in others),
             len(lost),
-            f" ({some_names(lost)})" if lost else "",
+            f" ({examples(lost)})" if lost else "",
         )
 
 

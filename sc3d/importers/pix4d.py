@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import pyproj
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.geometry.cameras import View
 from sc3d.geometry.distortion import DistortionModel, Lenses
 from sc3d.georeferencing.georeference import Georeference, triple
 from sc3d.importers.frames import LARGE, near_origin
-from sc3d.importers.project import Project, require_found, rigid, some_names
+from sc3d.importers.project import Project, require_found, rigid
 from sc3d.io.crs import split_crs
 from sc3d.settings.reconstruction import Import
 
@@ -87,7 +87,7 @@ def _file(path: Path) -> Path | None:
 def _warn_of_others(path: Path, file: Path) -> None:
     others = [other.name for other in _files(path) if other != file]
     if others:
-        logger.warning("%s: only %s is read, left out: %s", path, file.name, some_names(others))
+        logger.warning("%s: only %s is read, left out: %s", path, file.name, examples(others))
 
 
 def _read_text(file: Path) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
@@ -12,7 +12,7 @@ from types import ModuleType
 import numpy as np
 import pycolmap
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.geometry.cameras import View
 from sc3d.georeferencing.georeference import Georeference, read_georeference
 from sc3d.io.limits import FARTHEST
@@ -90,14 +90,8 @@ def warn_of_left_out(project: Project, path: Path) -> None:
 
 def _told(project: Project) -> str:
     return "; ".join(
-        f"{len(names)} {reason} ({some_names(names)})" for reason, names in project.left_out.items()
+        f"{len(names)} {reason} ({examples(names)})" for reason, names in project.left_out.items()
     )
-
-
-def some_names(names: Sequence[str]) -> str:
-    """The first names of a list, for messages."""
-    first = [name if name.isprintable() else repr(name) for name in names[:3]]
-    return ", ".join(first) + (", ..." if len(names) > 3 else "")
 
 
 def read_project(path: Path, settings: Import) -> Project:

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
 from sc3d.importers.clouds import CLOUDS, MESHES, UNREAD, is_mesh, read_geometry, to_open3d
 from sc3d.importers.frames import frame_of_scene, near_origin, place_geometries
 from sc3d.importers.model import write_project
 from sc3d.importers.photos import locate_photos
-from sc3d.importers.project import Project, project_files, read_project, some_names, warn_of_left_out
+from sc3d.importers.project import Project, project_files, read_project, warn_of_left_out
 from sc3d.io.atomic import require_writable
 from sc3d.io.clouds import write_geometry
 from sc3d.io.images import find_photos, require_place
@@ -66,7 +66,7 @@ def _without_camera(project: Project, photos: Path | None) -> dict[str, object]:
         return {}
     used = {view.name for view in project.views}
     names = [name for photo in find_photos(photos) if (name := photo_name(photo, photos)) not in used]
-    return {"photos_without_camera": f"{len(names)} ({some_names(names)})"} if names else {}
+    return {"photos_without_camera": f"{len(names)} ({examples(names)})"} if names else {}
 
 
 def run(scene: Scene, settings: Import) -> dict[str, object]:
