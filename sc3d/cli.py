@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import logging
+import os
+import re
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,13 +20,18 @@ from tyro.conf import OmitArgPrefixes, Positional
 from sc3d.commands import COMMANDS, MODULES, STAGES
 from sc3d.commands.renamed import MOVED, current
 from sc3d.errors import InputError, Sc3dError
+from sc3d.io.requirements import explain
+
+# numba reads it in whatever folder a command is called, also in a scene of somebody else
+NUMBA_FILE = ".numba_config.yaml"
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and exit: 0 done, 1 failed, 2 bad input, 130 interrupted by Ctrl-C."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = expanded(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
-        sys.stdout.write(usage())
+        with ending_with_reader():
+            sys.stdout.write(usage())
         sys.exit(0 if arguments else 2)
     name = arguments[0]
     if name in MOVED:
@@ -33,20 +40,64 @@ def main(arguments: list[str] | None = None) -> None:
         )
     if name not in STAGES and name not in COMMANDS:
         sys.exit(_fail(f"unknown command {name!r}: one of {', '.join(sorted(STAGES | COMMANDS))}"))
+    if Path(NUMBA_FILE).exists():
+        sys.exit(
+            _fail(
+                f"{Path(NUMBA_FILE).absolute()} would tell numba where to load code from: start sc3d in another folder"
+            )
+        )
     start_logging()
-    command = parse(name, current(arguments[1:]))
+    with ending_with_reader():
+        command = parse(name, current(arguments[1:]))
     with reporting_errors():
         _dispatch(name, command)
 
 
+def expanded(arguments: list[str]) -> list[str]:
+    """Arguments with `~` at the start of a path as the home folder, which shells leave in `--masks=~/masks`."""
+    found = [re.fullmatch(r"(--[\w.-]+=)?(~(?:/.*)?)", argument) for argument in arguments]
+    return [
+        (match[1] or "") + os.path.expanduser(match[2]) if match else argument
+        for match, argument in zip(found, arguments, strict=True)
+    ]
+
+
 def start_logging() -> None:
-    """Log to stderr, of other packages warnings only; `sc3d ... | head` ends quietly."""
-    if hasattr(signal, "SIGPIPE"):  # not on Windows
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    logging.basicConfig(format="%(message)s", stream=sys.stderr)
+    """Log to stderr, of other packages warnings only."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(PlainText("%(message)s"))
+    logging.basicConfig(handlers=[handler])
     for package in ("sc3d", "tools"):
         logging.getLogger(package).setLevel(logging.INFO)
     logging.captureWarnings(True)
+
+
+class PlainText(logging.Formatter):
+    """Names of photos and classes may hold what a terminal takes for commands."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
+
+
+def printable(text: str) -> str:
+    """Text without control characters, but for line feeds and tabs."""
+    return re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "?", text)
+
+
+@contextmanager
+def ending_with_reader() -> Iterator[None]:
+    """For what is printed: `sc3d --help | head` ends quietly. Not for more than that: a server whose visitor
+    leaves, or a command whose worker dies, must not end.
+    """
+    if not hasattr(signal, "SIGPIPE"):  # Windows
+        yield
+        return
+    before = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        signal.signal(signal.SIGPIPE, before or signal.SIG_DFL)
 
 
 @contextmanager
@@ -58,8 +109,15 @@ def reporting_errors() -> Iterator[None]:
         sys.exit(_fail(str(error)))
     except PermissionError as error:
         sys.exit(_fail(f"no permission for {error.filename}: check its permissions or choose another folder"))
-    except (Sc3dError, OSError, MemoryError) as error:
-        sys.exit(_fail(f"{error or type(error).__name__}", status=1))
+    except Sc3dError as error:
+        sys.exit(_fail(str(error), status=1))
+    except (OSError, MemoryError) as error:
+        sys.exit(_fail(explain(error) or str(error) or type(error).__name__, status=1))
+    except (ImportError, AttributeError, RuntimeError) as error:
+        reason = explain(error)
+        if reason is None:
+            raise
+        sys.exit(_fail(reason, status=1))
     except KeyboardInterrupt:
         sys.exit(
             _fail(
@@ -119,5 +177,6 @@ def _dispatch(name: str, command: Any) -> None:
 
 
 def _fail(message: str, status: int = 2) -> int:
-    sys.stderr.write(f"sc3d: {' '.join(message.split())}\n")
+    with suppress(BrokenPipeError):
+        sys.stderr.write(f"sc3d: {printable(' '.join(message.split()))}\n")
     return status

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,12 +13,12 @@ import numpy as np
 import open3d as o3d
 from tqdm import tqdm
 
-from sc3d.errors import Sc3dError
+from sc3d.errors import Sc3dError, left_out
 from sc3d.geometry.cameras import View
 from sc3d.geometry.neighbors import orient_normals
 from sc3d.geometry.raycast import FirstSurface, Surface, first_surface
 from sc3d.geometry.tsdf import DepthFusion, Part, cloud_in_order, drop_small_parts, near_mesh, pixel_squares
-from sc3d.io.atomic import temporary_name
+from sc3d.io.atomic import require_room, temporary_name
 from sc3d.settings.reconstruction import Extract
 from sc3d.splatting.consistency import blocking, consistent, pixel_rays
 from sc3d.splatting.evaluation import facing_depth
@@ -32,6 +33,8 @@ CELLS, AROUND = 64, 6  # cells along the map, and how many of them on each side 
 NADIR_SPREAD = 20.0  # degrees
 OBLIQUE_COVERAGE = 0.97
 LOOSE = 4.0  # px; how far two views may disagree where nothing better is known
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -56,16 +59,21 @@ class DepthViews:
     views: pinhole; image: index to (H, W, 3) uint8 RGB of the view's size
     neighbors: per view, rows of views that see the same surface; depth_range: nearest and farthest depth,
         world units
+    opaque: index to (H, W) bool pixels whose depth counts, None = all
     """
 
     views: list[View]
     image: Callable[[int], np.ndarray]
     neighbors: list[np.ndarray]
     depth_range: tuple[float, float]
+    opaque: Callable[[int], np.ndarray | None] = lambda row: None
 
 
 def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -> Surfaces:
     """Fuse the rendered depth of all views; raises Sc3dError where the views show or share no surface."""
+    # depth, and what is sure of it
+    size = 8 * sum(view.width * view.height for view in data.views)
+    require_room(Path(tempfile.gettempdir()) / "depth", size)
     with tempfile.TemporaryDirectory(prefix=temporary_name("sc3d-depth")) as folder:
         maps = _DepthMaps(Path(folder), data)
         footprint = maps.render(gaussians)
@@ -79,7 +87,7 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
         for accept in (_agreed, _unopposed, _plausible):
             if _coverage(_joined(parts)[0], data.views) >= wanted:
                 break
-            for turn in range(ROUNDS):
+            for turn in range(min(ROUNDS, len(data.views))):
                 parts.append(
                     _complete(
                         maps, _joined(parts)[0], voxel_size, range(turn, len(data.views), ROUNDS), accept
@@ -124,7 +132,13 @@ def _fused(
 
 def _part(fusion: DepthFusion) -> Part:
     """Mesh and cloud of a field, without floaters."""
-    mesh, cloud = drop_small_parts(fusion.mesh(), MIN_PART), fusion.cloud()
+    whole, cloud = fusion.mesh(), fusion.cloud()
+    mesh = drop_small_parts(whole, MIN_PART)
+    total = len(whole.triangle.indices)
+    if dropped := total - len(mesh.triangle.indices):
+        logger.info(
+            "%d of %d triangles are left out: in loose parts of fewer than %d", dropped, total, MIN_PART
+        )
     if not len(mesh.triangle.indices):
         return mesh, cloud.select_by_index(o3d.core.Tensor(np.empty(0, np.int64)))
     return mesh, cloud.select_by_mask(
@@ -271,13 +285,20 @@ class _DepthMaps:
 
     def render(self, gaussians: Gaussians) -> float:
         """Write all maps; returns the median size of a pixel on the surface, world units."""
-        footprints = []
+        footprints, empty = [], list[str]()
         for row, view in enumerate(tqdm(self.data.views, desc="depth", unit="view", disable=None)):
             depth, (nearest, farthest) = facing_depth(gaussians, view, MAX_ANGLE), self.data.depth_range
             depth[(depth <= nearest) | (depth >= farthest)] = 0
+            opaque = self.data.opaque(row)
+            if opaque is not None:
+                depth[~opaque] = 0
             np.save(self.folder / f"{row}.npy", depth)
-            if (depth > 0).any():
+            if not (depth > 0).any():
+                empty.append(view.name)
+            else:
                 footprints.append(float(np.median(depth[depth > 0])) / view.focal)
+        if empty and footprints:
+            logger.warning(left_out(empty, len(self.data.views), "photos show no surface and are not fused"))
         if not footprints:
             raise Sc3dError("no view shows a surface: train longer, or check the cameras")
         return float(np.median(footprints))

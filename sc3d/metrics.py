@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,15 +14,17 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
+from sc3d.errors import left_out
 from sc3d.geometry.cameras import View
 from sc3d.geometry.raycast import FirstSurface
-from sc3d.io.images import read_index_image
 from sc3d.io.json_files import write_json
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Evaluate
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -250,15 +253,16 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
     table, truth_files = scene.class_table(), truth_masks(scene, settings)
     mask_files = scene.mask_files(scene.masks, table) if scene.masks.is_dir() else {}
     views = [view for view in scene.model.views if view.name in truth_files]
+    _tell_of_left_out(scene, [view.name for view in views], mask_files)
     per_photo, reliabilities = {}, []
     for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
-        truth = read_index_image(truth_files[view.name])
+        truth = scene.read_mask(truth_files[view.name], view.name)
         rows, first = surface.rows(view, truth.shape[::-1], truth > 0)
         pixels = EvaluationPixels.from_photo(truth, rows, depth_edge_band(first.range, settings.band))
         near, elsewhere = pixels.confusions(pixels.look_up(labels.label), table.num_ids)
         found = {"labels": near + elsewhere, "labels_near_edges": near, "labels_elsewhere": elsewhere}
         if view.name in mask_files:
-            mask = read_index_image(mask_files[view.name])
+            mask = scene.read_mask(mask_files[view.name], view.name)
             mask = cv2.resize(mask, truth.shape[::-1], interpolation=cv2.INTER_NEAREST)
             found["masks"] = Confusion.from_labels(truth, mask, table.num_ids)
         per_photo[view.name] = found
@@ -277,6 +281,18 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
         metrics | {"reliability": overall.summary() if overall else {}, "per_photo": photos},
     )
     return EvaluationSummary(totals, overall.ece if overall else None)
+
+
+def _tell_of_left_out(scene: Scene, judged: list[str], mask_files: dict[str, Path]) -> None:
+    names = [view.name for view in scene.model.views]
+    untold = sorted(set(names) - set(judged))
+    bare = [name for name in judged if name not in mask_files]
+    if untold:
+        logger.info(left_out(untold, len(names), "photos have no truth and are not judged"))
+    if mask_files and bare:
+        logger.warning(
+            left_out(bare, len(judged), "photos with truth have no mask; masks are judged without")
+        )
 
 
 def truth_masks(scene: Scene, settings: Evaluate) -> dict[str, Path]:

@@ -4,25 +4,28 @@ A stage module `sc3d/stages/<name>.py` offers three functions of (scene, setting
     inputs   -> paths whose content decides whether the stage must run again
     outputs  -> paths that it writes
     run      -> does the work; returns the figures for the summary and the sidecar
+and, where that is not all, one more:
+    besides  -> folders that it writes into without being known by them
 Stages never import one another; `execute` below is what they share: skip finished work, time it, write the
 sidecars.
 """
 
 from __future__ import annotations
 
-import errno
 import importlib
 import logging
+import os
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, fields
-from pathlib import Path
+from itertools import zip_longest
+from pathlib import Path, PurePath
 from typing import Any
 
 from sc3d.errors import InputError, Sc3dError
-from sc3d.io.atomic import remove_leftovers, require_inside, temporary_name
+from sc3d.io.atomic import full_folder, remove_leftovers, require_inside, require_writable, temporary_name
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.provenance import digest, peak_memory_mb, reset_peak_memory, versions
 from sc3d.scene.scene import Scene
@@ -36,23 +39,25 @@ MAX_SIDECAR = 64 << 20  # bytes: names of all photos may be in it
 def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) -> dict[str, object]:
     """Run one stage unless its outputs are up to date; returns its summary.
 
-    Up to date: every output and its sidecar exist, made by the same settings from inputs of the same content.
+    Up to date: every output and its sidecar exist, made by the same settings from inputs of the same content,
+    wherever the scene and they lie and however they are spelled.
     """
     stage = importlib.import_module(f"sc3d.stages.{name}")
     record: dict[str, Any] = {
         "stage": name,
-        "settings": _decisive(settings),
-        "inputs": {str(path): digest(path) for path in stage.inputs(scene, settings)},
+        "settings": _decisive(settings, scene),
+        "inputs": {_portable(path, scene): digest(path) for path in stage.inputs(scene, settings)},
     }
     outputs = stage.outputs(scene, settings)
-    previous = _finished(record, outputs)
+    previous = _finished(record, outputs, scene, _path_fields(settings))
     if previous is not None and not overwrite:
         logger.info("%s: up to date (--overwrite runs it again)", name)
         return previous["summary"]
-    _prepare(scene, outputs)
+    besides = stage.besides(scene, settings) if hasattr(stage, "besides") else []
+    _prepare(scene, outputs, besides)
     started = time.perf_counter()
     reset_peak_memory()
-    with _replacing(outputs), _room(scene):
+    with _replacing(outputs), _room(scene, outputs):
         summary = _plain(stage.run(scene, settings))
     record |= {
         "versions": versions(),
@@ -60,17 +65,21 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
         "peak_memory_mb": peak_memory_mb(),
         "summary": summary,
     }
-    with _room(scene):
+    with _room(scene, outputs):
         for output in outputs:
             write_json(sidecar(output), record)
     _report(name, record, outputs)
     return summary
 
 
-def _prepare(scene: Scene, outputs: list[Path]) -> None:
-    """Refuse outputs that would be written through a link to elsewhere; remove what killed runs left behind."""
+def _prepare(scene: Scene, outputs: list[Path], besides: list[Path]) -> None:
+    """Refuse outputs that cannot be written, or only through a link to elsewhere; remove what killed runs left
+    behind.
+    """
     for output in outputs:
-        require_inside(scene.path, output)
+        require_writable(output.parent)
+    for path in [*outputs, *besides]:
+        require_inside(scene.path, path)
     for folder in {scene.path, Path(tempfile.gettempdir()), *outputs, *(output.parent for output in outputs)}:
         remove_leftovers(folder)
 
@@ -109,25 +118,44 @@ def _identity(path: Path) -> tuple[int, ...] | None:
 
 
 @contextmanager
-def _room(scene: Scene) -> Iterator[None]:
-    """Say that the disk is full where it is, in whatever words a library puts it."""
+def _room(scene: Scene, outputs: list[Path]) -> Iterator[None]:
+    """Say that a disk is full and which, in whatever words a library puts it: that of the file that was written,
+    or of the scene, the outputs or the temporary files.
+    """
     try:
         yield
     except (OSError, RuntimeError) as error:
-        if getattr(error, "errno", None) not in (errno.ENOSPC, errno.EDQUOT) and "disk is full" not in str(
-            error
-        ):
+        folders = [scene.path, *(output.parent for output in outputs), Path(tempfile.gettempdir())]
+        full = full_folder(error, folders)
+        if full is None:
             raise
-        name = getattr(error, "filename", None)
+        hint = (
+            ", or let TMPDIR name a folder with more room for temporary files" if full == folders[-1] else ""
+        )
         raise Sc3dError(
-            f"no space left in {Path(name).parent if name else scene.path}: make room and run the same command again; finished work is kept"
+            f"no space left in {full}: make room{hint}, and run the same command again; finished work is kept"
         ) from error
 
 
-def _decisive(settings: Any) -> dict[str, object]:
-    """The settings without those that no result depends on."""
+def _decisive(settings: Any, scene: Scene) -> dict[str, object]:
+    """The settings without those that no result depends on; paths as `_portable` has them."""
     ignored = {field.name for field in fields(Resources)} if isinstance(settings, Workers) else set()
-    return {name: value for name, value in _plain(asdict(settings)).items() if name not in ignored}
+    return {name: _plain(value, scene) for name, value in asdict(settings).items() if name not in ignored}
+
+
+def _path_fields(settings: Any) -> set[str]:
+    return {field.name for field in fields(settings) if "Path" in str(field.type)}
+
+
+def _portable(path: Path, scene: Scene) -> str:
+    """Relative to the scene folder for what lies in it, by name or by links, so that it may be moved and called
+    by any path; else absolute.
+    """
+    for convert in (os.path.abspath, os.path.realpath):
+        inside = PurePath(convert(path))
+        if inside.is_relative_to(convert(scene.path)):
+            return inside.relative_to(convert(scene.path)).as_posix()
+    return os.path.abspath(path)
 
 
 def sidecar(output: Path) -> Path:
@@ -135,7 +163,7 @@ def sidecar(output: Path) -> Path:
     return output.with_name(output.name + ".json")
 
 
-def _finished(record: dict, outputs: list[Path]) -> dict | None:
+def _finished(record: dict, outputs: list[Path], scene: Scene, paths: set[str]) -> dict | None:
     found: dict | None = None
     for output in outputs:
         try:
@@ -145,9 +173,62 @@ def _finished(record: dict, outputs: list[Path]) -> dict | None:
         if not isinstance(read, dict) or not isinstance(read.get("summary"), dict):
             return None
         found = read
-        if not output.exists() or any(found.get(key) != value for key, value in record.items()):
+        if not output.exists() or not _is_same_work(found, record, scene, paths):
             return None
     return found
+
+
+def _is_same_work(found: dict, record: dict, scene: Scene, paths: set[str]) -> bool:
+    """Whether a sidecar tells of what `record` asks for. Inputs count by their content, and settings that are
+    `paths` by the inputs that they name: sidecars of earlier versions hold them as they were typed.
+    """
+    inputs, settings = found.get("inputs"), found.get("settings")
+    if (
+        found.get("stage") != record["stage"]
+        or not isinstance(inputs, dict)
+        or not isinstance(settings, dict)
+    ):
+        return False
+    if (
+        list(inputs.values()) != list(record["inputs"].values())
+        or settings.keys() != record["settings"].keys()
+    ):
+        return False
+    if not all(
+        PurePath(before).name == PurePath(now).name or _is_same_file(before, now, scene)
+        for before, now in zip(inputs, record["inputs"], strict=True)
+    ):
+        return False
+    return all(
+        settings[name] == value
+        or name == "output"  # which the sidecar lies beside
+        or (name in paths and _names_same(settings[name], value, (inputs, record["inputs"]), scene))
+        for name, value in record["settings"].items()
+    )
+
+
+def _names_same(before: object, now: object, inputs: tuple[dict, dict], scene: Scene) -> bool:
+    """Whether two values of a setting name the same: inputs, whose content is the same, or one file."""
+    listed = [list(value) if isinstance(value, list) else [value] for value in (before, now)]
+    return all(
+        (_names_input(first, inputs[0]) and _names_input(second, inputs[1]))
+        or (isinstance(first, str) and isinstance(second, str) and _is_same_file(first, second, scene))
+        for first, second in zip_longest(*listed)
+    )
+
+
+def _names_input(value: object, inputs: dict[str, str]) -> bool:
+    """Whether a path is an input or a folder of inputs; None stands for the scene's own."""
+    return value is None or any(
+        key == value or PurePath(str(value)) in PurePath(key).parents for key in inputs
+    )
+
+
+def _is_same_file(before: str, now: str, scene: Scene) -> bool:
+    """before: as a sidecar has it; now: as `_portable` has it."""
+    with suppress(OSError, ValueError):
+        return os.path.samefile(before, scene.path / now)
+    return False
 
 
 def _report(name: str, record: dict, outputs: list[Path]) -> None:
@@ -157,12 +238,14 @@ def _report(name: str, record: dict, outputs: list[Path]) -> None:
     logger.info("\n".join(lines))
 
 
-def _plain(value: Any) -> Any:
-    """JSON-ready copy: paths as text, tuples as lists, numpy scalars as numbers."""
+def _plain(value: Any, scene: Scene | None = None) -> Any:
+    """JSON-ready copy: paths as text (with a scene, as `_portable` has them), tuples as lists, numpy scalars as
+    numbers.
+    """
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _plain(item, scene) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [_plain(item, scene) for item in value]
     if isinstance(value, Path):
-        return str(value)
+        return str(value) if scene is None else _portable(value, scene)
     return value.item() if hasattr(value, "item") else value

@@ -1,8 +1,8 @@
 """HTTP for the annotation page, on the loopback address only.
 
-What keeps others out: the Host header must name this server (a foreign name that resolves to 127.0.0.1 does
-not), requests that a browser marks as coming from another site are refused, and whatever writes or computes
-must come from the page's own origin and carry the token that only this page was given. Photos are found by
+What keeps others out: requests under another name or from another page are refused (`sc3d.io.local_page`),
+and whatever writes or computes must come from the page's own origin and carry the token that only this page
+was given. Photos are found by
 their names in a list, never by a path.
 """
 
@@ -22,6 +22,7 @@ from urllib.parse import unquote, urlsplit
 
 from sc3d.annotate.session import BusyError, Session
 from sc3d.errors import InputError
+from sc3d.io.local_page import LocalPage
 
 logger = logging.getLogger(__name__)
 
@@ -81,7 +82,7 @@ class AnnotationServer(ThreadingHTTPServer):
             raise InputError(
                 f"no free port from {port} to {port + PORTS_TRIED - 1}: choose another with --port"
             )
-        self.hosts = {f"{name}:{self.server_port}" for name in (ADDRESS, "localhost")}
+        self.page = LocalPage(port=self.server_port)
 
     @property
     def url(self) -> str:
@@ -151,13 +152,12 @@ class Handler(BaseHTTPRequestHandler):
         return _to_json({"saved": self.server.session.save(stem, content)})
 
     def _check_origin(self) -> None:
-        if self.headers.get("Host", "") not in self.server.hosts:
-            raise Refusal(HTTPStatus.FORBIDDEN, f"this page is served at {self.server.url} only")
-        if self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
-            raise Refusal(HTTPStatus.FORBIDDEN, "requests from other sites are refused")
+        refusal = self.server.page.refusal(self.headers)
+        if refusal is not None:
+            raise Refusal(HTTPStatus.FORBIDDEN, refusal)
 
     def _check_token(self) -> None:
-        if self.headers.get("Origin", "") != f"http://{self.headers['Host']}":
+        if not self.server.page.is_own_origin(self.headers):
             raise Refusal(HTTPStatus.FORBIDDEN, "requests from other origins are refused")
         if not hmac.compare_digest(self.headers.get("X-Token", "").encode(), self.server.token.encode()):
             raise Refusal(HTTPStatus.FORBIDDEN, "the page is of an earlier start of the server: reload it")

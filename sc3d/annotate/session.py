@@ -12,12 +12,14 @@ import cv2
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import find_photos, image_size, read_image
+from sc3d.io.atomic import require_inside
+from sc3d.io.images import find_photos, read_image, require_within
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.provenance import digest
+from sc3d.scene.photo_names import PhotoNames, photo_name
 from sc3d.scene.scene import Scene
 from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, shrink
-from sc3d.segmentation.strokes.files import BACKGROUND, parse_shapes
+from sc3d.segmentation.strokes.files import BACKGROUND, read_shapes, shown_size
 
 DISPLAY_SIZE = 4096  # px, longest side of the photo in the browser
 TRIAL_SIZE = 2048  # px, longest side of the mask that is tried out
@@ -35,41 +37,44 @@ class Session:
     def __init__(self, scene: Scene, start: str | None = None, settings: StrokesSettings = QUICK) -> None:
         """Look at everything first, so that errors come before the page.
 
-        start: name or stem of the photo to show first
+        start: name of the photo to show first; its suffix and folders may be missing where that is clear
         Raises InputError if the scene lacks photos, classes or that photo, or holds strokes that cannot be
         read.
         """
         scene.require(scene.classes, scene.images, hint="the page needs classes.json and images/")
+        require_inside(scene.path, scene.strokes / "any.json")
         self._scene = scene
         self._settings = settings
         self.class_table = scene.class_table()
-        self.photos = {photo.stem: photo for photo in find_photos(scene.images)}
-        self.sizes = {stem: image_size(photo) for stem, photo in self.photos.items()}
-        self._start = next(iter(self.photos)) if start is None else Path(start).stem
-        if self._start not in self.photos:
-            raise InputError(
-                f"no photo {start!r} in {scene.images}: one of {', '.join(list(self.photos)[:5])} ..."
-            )
+        photos = find_photos(scene.images)
+        self._names = PhotoNames(photo_name(photo, scene.images) for photo in photos)
+        self.photos = dict(zip(map(self._names.key, self._names.names), photos, strict=True))
+        self.sizes = {key: shown_size(photo) for key, photo in self.photos.items()}
+        self._start = (
+            next(iter(self.photos))
+            if start is None
+            else self._names.key(self._names.one(start, scene.images))
+        )
         self._trying, self._writing = threading.Lock(), threading.Lock()
         self._learned: tuple[str, Strokes] | None = None
         self._jpeg = lru_cache(maxsize=4)(self._encode)
-        for stem in self.photos:
-            self.read(stem)
+        for key in self.photos:
+            self.read(key)
 
     def describe(self) -> dict[str, object]:
         """Everything the page shows at its start, as JSON."""
         classes = [{"name": entry.name, "color": list(entry.color)} for entry in self.class_table]
         classes.append({"name": BACKGROUND, "color": [255, 0, 200]})
         photos = []
-        for stem, photo in self.photos.items():
-            width, height = self.sizes[stem]
+        for key, photo in self.photos.items():
+            width, height = self.sizes[key]
             photos.append(
                 {
-                    "stem": stem,
-                    "name": photo.name,
+                    "stem": key,
+                    "name": photo_name(photo, self._scene.images),
                     "width": width,
                     "height": height,
-                    "strokes": len(self.read(stem)),
+                    "strokes": len(self.read(key)),
                 }
             )
         return {
@@ -79,18 +84,21 @@ class Session:
             "photos": photos,
         }
 
-    def file(self, stem: str) -> Path:
+    def file(self, key: str) -> Path:
         """Where the strokes of a photo are kept; KeyError for an unknown photo, so that no name leads out of
         the folder.
         """
-        return self._scene.strokes / f"{self.photos[stem].stem}.json"
+        name, folder = photo_name(self.photos[key], self._scene.images), self._scene.strokes
+        file = self._names.find(folder, name, ".json") or self._names.path(folder, name, ".json")
+        require_within(file.parent, folder)
+        return file
 
-    def read(self, stem: str) -> list[dict[str, object]]:
+    def read(self, key: str) -> list[dict[str, object]]:
         """The shapes of a photo's LabelMe file, in px of the photo; none if there is no file."""
-        file = self.file(stem)
-        return self._plain(read_json(file), file, stem) if file.exists() else []
+        file = self.file(key)
+        return self._plain(read_json(file), file, key) if file.exists() else []
 
-    def save(self, stem: str, content: object) -> int:
+    def save(self, key: str, content: object) -> int:
         """Check a drawing like the backend does and write it; a file without shapes is removed. Returns the
         number of shapes.
 
@@ -98,48 +106,48 @@ class Session:
         """
         shapes = [
             shape | {"group_id": None, "description": "", "flags": {}}
-            for shape in self._plain(content, "the drawing", stem)
+            for shape in self._plain(content, "the drawing", key)
         ]
-        width, height = self.sizes[stem]
+        width, height = self.sizes[key]
         head: dict[str, object] = {
             "version": "5.5.0",
             "flags": {},
-            "imagePath": self.photos[stem].name,
+            "imagePath": photo_name(self.photos[key], self._scene.images),
             "imageData": None,
             "imageHeight": height,
             "imageWidth": width,
         }
         with self._writing:  # two windows may save at once
             if shapes:
-                write_json(self.file(stem), head | {"shapes": shapes})
+                write_json(self.file(key), head | {"shapes": shapes})
             else:
-                self.file(stem).unlink(missing_ok=True)
+                self.file(key).unlink(missing_ok=True)
         return len(shapes)
 
-    def _plain(self, content: object, origin: Path | str, stem: str) -> list[dict[str, object]]:
+    def _plain(self, content: object, origin: Path | str, key: str) -> list[dict[str, object]]:
         """The shapes of a LabelMe file, checked, in px of the photo."""
         names = {entry.id: entry.name for entry in self.class_table} | {0: BACKGROUND}
-        shapes = parse_shapes(content, origin, self.sizes[stem], self.class_table)
+        shapes = read_shapes(content, origin, self.photos[key], self.class_table)
         return [
             {"label": names[shape.label], "shape_type": shape.kind, "points": shape.points.tolist()}
             | ({"width": shape.width} if shape.width else {})
             for shape in shapes
         ]
 
-    def photo(self, stem: str) -> bytes:
-        """The photo as JPEG, as it is stored: LabelMe and browsers would turn it by its EXIF orientation, the
-        cameras do not.
+    def photo(self, key: str) -> bytes:
+        """The photo as JPEG, as shown: turned by its EXIF orientation, as in LabelMe; strokes lie in this
+        frame.
         """
-        return self._jpeg(stem)
+        return self._jpeg(key)
 
-    def try_out(self, stem: str) -> bytes:
+    def try_out(self, key: str) -> bytes:
         """Learn from all strokes of the scene, if they have changed, and segment a photo.
 
         returns: RGBA PNG in the colors of the classes, transparent where there is no label; no larger than
             needed
         Raises BusyError while another request does the same.
         """
-        photo = self.photos[stem]
+        photo = self.photos[key]
         if not self._trying.acquire(blocking=False):
             raise BusyError("still learning: wait for the last run to end")
         try:
@@ -149,7 +157,7 @@ class Session:
                     state,
                     Strokes.fit(self._scene.strokes, self._scene.images, self.class_table, self._settings),
                 )
-            labels = self._learned[1].segment(shrink(read_image(photo), TRIAL_SIZE)).labels
+            labels = self._learned[1].segment(shrink(self._pixels(photo), TRIAL_SIZE)).labels
         finally:
             self._trying.release()
         return _png(
@@ -158,8 +166,11 @@ class Session:
             )
         )
 
-    def _encode(self, stem: str) -> bytes:
-        shown = np.ascontiguousarray(shrink(read_image(self.photos[stem]), DISPLAY_SIZE)[..., ::-1])
+    def _pixels(self, photo: Path) -> np.ndarray:
+        return read_image(photo, self._scene.images, shown=True)
+
+    def _encode(self, key: str) -> bytes:
+        shown = np.ascontiguousarray(shrink(self._pixels(self.photos[key]), DISPLAY_SIZE)[..., ::-1])
         return cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import ctypes.util
+import ctypes
 import logging
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 from sc3d.errors import Sc3dError
+from sc3d.io.caches import kernel_cache
 from sc3d.io.provenance import versions
+from sc3d.io.python_process import run_python
+from sc3d.io.requirements import ALWAYS, INSTALL, LIBRARIES, outdated
 from sc3d.segmentation.models import find_weights
 from sc3d.settings.labels import Segment
 from sc3d.settings.outputs import Doctor
@@ -25,23 +30,17 @@ PROBES = {  # each in a process of its own: a missing library may abort it
     "vulkan pictures": "import open3d as o; o.visualization.rendering.OffscreenRenderer(8, 8); print('work')",
     "OpenGL pictures": "import open3d as o; v = o.visualization.Visualizer(); print('work' if v.create_window(visible=False) else 'do not work')",
 }
-APT = {
-    "GL": "libgl1",
-    "EGL": "libegl1",
-    "usb-1.0": "libusb-1.0-0",
-    "vulkan": "libvulkan1 mesa-vulkan-drivers",
-}
 
 
 def main(command: Doctor) -> None:
     for name, version in versions().items():
         logger.info("%-22s %s", name, version)
-    missing = [package for library, package in APT.items() if ctypes.util.find_library(library) is None]
-    logger.info(
-        "%-22s %s",
-        "system libraries",
-        "complete" if not missing else f"sudo apt-get install --no-install-recommends {' '.join(missing)}",
-    )
+    for old in outdated():
+        logger.info("%-22s %s: pip install --upgrade", "too old", old)
+    missing = [LIBRARIES[library] for library in ALWAYS if not _loads(library)]
+    logger.info("%-22s %s", "system libraries", f"{INSTALL} {' '.join(missing)}" if missing else "complete")
+    logger.info("%-22s %s", "compiled kernels", kernel_cache())
+    logger.info("%-22s %s", "temporary files", _room(Path(tempfile.gettempdir())))
     for name, code in PROBES.items():
         logger.info("%-22s %s", name, _probe(code))
     logger.info("%-22s %s", "processor cores", os.cpu_count())
@@ -49,9 +48,23 @@ def main(command: Doctor) -> None:
         logger.info("%-22s %s", model, _weights(model, command.model_dir))
 
 
+def _loads(library: str) -> bool:
+    if sys.platform != "linux":
+        return True
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+def _room(folder: Path) -> str:
+    return f"{shutil.disk_usage(folder).free / 2**30:.1f} GiB free in {folder} (TMPDIR names another folder)"
+
+
 def _probe(code: str) -> str:
     try:
-        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+        result = run_python(code, timeout=120)
     except subprocess.TimeoutExpired:
         return "no answer within 120 s"
     if result.returncode == 0 and result.stdout.strip():

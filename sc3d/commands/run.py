@@ -14,7 +14,7 @@ from sc3d.scene.class_table import read_classes
 from sc3d.scene.scene import Scene, match_masks, photo_sizes
 from sc3d.settings.labels import Evaluate, Segment
 from sc3d.settings.outputs import Report, Run
-from sc3d.stages.reconstruct import prepare
+from sc3d.stages.reconstruct import prepare, reconstruct
 
 logger = logging.getLogger(__name__)
 
@@ -28,12 +28,11 @@ def main(command: Run) -> None:
         confidence=command.confidence or command.segment.confidence,
     )
     check(command, segment)
-    prepare(command.photos, scene)
+    prepare(command.photos, scene, command.reconstruct)
     if command.classes is not None:
         with atomic_path(scene.classes) as temporary:
             shutil.copyfile(command.classes, temporary)
     stages = [
-        ("reconstruct", command.reconstruct),
         ("train", command.train),
         ("extract", command.extract),
         ("segment", replace(segment, refine=False)),
@@ -43,6 +42,7 @@ def main(command: Run) -> None:
     ]
     if command.truth is not None:
         stages.append(("evaluate", Evaluate(truth=command.truth)))
+    reconstruct(scene, command.reconstruct, command.overwrite)
     for name, settings in [*stages, ("report", Report())]:
         execute(name, scene, settings, command.overwrite)
     logger.info("run: %.0f s; look at %s", time.perf_counter() - started, scene.report)
@@ -58,7 +58,7 @@ def check(command: Run, segment: Segment) -> None:
         )
     class_table = read_classes(classes)
     if segment.backend == "files":
-        from sc3d.segmentation.mask_formats.import_masks import check_masks
+        from sc3d.segmentation.mask_formats.import_masks import check_masks, mask_source
         from sc3d.segmentation.mask_formats.source import MaskFiles
 
         masks = segment.masks or Scene(command.scene).masks
@@ -66,9 +66,7 @@ def check(command: Run, segment: Segment) -> None:
             raise InputError(
                 "--masks PATH is needed (or --segment.backend strokes, grounded-sam or sam3, which make masks)"
             )
-        source = (
-            MaskFiles(masks, segment.format, segment.mapping) if segment.masks else MaskFiles(masks, "index")
-        )
-        check_masks(source, sizes, class_table, segment.confidence)
+        source = mask_source(segment, masks) if segment.masks else MaskFiles(masks, "index")
+        check_masks(source, sizes, class_table, segment.confidence, command.photos)
     if command.truth is not None:
-        match_masks(command.truth, sizes, class_table)
+        match_masks(command.truth, sizes, class_table, photos=command.photos)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sc3d.errors import InputError
-from sc3d.io.images import IMAGE_SUFFIXES, read_image, write_image
+from sc3d.io.images import IMAGE_SUFFIXES, write_image
+from sc3d.scene.photo_names import PhotoNames
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import ViewCommand
 
@@ -25,6 +27,8 @@ def main(command: ViewCommand) -> None:
     _check(command)
     views = scene.model.views if scene.sparse.is_dir() else []
     photo = None if command.photo is None else _find_photo(command.photo, views, scene)
+    if photo is not None:
+        command = replace(command, photo=photo.name)
     if command.flight is not None:
         _write_flight(command, scene, command.flight)
     if command.web or command.html is not None:
@@ -66,12 +70,8 @@ def _check(command: ViewCommand) -> None:
 
 
 def _find_photo(name: str, views: list[View], scene: Scene) -> View:
-    photo = next((view for view in views if view.name == name), None)
-    if photo is None:
-        raise InputError(
-            f"no photo {name!r} in {scene.sparse}: one of {', '.join(view.name for view in views[:5])} ..."
-        )
-    return photo
+    by_name = {view.name: view for view in views}
+    return by_name[PhotoNames(by_name).one(name, scene.sparse)]
 
 
 def _write_flight(command: ViewCommand, scene: Scene, path: Path) -> None:
@@ -94,7 +94,7 @@ def _picture(command: ViewCommand, scene: Scene, views: list[View], photo: View 
     style = Style(by=command.by, from_above=command.from_above, cameras=drawn)
     if command.splats:
         splats = splats_colored_by(scene, command.by, command.classes)
-        pixels = None if photo is None else read_image(scene.photo(photo.name))
+        pixels = None if photo is None else scene.read_photo(photo.name)
         return screenshot_splats(splats, photo, pixels, command.size, style)
     table = scene.class_table() if scene.classes.exists() else None
     cloud = load_cloud(scene, command.file, votes=command.by == "disagreement")

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import cv2
 import numpy as np
 from tqdm import tqdm
 
+from sc3d.errors import left_out
 from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
-from sc3d.io.images import read_image, read_index_image, write_image
+from sc3d.io.images import read_orientation, write_image
 from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
@@ -18,14 +20,16 @@ from sc3d.view.contact_sheet import side_by_side
 
 SHOWN, PANEL = 4, 600  # photos in masks.jpg, and the width of each picture there, px
 
+logger = logging.getLogger(__name__)
+
 
 def outputs(scene: Scene, settings: Export) -> list[Path]:
     return [scene.export / "masks", scene.export / "confidence", scene.export / "masks.jpg"]
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
-    """`export/masks/<photo stem>.png` and `export/confidence/<photo stem>.png` for every photo; usable as
-    `segment --masks`, `--confidence`.
+    """A mask in `export/masks` and a confidence map in `export/confidence` for every photo, named like it;
+    usable as `segment --masks`, `--confidence`.
     """
     cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
     views = scene.model.views
@@ -37,11 +41,14 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
         confidence_folder.mkdir()
         for view in tqdm(views, desc="rendering masks", unit="photo", disable=None):
             mask, confidence = render_mask(surface, labels.confidence, view, settings.max_size)
-            name = f"{Path(view.name).stem}.png"
-            write_image(mask_folder / name, mask)
-            write_image(confidence_folder / name, confidence)
+            orientation = read_orientation(scene.photo(view.name))
+            write_image(scene.photo_names.path(mask_folder, view.name), mask, orientation)
+            write_image(scene.photo_names.path(confidence_folder, view.name), confidence, orientation)
             covered.append(float((mask > 0).mean()))
     write_image(sheet, _comparison(scene, views))
+    empty = [view.name for view, share in zip(views, covered, strict=True) if not share]
+    if empty:
+        logger.warning(left_out(empty, len(views), "photos see no label; their masks are empty"))
     return {"photos": len(views), "labelled_pixels": f"{np.mean(covered):.1%}"}
 
 
@@ -54,16 +61,14 @@ def _comparison(scene: Scene, views: list[View]) -> np.ndarray:
         views[row]
         for row in np.unique(np.linspace(0, len(views) - 1, min(SHOWN, len(views))).round().astype(int))
     ]:
-        size, stem = (PANEL, round(PANEL * view.height / view.width)), Path(view.name).stem
+        size = PANEL, round(PANEL * view.height / view.width)
         pictures, captions = [], []
         if scene.photo(view.name).exists():
-            pictures.append(
-                cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA)
-            )
+            pictures.append(cv2.resize(scene.read_photo(view.name), size, interpolation=cv2.INTER_AREA))
             captions.append(view.name)
         for folder, caption in ((scene.masks, "mask in"), (scene.export / "masks", "mask back")):
-            file = folder / f"{stem}.png"
-            mask = read_index_image(file) if file.exists() else np.zeros((1, 1), np.uint8)
+            file = scene.mask_file(folder, view.name)
+            mask = np.zeros((1, 1), np.uint8) if file is None else scene.read_mask(file, view.name)
             pictures.append(palette[cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)])
             captions.append(caption)
         rows.append(side_by_side(pictures, captions))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ from sc3d.exporters.polygonize import orthogonalized, polygonize, simplified
 from sc3d.exporters.projected_cloud import ProjectedCloud, find_projection, read_projected_cloud
 from sc3d.exporters.regions import cells_by_number
 from sc3d.exporters.terrain import ground_height
-from sc3d.exporters.trees import canopy_height, split_crowns
+from sc3d.exporters.trees import MIN_CROWN, canopy_height, split_crowns
 from sc3d.exporters.vector_files import Feature, has_geopackage, write_geojson, write_geopackage
 from sc3d.geometry.raster import Raster, spacing_of_all
 from sc3d.scene.class_table import ClassTable
@@ -34,6 +35,8 @@ BUILDING, LOW, MEDIUM, HIGH = 6, 3, 4, 5  # ASPRS codes: building; low, medium a
 GROUND = (2, LOW, 9, 10, 11)  # ground, low vegetation, water, rail, road
 NOISE = (7, 18)
 TREE_TOP = 0.99  # quantile of the crown that is its height: a single point is no tree top
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,8 @@ def _find_buildings(site: Site, settings: Export) -> list[Feature]:
     grid, is_building = site.grid, site.kinds.building
     covered, roofs = roof_heights(site.points, is_building, site.above, grid)
     buildings = split_buildings(covered, roofs, grid, settings.min_area)
+    why = f"lower than {settings.min_height:g} m, or in pieces below {settings.min_area:g} m2"
+    _tell_of_left_out("buildings", is_building, buildings, site, why)
     draw = orthogonalized if settings.rectangular else simplified
     outlines = {
         number: draw(traced, 2 * grid.pixel) for number, traced in polygonize(buildings, grid).items()
@@ -114,12 +119,22 @@ def _find_trees(site: Site, settings: Export) -> list[Feature]:
     grid, is_tree = site.grid, site.kinds.tree
     canopy = canopy_height(site.points, is_tree, site.ground, grid)
     crowns = split_crowns(canopy, grid, settings.min_height)
+    why = f"lower than {settings.min_height:g} m, or in crowns below {MIN_CROWN:g} m2"
+    _tell_of_left_out("trees", is_tree, crowns, site, why)
     outlines = {
         number: simplified(shapely.Polygon(traced.exterior), grid.pixel)
         for number, traced in polygonize(crowns, grid).items()
     }
     heights, ground = _quantiles(canopy, crowns, TREE_TOP), _quantiles(site.ground, crowns, 0.5)
     return _features(site, crowns, is_tree, outlines, (heights, ground))
+
+
+def _tell_of_left_out(kind: str, chosen: np.ndarray, regions: np.ndarray, site: Site, why: str) -> None:
+    """How many points of a kind (N,) bool belong to none of the regions (H, W)."""
+    member = site.above & (regions.ravel()[site.grid.flat_cells(site.points)] > 0)
+    lost, total = int((chosen & ~member).sum()), int(chosen.sum())
+    if lost:
+        logger.info("%s: %d of %d points are part of no object: %s", kind, lost, total, why)
 
 
 def _quantiles(values: np.ndarray, regions: np.ndarray, share: float) -> np.ndarray:

@@ -12,7 +12,7 @@ def load(name: str) -> ModuleType:
     """Import a module of the extra; MissingPackageError says how to install it."""
     try:
         return importlib.import_module(name)
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingPackageError(
             f"this format needs {name.split('.')[0]}: pip install 'sc3d[geo]'"
         ) from None

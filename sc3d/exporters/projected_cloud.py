@@ -17,8 +17,11 @@ import open3d as o3d
 from sc3d.errors import InputError
 from sc3d.georeferencing.georeference import (
     Georeference,
+    check_area,
+    crs_to_geodetic,
     projected_crs,
     read_georeference,
+    triple,
     write_georeference,
 )
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
@@ -100,6 +103,9 @@ def find_projection(scene: Scene, settings: Export) -> MapProjection:
     georeference = read_georeference(scene)
     if georeference is not None:
         projection = MapProjection(georeference, settings.epsg or georeference.epsg)
+        if projection.epsg != georeference.epsg:
+            place = crs_to_geodetic(np.array([georeference.offset]), georeference.crs)[0]
+            check_area(projected_crs(settings.epsg or georeference.epsg), triple(place))
     elif settings.epsg:
         projection = MapProjection(Georeference(settings.epsg, (0.0, 0.0, 0.0)), settings.epsg)
     else:

@@ -12,6 +12,7 @@ from sc3d.exporters.projected_cloud import MapProjection, chosen_classes, find_p
 from sc3d.geometry.cameras import undistorted
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.io.splats import origin_comment, write_splat_ply
+from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import REACH, LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
@@ -47,16 +48,18 @@ def label_splats(scene: Scene, settings: Export) -> DisplaySplats:
     unknown = table.unknown(labels.label)
     if unknown:
         raise InputError(f"{source} has class id {unknown[0]}, which is not in {scene.classes}: add it there")
+    channels = table.channels
     gaussians, origin = load_gaussians(scene)
     surface = LabelledSurface.build(cloud, scene.model.views, scene.mesh)
     views = [undistorted(view.shifted(origin), LIFTED_SIZE) for view in scene.model.views]
     evidence = lift(
         gaussians,
         views,
-        lambda view: render_mask(surface, labels.confidence, view.shifted(-origin)),
-        table.num_ids,
+        lambda view: _channel_mask(channels, render_mask(surface, labels.confidence, view.shifted(-origin))),
+        channels.count,
     )
-    label, confidence = winners(evidence)
+    winner, confidence = winners(evidence)
+    label = channels.to_ids(winner)
     points = cloud.point.positions.numpy().astype(np.float64)
     floating = (
         distance_to_class(gaussians.means.numpy() + origin, label, points, surface.label)
@@ -73,6 +76,10 @@ def label_splats(scene: Scene, settings: Export) -> DisplaySplats:
         np.where(floating, np.float32(0), confidence),
         table,
     )
+
+
+def _channel_mask(channels: Channels, mask: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    return channels.from_ids(mask[0]), mask[1]
 
 
 def distance_to_class(

@@ -167,19 +167,24 @@ class LabelGrid(VoxelGrid):
         self.grid.hashmap().activate(o3d.core.Tensor(positions))
         self.values[self.slots(positions)] += other.values[theirs]
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path, class_ids: np.ndarray | None = None) -> None:
         """Write an npz that `VoxelBlockGrid.load` reads, blocks ordered by position. Not by `VoxelBlockGrid.save`,
-        which ends the process if the disk is full.
+        which ends the process if the disk is full. class_ids: as in `file_header`
         """
         slots, positions = self.blocks()
         votes = self.grid.attribute(self.ATTRIBUTE).numpy()[slots]
-        arrays = {"value_000": votes, "key": positions, **file_header(self.voxel_size)}
+        arrays = {"value_000": votes, "key": positions, **file_header(self.voxel_size, class_ids)}
         np.savez(path, **arrays)
 
 
-def file_header(voxel_size: float) -> dict[str, np.ndarray]:
-    """What `VoxelBlockGrid.load` reads in the file of a label field beside `key` (B, 3) and `value_000`."""
-    return {
+def file_header(voxel_size: float, class_ids: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """What `VoxelBlockGrid.load` reads in the file of a label field beside `key` (B, 3) and `value_000`.
+
+    class_ids: (C,) uint8 class of each channel, kept as `class_ids`, which Open3D does not read, unless these are
+        0, 1, 2, ...
+    """
+    ids = {} if class_ids is None or len(class_ids) > class_ids[-1] else {"class_ids": class_ids}
+    return ids | {
         "attr_name_votes": np.zeros(1, np.int32),
         "CPU:0": np.zeros((), np.uint8),
         "block_resolution": np.array([BLOCK], np.int64),

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 LEVEL_SHARE = 0.9  # nearest share of the points that the ground plane is fitted to
-NUM_TRIPLES = 500  # at most, tried by the robust fit
+NUM_SUBSETS = 500  # at most, tried by the robust fit
+SAME_WAY = 30.0  # degrees: optical axes that differ by less, on average, belong to a flight that looks down
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def fit_similarity_robust(
     """
     fit, kept = fit_similarity(source, target), np.zeros(len(source), bool)
     if len(source) > 3:
-        fits = [fit_similarity(source[triple], target[triple]) for triple in _triples(len(source))]
+        fits = [fit_similarity(source[triple], target[triple]) for triple in subsets(len(source), 3)]
         fit = min(
             fits, key=lambda candidate: np.median(np.linalg.norm(candidate.apply(source) - target, axis=1))
         )
@@ -75,12 +76,12 @@ def fit_similarity_robust(
     return fit, kept
 
 
-def _triples(count: int) -> list[np.ndarray]:
-    """All triples of rows, or a fixed random choice of NUM_TRIPLES."""
-    if math.comb(count, 3) <= NUM_TRIPLES:
-        return [np.array(triple) for triple in itertools.combinations(range(count), 3)]
+def subsets(count: int, size: int) -> list[np.ndarray]:
+    """All choices of `size` rows, or a fixed random choice of NUM_SUBSETS of them."""
+    if math.comb(count, size) <= NUM_SUBSETS:
+        return [np.array(rows) for rows in itertools.combinations(range(count), size)]
     rng = np.random.default_rng(0)
-    return [rng.choice(count, 3, replace=False) for _ in range(NUM_TRIPLES)]
+    return [rng.choice(count, size, replace=False) for _ in range(NUM_SUBSETS)]
 
 
 def flight_shape(positions: np.ndarray, sigma: float) -> str:
@@ -113,3 +114,24 @@ def roll_upright(normal: np.ndarray, axis: np.ndarray) -> np.ndarray:
     angle = np.arctan2(np.cross(flat, target) @ axis, flat @ target)
     cross = np.cross(np.eye(3), axis)
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def camera_up(rotations: np.ndarray) -> np.ndarray:
+    """(3,) up, in the world of cameras (N, 3, 3) cam_from_world, if people and gimbals hold them level.
+
+    Cameras that all look the same way look down; of others the sideways axes are horizontal.
+    """
+    across, down, along = rotations[:, 0], rotations[:, 1], rotations[:, 2]
+    mean = along.mean(axis=0)
+    if np.linalg.norm(mean) > np.cos(np.radians(SAME_WAY)):
+        return -mean / np.linalg.norm(mean)
+    up = np.linalg.svd(across, full_matrices=False)[2][2]
+    return up if (down + along).mean(axis=0) @ up < 0 else -up
+
+
+def upside_down(rotations: np.ndarray, fit: Similarity) -> bool:
+    """Whether a similarity puts cameras (N, 3, 3) cam_from_world on their heads: looking up, photos with the
+    ground on top.
+    """
+    up = fit.rotation[2]
+    return bool((rotations[:, 1:] @ up).sum() > 0)

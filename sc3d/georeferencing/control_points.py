@@ -1,31 +1,36 @@
-"""Ground control points: read from ODM's `gcp_list.txt`, triangulated in a model, and the model brought onto
-them.
-"""
+"""Ground control points: read from a `gcp_list.txt`, triangulated in a model, and the model brought onto them."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pycolmap
 
-from sc3d.errors import InputError
-from sc3d.georeferencing.alignment import Similarity, fit_similarity, fit_similarity_robust
+from sc3d.errors import InputError, examples
+from sc3d.georeferencing.alignment import Similarity, camera_up, upside_down
+from sc3d.georeferencing.control_fit import MIN_POINTS, Accuracy, ControlFit, fit_control_points
+from sc3d.georeferencing.gcp_list import is_title, parse_crs, parse_mark, read_lines
 from sc3d.georeferencing.georeference import crs_to_geodetic, geodetic_to_enu
+from sc3d.io.colmap import cam_from_world, registered_images
+from sc3d.io.crs import split_crs
+from sc3d.scene.photo_names import PhotoNames
 
 if TYPE_CHECKING:
     import pyproj
 
 logger = logging.getLogger(__name__)
 
-# of the distance to the cameras; a point that misses the fit of the others by more was mistaken for another,
-# or mistyped
-MAX_ERROR = 0.02
 PIXEL_CENTER = 0.5  # ODM and OpenSfM call the center of the first pixel (0, 0)
-MIN_POINTS = 3
+# of the distance to the cameras; points that miss the fit by less are as good as the cameras
+MAX_ERROR = 0.02
+SAME_HEIGHT = 1e-3  # m: heights that differ by less were not measured
+BAD_MARK = 0.02  # of the photo's longer side: marks that miss the others by more were set wrong
+FAR_FROM_GPS = 20_000.0  # m: control points this far from the photos' GPS are in another CRS
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,7 @@ class ControlPoints:
 
     names: of the points; geodetic: (G, 3) latitude, longitude (degrees), height (m)
     observations: per point, the (K, 2) px, COLMAP's convention, by photo name
-    epsg: of the file's CRS if that is a projected one with a code, else None
+    epsg: of the file's CRS, horizontal part, if that is a projected one with a code, else None
     """
 
     names: list[str]
@@ -49,92 +54,102 @@ class ControlPoints:
         return round(float(latitude), 6), round(float(longitude), 6), round(float(height), 0)
 
 
-def read_control_points(path: Path, photos: list[str]) -> ControlPoints:
-    """Read a `gcp_list.txt`: a line with the CRS, then `x y z px py photo [name]` per observation.
+def read_control_points(path: Path, photos: Sequence[str]) -> ControlPoints:
+    """Read a `gcp_list.txt`: a line with the CRS, then `x y z px py photo [name]` per observation, apart by
+    tabs, semicolons, commas or blanks.
 
-    photos: known names; a photo is found by its name, or by the last part of it. InputError with the line for
-        whatever cannot be understood.
+    photos: known names; a photo is found by its name, or by what is left of it without folders, suffix or
+        case where that is clear. InputError with the line for whatever cannot be understood.
     """
-    try:
-        lines = [
-            (number, line.strip())
-            for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1)
-        ]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the ground control points {path}: {error}") from None
-    lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
-    if not lines:
-        raise InputError(
-            f"{path} is empty: the CRS is expected in its first line, then `x y z px py photo [name]`"
-        )
+    lines = read_lines(path)
     crs = parse_crs(lines[0][1], path)
-    known = {Path(name).name: name for name in photos} | {name: name for name in photos}
+    known = PhotoNames(photos)
     positions: dict[str, tuple[float, ...]] = {}
     observations: dict[str, dict[str, np.ndarray]] = {}
-    unknown = set()
-    for number, line in lines[1:]:
-        position, pixel, photo, name = _parse(line, f"{path}, line {number}")
-        if photo not in known:
-            unknown.add(photo)
+    unknown, twice = [], []
+    for number, line in lines[2 if len(lines) > 1 and is_title(lines[1][1]) else 1 :]:
+        mark = parse_mark(line, f"{path}, line {number}", known)
+        if not mark.known:
+            unknown.append(mark.photo)
             continue
-        if positions.setdefault(name, position) != position:
-            raise InputError(f"{path}, line {number}: the point {name!r} has another position further up")
-        observations.setdefault(name, {})[known[photo]] = np.array(pixel) + PIXEL_CENTER
-    if unknown:
-        logger.warning(
-            "%s names %d photos that are not there: %s", path, len(unknown), ", ".join(sorted(unknown))
-        )
+        if positions.setdefault(mark.name, mark.position) != mark.position:
+            raise InputError(
+                f"{path}, line {number}: the point {mark.name!r} has another position further up"
+            )
+        pixel = np.array(mark.pixel) + PIXEL_CENTER
+        before = observations.setdefault(mark.name, {}).setdefault(mark.photo, pixel)
+        if (before != pixel).any():
+            twice.append(f"{mark.name} in {mark.photo}")
+    _warn(path, list(dict.fromkeys(unknown)), twice)
     if len(positions) < MIN_POINTS:
         raise InputError(
             f"{path} has {len(positions)} points on known photos: at least {MIN_POINTS} are needed"
         )
     return ControlPoints(
         list(positions),
-        crs_to_geodetic(np.array(list(positions.values())), crs),
+        _geodetic(np.array(list(positions.values())), crs, path),
         list(observations.values()),
-        crs.to_epsg() if crs.is_projected else None,
+        split_crs(crs)[0].to_epsg() if crs.is_projected else None,
     )
 
 
-def parse_crs(header: str, path: Path) -> pyproj.CRS:
-    """CRS of a header: `EPSG:32615`, `WGS84 UTM 15N`, `WGS84` (longitude, latitude) or a PROJ string."""
-    import pyproj
-
-    words = header.strip("'\"").split()
-    try:
-        if [word.upper() for word in words[:2]] == ["WGS84", "UTM"] and len(words) == 3:
-            zone, south = int(words[2].rstrip("NSns")), words[2].upper().endswith("S")
-            if not 1 <= zone <= 60:
-                raise ValueError
-            return pyproj.CRS.from_epsg((32700 if south else 32600) + zone)
-        crs = (
-            pyproj.CRS.from_epsg(4326)
-            if [word.upper() for word in words] == ["WGS84"]
-            else pyproj.CRS.from_user_input(" ".join(words))
+def _warn(path: Path, unknown: list[str], twice: list[str]) -> None:
+    if unknown:
+        logger.warning("%s names %d photos that are not there: %s", path, len(unknown), examples(unknown))
+    if twice:
+        logger.warning(
+            "%s marks %d points twice in one photo, the first mark counts: %s",
+            path,
+            len(twice),
+            examples(twice),
         )
-    except (pyproj.exceptions.CRSError, ValueError):
+
+
+def _geodetic(positions: np.ndarray, crs: pyproj.CRS, path: Path) -> np.ndarray:
+    geodetic = crs_to_geodetic(positions, crs)
+    outside = ~np.isfinite(geodetic).all(axis=1) | (np.abs(geodetic[:, :2]) > [90.0, 180.0]).any(axis=1)
+    if outside.any():
         raise InputError(
-            f"{path} starts with {header!r}: a CRS is expected there, such as EPSG:32615, WGS84 UTM 15N or +proj=utm +zone=15"
-        ) from None
-    if not (crs.is_projected or crs.is_geographic):
-        raise InputError(f"{path}: {crs.name} is neither a projected nor a geographic CRS")
-    return crs
+            f"{path}: {outside.sum()} of {len(positions)} points, such as {positions[outside][0].tolist()}, lie outside the area of {crs.name}: "
+            f"check the CRS and the order ({'east, north' if crs.is_projected else 'longitude, latitude'})"
+        )
+    return geodetic
 
 
-def _parse(line: str, where: str) -> tuple[tuple[float, ...], tuple[float, float], str, str]:
-    """Position (x, y, z), pixel (x, y), photo and name of a line; a point without a name is called by its
-    position.
+def check_accuracy(file: Path | None, accuracy: Accuracy | None) -> None:
+    """InputError for an accuracy without control points, or one that is none."""
+    if accuracy is not None and file is None:
+        raise InputError("--gcp-accuracy needs --gcp")
+    if accuracy is not None and not all(0 < value < np.inf for value in accuracy):
+        raise InputError("--gcp-accuracy takes two standard deviations above 0, m: horizontal, vertical")
+
+
+def check_control_points(
+    points: ControlPoints, sizes: dict[str, tuple[int, int]], gps: tuple[float, float, float] | None
+) -> None:
+    """What can be seen before there are cameras: InputError for marks outside their photos, a warning for
+    points far from the photos' GPS.
+
+    sizes: (width, height) px by photo name; gps: latitude, longitude, height of the photos
     """
-    words = line.split()
-    try:
-        numbers = [float(word) for word in words[:5]]
-        if len(words) < 6 or not np.isfinite(numbers).all():
-            raise ValueError
-    except ValueError:
+    outside = [
+        f"{name} in {photo} at {pixel[0] - PIXEL_CENTER:.0f} {pixel[1] - PIXEL_CENTER:.0f} of {sizes[photo][0]} x {sizes[photo][1]}"
+        for name, seen in zip(points.names, points.observations)
+        for photo, pixel in seen.items()
+        if photo in sizes and ((pixel < 0) | (pixel > sizes[photo])).any()
+    ]
+    if outside:
         raise InputError(
-            f"{where}: `x y z px py photo [name]` with finite numbers is expected, not {line!r}"
-        ) from None
-    return tuple(numbers[:3]), (numbers[3], numbers[4]), words[5], " ".join(words[6:]) or " ".join(words[:3])
+            f"{len(outside)} marks of ground control points lie outside their photos ({examples(outside)}): "
+            "they belong to photos of another size"
+        )
+    if gps is not None:
+        away = float(np.linalg.norm(geodetic_to_enu(np.array([points.origin]), gps)))
+        if away > FAR_FROM_GPS:
+            logger.warning(
+                "the ground control points lie %.0f km from the GPS of the photos, one of them is wrong: check their CRS and the order x y (east, north)",
+                away / 1000,
+            )
 
 
 def triangulate(
@@ -155,7 +170,7 @@ def triangulate(
         direction = image.cam_from_world().rotation.matrix().T @ (ray / np.linalg.norm(ray))
         across = np.eye(3) - np.outer(direction, direction)
         normal, moment = normal + across, moment + across @ image.projection_center()
-    point = np.linalg.solve(normal, moment)
+    point = np.linalg.lstsq(normal, moment, rcond=None)[0]  # rays may be parallel
     projected = [image.project_point(point) for image, _ in seen]
     return point, np.array(
         [
@@ -165,48 +180,159 @@ def triangulate(
     )
 
 
-def align_to_control_points(
-    model: pycolmap.Reconstruction, points: ControlPoints, refine_focal: bool = True
-) -> dict[str, object]:
-    """Bring a model into ENU at `points.origin`: similarity, then bundle adjustment with the points held
-    fixed. Changes the model.
+def drop_wrong_marks(model: pycolmap.Reconstruction, points: ControlPoints) -> ControlPoints:
+    """The points without the marks that miss the place on which the others of the same point agree; one per
+    point. Marks that do not meet and cannot tell which of them is wrong take their point with them. Says so.
+    """
+    limit = BAD_MARK * max(max(camera.width, camera.height) for camera in model.cameras.values())
+    registered = {model.image(image_id).name for image_id in model.reg_image_ids()}
+    kept, marks, apart = [], [], []
+    for name, observations in zip(points.names, points.observations):
+        seen = {photo: pixel for photo, pixel in observations.items() if photo in registered}
+        kept.append(seen)
+        if len(seen) < 2 or triangulate(model, seen)[1].max() <= limit:
+            continue
+        fewer = {photo: {key: seen[key] for key in seen if key != photo} for photo in seen}
+        errors = {photo: triangulate(model, rest)[1].max(initial=0.0) for photo, rest in fewer.items()}
+        good = [photo for photo in seen if len(fewer[photo]) > 1 and errors[photo] <= limit]
+        if len(good) == 1:
+            kept[-1] = fewer[good[0]]
+            marks.append(f"{name} in {good[0]}")
+        else:
+            kept[-1] = {}
+            apart.append(name)
+    if marks:
+        logger.warning(
+            "marks that do not meet the others of the same ground control point are left out, %d: %s",
+            len(marks),
+            examples(marks),
+        )
+    if apart:
+        logger.warning(
+            "ground control points whose marks do not meet in one place are left out, %d: %s",
+            len(apart),
+            examples(apart),
+        )
+    return replace(points, observations=kept)
 
-    returns: figures: per point its residual east, north, up (m) and reprojection error (px); root mean
-        squares; leave-one-out before the adjustment
+
+def align_to_control_points(
+    model: pycolmap.Reconstruction,
+    points: ControlPoints,
+    refine_focal: bool = True,
+    accuracy: Accuracy | None = None,
+) -> dict[str, object]:
+    """Bring a model into ENU at `points.origin`: similarity, then, if the points are as good as the cameras,
+    bundle adjustment with the points held fixed. Changes the model.
+
+    accuracy: standard deviations of the points, m: horizontal, vertical; None = estimated
+    returns: figures: per point its residual east, north, up (m), reprojection error (px) and leave-one-out
+        error (m); root mean squares; the same of those left out
+    errors: InputError, before anything is changed, if the points do not fit
+    """
+    points = drop_wrong_marks(model, points)
+    found = match_control_points(model, points, accuracy)
+    fit, rows = found.fit, found.rows
+    transform(model, fit.similarity)
+    if fit.exact:
+        kept = rows[fit.kept]
+        _adjust(model, [points.observations[row] for row in kept], found.target[fit.kept], refine_focal)
+    return found.figures(model, points)
+
+
+@dataclass(frozen=True)
+class Matched:
+    """How control points fit a model.
+
+    rows: (U,) of the points that two or more photos show; target: (U, 3) their ENU positions, m
+    """
+
+    fit: ControlFit
+    rows: np.ndarray
+    target: np.ndarray
+
+    def figures(self, model: pycolmap.Reconstruction, points: ControlPoints) -> dict[str, object]:
+        """Residuals of a model that has been brought onto the points."""
+        offsets = np.array([triangulate(model, points.observations[row])[0] for row in self.rows])
+        offsets = offsets - self.target
+        kept = self.fit.kept
+        squares = (offsets[kept] ** 2).mean(axis=0)
+        apart = self.fit.leave_one_out
+        listed = {
+            points.names[row]: {
+                "east_north_up_m": np.round(offset, 4).tolist(),
+                "reprojection_px": _reprojection(model, points.observations[row]),
+            }
+            for row, offset in zip(self.rows, offsets)
+        }
+        if apart is not None:
+            for row, error in zip(self.rows[kept], apart):
+                listed[points.names[row]]["leave_one_out_m"] = round(float(error), 4)
+        out = {points.names[row] for row in self.rows[~kept]}
+        return {
+            "points": len(self.rows),
+            "left_out": len(out),
+            "leave_one_out_rms": None if apart is None else round(float(np.sqrt((apart**2).mean())), 4),
+            "accuracy_horizontal_vertical_m": np.round(self.fit.accuracy, 4).tolist(),
+            "up_from_cameras": self.fit.upright,
+            # heights that are no measurements say nothing
+            "rms": round(float(np.sqrt(squares[: 2 if self.fit.upright else 3].sum())), 4),
+            "rms_horizontal": round(float(np.sqrt(squares[:2].sum())), 4),
+            "rms_vertical": round(float(np.sqrt(squares[2])), 4),
+            "residuals": {name: found for name, found in listed.items() if name not in out},
+            "residuals_left_out": {name: found for name, found in listed.items() if name in out},
+        }
+
+
+def match_control_points(
+    model: pycolmap.Reconstruction, points: ControlPoints, accuracy: Accuracy | None = None
+) -> Matched:
+    """Fit control points to a model, which stays as it is, and say in one line how well they do. InputError if
+    they do not.
     """
     target = geodetic_to_enu(points.geodetic, points.origin)
-    source, used = _triangulate_all(model, points)
-    if len(used) < MIN_POINTS:
+    source, rows = _triangulate_all(model, points)
+    if len(rows) < MIN_POINTS:
         raise InputError(
-            f"{len(used)} ground control points are seen by two or more registered photos: at least {MIN_POINTS} are needed"
+            f"{len(rows)} ground control points are seen by two or more registered photos: at least {MIN_POINTS} are needed"
         )
-    fit, kept = fit_similarity_robust(
-        source, target[used], MAX_ERROR * _distance(model, source, target[used])
+    rotations = np.array([cam_from_world(image)[:3, :3] for image in registered_images(model)])
+    heights = points.geodetic[rows, 2]
+    fit = fit_control_points(
+        source,
+        target[rows],
+        camera_up(rotations),
+        MAX_ERROR * _distance(model, source, target[rows]),
+        accuracy,
+        bool(np.ptp(heights) < SAME_HEIGHT),
+        [points.names[row] for row in rows],
     )
-    if kept.sum() < MIN_POINTS:
+    if upside_down(rotations, fit.similarity):
         raise InputError(
-            "the ground control points do not fit the model: check the CRS, the order x y (east, north) and the pixels"
+            "the ground control points would turn the cameras upside down: check the order x y (east, north)"
         )
-    if not kept.all():
-        logger.warning(
-            "ground control points left out, as they do not fit the others: %s",
-            ", ".join(points.names[used[row]] for row in np.flatnonzero(~kept)),
+    _tell(fit, [points.names[row] for row in rows], source, target[rows], float(heights[0]))
+    return Matched(fit, rows, target[rows])
+
+
+def _tell(fit: ControlFit, names: list[str], source: np.ndarray, target: np.ndarray, height: float) -> None:
+    """One line of what the user should know of a fit; nothing if all is as it should be."""
+    distances = np.linalg.norm((fit.similarity.apply(source) - target)[:, : 2 if fit.upright else 3], axis=1)
+    words = []
+    if not fit.exact:
+        rms = np.sqrt((distances[fit.kept] ** 2).mean())
+        words.append(
+            f"they fit to {rms:.2f} m{' horizontally' if fit.upright else ''}, so the cameras keep their shape"
         )
-    spread = np.linalg.svd(target[used][kept] - target[used][kept].mean(axis=0), compute_uv=False) / np.sqrt(
-        kept.sum()
-    )
-    if spread[1] < 0.02 * spread[0]:
-        raise InputError(
-            "the ground control points lie on one line: they leave the tilt about it open; add one beside it"
-        )
-    transform(model, fit)
-    figures = {
-        "points": len(used),
-        "left_out": int((~kept).sum()),
-        "leave_one_out_rms": _leave_one_out(source[kept], target[used][kept]),
-    }
-    _adjust(model, [points.observations[row] for row in used[kept]], target[used[kept]], refine_focal)
-    return figures | _residuals(model, points, target, used[kept])
+        if fit.kept.sum() == MIN_POINTS:
+            words.append("three points cannot check one another")
+    if not fit.kept.all():
+        left_out = [f"{names[row]} ({distances[row]:.2f} m)" for row in np.flatnonzero(~fit.kept)]
+        words.append(f"left out, as they do not fit the others: {', '.join(left_out)}")
+    if fit.upright:
+        words.append(f"heights are all {height:g} or say nothing: up comes from the cameras")
+    if words:
+        logger.warning("ground control points: %s", "; ".join(words))
 
 
 def transform(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
@@ -220,9 +346,13 @@ def _triangulate_all(model: pycolmap.Reconstruction, points: ControlPoints) -> t
     """(U, 3) positions in the model and (U,) rows of the points that at least two registered photos show."""
     found = [triangulate(model, seen)[0] for seen in points.observations]
     used = np.array([row for row, point in enumerate(found) if point is not None], int)
-    missing = [points.names[row] for row, point in enumerate(found) if point is None]
+    missing = [points.names[row] for row, seen in enumerate(points.observations) if len(seen) == 1]
     if missing:
-        logger.warning("ground control points in fewer than two registered photos: %s", ", ".join(missing))
+        logger.warning(
+            "ground control points that fewer than two registered photos show are left out, %d: %s",
+            len(missing),
+            examples(missing),
+        )
     return np.array([found[row] for row in used]).reshape(-1, 3), used
 
 
@@ -269,35 +399,6 @@ def _adjust(
     model.update_point_3d_errors()
 
 
-def _leave_one_out(source: np.ndarray, target: np.ndarray) -> float | None:
-    """Root mean square distance, m, at which points are found by the fit of the others: what the model is
-    worth between control points.
-    """
-    if len(source) <= MIN_POINTS:
-        return None
-    rest = [np.delete(np.arange(len(source)), row) for row in range(len(source))]
-    errors = [
-        fit_similarity(source[keep], target[keep]).apply(source[row : row + 1])[0] - target[row]
-        for row, keep in enumerate(rest)
-    ]
-    return round(float(np.sqrt((np.array(errors) ** 2).sum(axis=1).mean())), 4)
-
-
-def _residuals(
-    model: pycolmap.Reconstruction, points: ControlPoints, target: np.ndarray, rows: np.ndarray
-) -> dict[str, object]:
-    listed, offsets = {}, []
-    for row in rows:
-        position, pixels = triangulate(model, points.observations[row])
-        offsets.append(position - target[row])
-        listed[points.names[row]] = {
-            "east_north_up_m": np.round(offsets[-1], 4).tolist(),
-            "reprojection_px": round(float(np.sqrt((pixels**2).mean())), 3),
-        }
-    squares = (np.array(offsets) ** 2).mean(axis=0)
-    return {
-        "rms": round(float(np.sqrt(squares.sum())), 4),
-        "rms_horizontal": round(float(np.sqrt(squares[:2].sum())), 4),
-        "rms_vertical": round(float(np.sqrt(squares[2])), 4),
-        "residuals": listed,
-    }
+def _reprojection(model: pycolmap.Reconstruction, observations: dict[str, np.ndarray]) -> float:
+    """Root mean square, px."""
+    return round(float(np.sqrt((triangulate(model, observations)[1] ** 2).mean())), 3)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from sc3d.georeferencing.geotags import read_dji_xmp
+from sc3d.georeferencing.geotags import read_drone_xmp
 from sc3d.georeferencing.gps import Flight
 from sc3d.io.colmap import registered_images
 from sc3d.io.images import open_image
@@ -37,7 +37,7 @@ def exif_focal(photo: Path) -> float | None:
     with open_image(photo) as image:
         (width, height), exif = image.size, image.getexif().get_ifd(EXIF_BLOCK)
     calibrated, original = (
-        read_dji_xmp(photo).get("CalibratedFocalLength", 0.0),
+        read_drone_xmp(photo).get("CalibratedFocalLength", 0.0),
         _number(exif.get(EXIF_WIDTH)) or width,
     )
     if calibrated > 0:

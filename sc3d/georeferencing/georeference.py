@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.io.crs import split_crs
 from sc3d.io.json_files import read_json, write_json
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 LARGEST = (90.0, 180.0, 1e6)  # latitude, longitude, degrees; height, m
+LARGEST_STRETCH = 1.0  # per cent; a neighboring UTM zone stretches lengths by 0.3
 POINTS_AT_ONCE = 1_000_000  # points per call of PROJ
 IDENTITY = tuple(tuple(float(row == column) for column in range(4)) for row in range(4))
 
@@ -114,9 +116,11 @@ def from_origin(
     epsg: int | None = None,
     altitude_offset: float = 0.0,
     figures: dict | None = None,
+    quiet: bool = False,
 ) -> Georeference:
     """Georeference of a world in local ENU at `origin` (latitude, longitude, height); `epsg` None = the UTM
-    zone there (WGS 84).
+    zone there (WGS 84). Warns, unless `quiet`, of a CRS that is made for elsewhere or stretches lengths;
+    InputError if it is both.
     """
     origin = triple(origin)
     zone = epsg or utm_epsg(origin[0], origin[1])
@@ -124,17 +128,51 @@ def from_origin(
         np.zeros((1, 3))
     )[0]
     offset = triple(np.round(here))
-    area = projected_crs(zone).area_of_use
-    if area is not None and not (
-        area.south <= origin[0] <= area.north and area.west <= origin[1] <= area.east
-    ):
-        logger.warning(
-            "EPSG:%d is made for %s: the scene at latitude %.4f, longitude %.4f lies outside",
-            zone,
-            area.name,
-            *origin[:2],
-        )
+    check_area(projected_crs(zone), origin, quiet)
     return Georeference(zone, offset, origin, altitude_offset=altitude_offset, figures=figures or {})
+
+
+def check_area(crs: pyproj.CRS, origin: tuple[float, float, float], quiet: bool = False) -> None:
+    """A warning, unless `quiet`, where a CRS is made for elsewhere or stretches lengths at a place (latitude,
+    longitude, height); InputError where it is both.
+    """
+    area, percent = crs.area_of_use, 100 * _stretch(crs, origin)
+    here = f"the scene at latitude {origin[0]:.4f}, longitude {origin[1]:.4f}"
+    name = f"EPSG:{crs.to_epsg()}"
+    inside = area is None or (
+        area.south <= origin[0] <= area.north
+        # an area across 180 degrees has its west in the east
+        and (area.west <= origin[1] or area.west > area.east)
+        and (origin[1] <= area.east or (area.west > area.east and origin[1] >= area.west))
+    )
+    if area is not None and not inside and percent > LARGEST_STRETCH:
+        raise InputError(
+            f"{name} is made for {area.name}: {here} lies far outside, where it stretches lengths by {percent:.0f} %; choose the CRS of the place with --epsg"
+        )
+    if quiet:
+        return
+    if area is not None and not inside:
+        logger.warning("%s is made for %s: %s lies outside", name, area.name, here)
+    if inside and percent > LARGEST_STRETCH:
+        logger.warning(
+            "%s stretches lengths by %.0f %% at %s: areas and slopes measured in it are wrong",
+            name,
+            percent,
+            here,
+        )
+
+
+def _stretch(crs: pyproj.CRS, origin: tuple[float, float, float]) -> float:
+    """How much longer or shorter a meter becomes at a place, as a fraction; infinite where a CRS ends."""
+    import pyproj
+
+    with np.errstate(all="ignore"):
+        try:
+            factors = pyproj.Proj(crs).get_factors(origin[1], origin[0])
+        except pyproj.exceptions.ProjError:
+            return float("inf")
+    scales = np.array([factors.tissot_semimajor, factors.tissot_semiminor])
+    return float(np.abs(scales - 1).max()) if np.isfinite(scales).all() else float("inf")
 
 
 def triple(values: Iterable[float]) -> tuple[float, float, float]:
@@ -216,6 +254,12 @@ def projected_crs(epsg: int) -> pyproj.CRS:
         raise InputError(
             f"EPSG:{epsg} is unknown: give the code of a projected CRS, such as 32615 for WGS 84 / UTM zone 15N"
         ) from None
+    if crs.is_compound or len(crs.axis_info) > 2:
+        horizontal = split_crs(crs)[0]
+        raise InputError(
+            f"EPSG:{epsg} ({crs.name}) is a CRS of heights too, which are not converted here: give its horizontal part,"
+            f" {horizontal.name}" + (f", EPSG:{horizontal.to_epsg()}" if horizontal.to_epsg() else "")
+        )
     if not crs.is_projected:
         raise InputError(
             f"EPSG:{epsg} ({crs.name}) is not a projected CRS: choose one with eastings and northings, such as a UTM zone"
@@ -251,11 +295,14 @@ def geodetic_to_enu(geodetic: np.ndarray, origin: tuple[float, float, float]) ->
 
 
 def crs_to_geodetic(points: np.ndarray, crs: pyproj.CRS) -> np.ndarray:
-    """(N, 3) easting, northing, height (unit of the CRS), or longitude, latitude, height of a geographic CRS,
-    to latitude, longitude, height (m).
+    """(N, 3) easting, northing, height of a projected CRS, or longitude, latitude, height of a geographic one,
+    to latitude, longitude, height (m). Heights are in the unit that the CRS states for them, whatever they are
+    above; without one in that of a projected CRS, else in meters.
     """
     points = np.asarray(points, np.float64)
-    unit = crs.axis_info[0].unit_conversion_factor if crs.is_projected else 1.0
+    crs, unit = split_crs(crs)
+    if unit is None:
+        unit = crs.axis_info[0].unit_conversion_factor if crs.is_projected else 1.0
     longitude, latitude = _transformer("EPSG:4326", crs).transform(
         points[:, 0], points[:, 1], direction="INVERSE"
     )

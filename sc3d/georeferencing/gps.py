@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.georeferencing.alignment import (
     Similarity,
     fit_similarity_robust,
@@ -22,10 +22,17 @@ from sc3d.georeferencing.georeference import (
     crs_to_geodetic,
     enu_to_geodetic,
     from_origin,
+    geodetic_to_enu,
     triple,
     utm_epsg,
 )
-from sc3d.georeferencing.geotags import Geotag, enu_positions, read_geotags
+from sc3d.georeferencing.geotags import (
+    STANDARD_DEVIATION,
+    Geotag,
+    coarse_step,
+    enu_positions,
+    read_geotags,
+)
 from sc3d.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -34,6 +41,10 @@ MIN_GPS = 3  # a similarity needs three positions
 # standard deviations, and not less than OUTLIER_METERS: a position this far off takes no part in the fit
 OUTLIER = 5.0
 OUTLIER_METERS = 10.0
+# a position is astray behind a gap this many times as wide as the rest lies from its middle, and in m; the rest
+# is this share at least
+FAR, FAR_METERS, FAR_SHARE = 10.0, 1000.0, 0.6
+EARTH_RADIUS, METERS_PER_DEGREE = 6_371_000.0, 111_200.0
 # relative, radians: a model within these of ENU is ENU, its rest is the noise of GPS
 SAME_SCALE, SAME_ANGLE = 1e-3, 1e-3
 
@@ -44,51 +55,198 @@ class Flight:
 
     tags: by photo name, in the order of the names
     shape: "line" (the roll about it stays open) or "area"
-    origin: latitude, longitude (degrees), altitude (m) of the local ENU frame; that of the first photo as a
-        rule
+    origin: latitude, longitude (degrees), altitude (m) of the local ENU frame; that of the first photo that
+        is not astray, as a rule
+    astray: photos whose positions lie so far from all others that cameras can only say that they are wrong
     """
 
     tags: dict[str, Geotag]
     shape: str
     origin: tuple[float, float, float]
+    astray: frozenset[str] = frozenset()
 
     @cached_property
     def positions(self) -> dict[str, np.ndarray]:
         """ENU position (3,) of each photo, m."""
         return dict(zip(self.tags, enu_positions(self.tags, self.origin)))
 
+    def without(self, names: frozenset[str]) -> Flight:
+        """The flight of the other photos, at the same origin if that is still the position of one."""
+        tags = {name: tag for name, tag in self.tags.items() if name not in names}
+        origin = self.origin
+        if origin not in {tag.geodetic for tag in tags.values()}:
+            origin = next(iter(tags.values())).geodetic
+        return Flight(tags, _shape(tags, origin), origin)
 
-def read_flight(folder: Path, names: list[str]) -> Flight | None:
-    """GPS of the photos (names relative to `folder`); None, with a warning, where it can place no model."""
-    tags = read_geotags(folder, names)
-    if len(tags) < MIN_GPS:
-        logger.warning(
+
+def read_flight(folder: Path, names: list[str], quiet: bool = False) -> Flight | None:
+    """GPS of the photos (names relative to `folder`); None where it can place no model. Says so in warnings
+    unless `quiet`.
+    """
+    level = logging.DEBUG if quiet else logging.WARNING
+    tags, reasons = read_geotags(folder, names)
+    far = _astray(tags)
+    reasons |= dict.fromkeys(far, "far from all others")
+    usable = {name: tag for name, tag in _coarse(tags, level).items() if name not in far}
+    if len(usable) < MIN_GPS:
+        logger.log(
+            level,
             "%s: the model gets no scale, no north and no position",
-            f"only {len(tags)} of {len(names)} photos have GPS" if tags else "no photo has GPS",
+            f"only {len(usable)} of {len(names)} photos have GPS{_counted(reasons)}"
+            if tags or len(set(reasons.values())) > 1
+            else f"no photo has GPS{_counted(reasons)}",
         )
         return None
-    sigma = np.median([tag.sigma for tag in tags.values()], axis=0)
-    origin = next(iter(tags.values())).geodetic
-    positions = enu_positions(tags, origin)
-    shape = flight_shape(positions, float(sigma[:2].mean()))
+    origin = next(iter(usable.values())).geodetic
+    shape = _shape(usable, origin)
     if shape == "point":
-        logger.warning(
+        extent = float(np.linalg.norm(np.ptp(enu_positions(usable, origin), axis=0)))
+        logger.log(
+            level,
             "all GPS positions lie within %.1f m of one another, no more than they err: they give no scale, and none is used",
-            float(np.linalg.norm(np.ptp(positions, axis=0))),
+            extent,
         )
         return None
     if shape == "line":
-        logger.warning(
+        logger.log(
+            level,
             "all photos with GPS lie on one line: GPS leaves the tilt about it open, the main plane of the points is taken for level. "
-            "A second strip beside the first, or ground control points (--gcp), would fix it"
+            "A second strip beside the first, or ground control points (--gcp), would fix it",
         )
-    if len(tags) < len(names):
-        logger.warning("%d of %d photos have GPS; the others follow", len(tags), len(names))
-    return Flight(tags, shape, origin)
+    if reasons:
+        logger.log(
+            level,
+            "%d of %d photos have GPS; the others follow%s",
+            len(usable),
+            len(names),
+            _counted(reasons),
+        )
+    return Flight(tags | usable, shape, origin, far)
+
+
+def _counted(reasons: dict[str, str]) -> str:
+    """ " (2 without an altitude: a.jpg, b.jpg)": photos by what is wrong with their GPS; "" for those that have
+    none at all.
+    """
+    kinds: dict[str, list[str]] = {}
+    for name, why in reasons.items():
+        kinds.setdefault(why, []).append(name)
+    kinds.pop("without a position", None)
+    parts = [f"{len(found)} {why}: {examples(found)}" for why, found in kinds.items()]
+    return f" ({'; '.join(parts)})" if parts else ""
+
+
+def _astray(tags: dict[str, Geotag]) -> frozenset[str]:
+    """Photos beyond a gap that is many times as wide as all the others lie apart, such as those with the
+    last position of another day. A long line, or sites side by side, have no such gap.
+    """
+    if len(tags) < MIN_GPS:
+        return frozenset()
+    names, places = list(tags), _geocentric(np.array([tag.geodetic for tag in tags.values()]))
+    distance = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    order = np.argsort(distance, kind="stable")
+    ranked = distance[order]
+    gaps = ranked[1:] > np.maximum(FAR_METERS, FAR * ranked[:-1])
+    gaps[: int(np.ceil(FAR_SHARE * len(tags))) - 1] = False
+    return frozenset(names[row] for row in order[int(np.argmax(gaps)) + 1 :]) if gaps.any() else frozenset()
+
+
+def _geocentric(geodetic: np.ndarray) -> np.ndarray:
+    """(N, 3) directions from the middle of the Earth, times its radius, m; heights do not count. A sphere is
+    near enough to tell sites apart.
+    """
+    latitude, longitude = np.radians(geodetic[:, :2]).T
+    flat = np.cos(latitude)
+    return EARTH_RADIUS * np.stack(
+        [flat * np.cos(longitude), flat * np.sin(longitude), np.sin(latitude)], axis=1
+    )
+
+
+def _coarse(tags: dict[str, Geotag], level: int) -> dict[str, Geotag]:
+    """The tags; where all positions are cut to a coarse step, such as whole seconds, with the deviation that
+    this makes.
+    """
+    angles = np.array([tag.geodetic[:2] for tag in tags.values()]).reshape(-1, 2)
+    step = METERS_PER_DEGREE * coarse_step(angles) if len(tags) >= MIN_GPS else 0.0
+    sigma = step / np.sqrt(12)
+    if sigma <= max(STANDARD_DEVIATION):
+        return tags
+    logger.log(level, "all GPS positions are cut to steps of %.0f m: they place the model no better", step)
+    return {
+        name: replace(tag, deviation=tag.deviation or (sigma, sigma, STANDARD_DEVIATION[2]))
+        for name, tag in tags.items()
+    }
+
+
+def _shape(tags: dict[str, Geotag], origin: tuple[float, float, float]) -> str:
+    """`flight_shape` of some geotags."""
+    sigma = np.median([tag.sigma for tag in tags.values()], axis=0)
+    return flight_shape(enu_positions(tags, origin), float(sigma[:2].mean()))
+
+
+def agree(flight: Flight, centers: dict[str, np.ndarray]) -> Flight | None:
+    """The flight without the photos whose GPS does not fit the cameras, with the shape and the origin that
+    are left; the same flight if all fit.
+
+    centers: camera center (3,) by photo name, in any frame
+    returns: None, with a warning, where GPS and cameras do not fit, or too little is left
+    """
+    names = [name for name in flight.tags if name in centers]
+    if len(names) < MIN_GPS:
+        logger.warning("only %d registered photos have GPS: it is not used", len(names))
+        return None
+    source = np.array([centers[name] for name in names])
+    target = np.array([flight.positions[name] for name in names])
+    fit, kept = fit_similarity_robust(source, target, _tolerance(flight, names))
+    if kept.sum() < max(MIN_GPS, len(names) / 2):
+        logger.warning(
+            "GPS of %d of %d registered photos does not fit the cameras, it is not used%s",
+            len(names) - kept.sum(),
+            len(names),
+            ": with latitude and longitude exchanged it would fit"
+            if _exchanged(flight, names, source)
+            else "",
+        )
+        return None
+    if kept.all() and not flight.astray:
+        return flight
+    wrong = np.array(names)[~kept].tolist()
+    if wrong:
+        logger.warning(
+            "GPS of %d of %d photos is wrong, by up to %s, and left out: %s",
+            len(wrong),
+            len(names),
+            _far(float(np.linalg.norm(fit.apply(source) - target, axis=1)[~kept].max())),
+            examples(wrong),
+        )
+    agreed = flight.without(frozenset(wrong) | {name for name in flight.astray if name not in centers})
+    if agreed.shape == "point":
+        logger.warning("the GPS positions that fit the cameras lie too close together: they are not used")
+        return None
+    return agreed
+
+
+def _far(meters: float) -> str:
+    return f"{meters:.0f} m" if meters < 10_000 else f"{meters / 1000:.0f} km"
+
+
+def _tolerance(flight: Flight, names: list[str]) -> float:
+    """Distance, m, beyond which a position does not fit its camera."""
+    return float(max(OUTLIER * np.median([flight.tags[name].sigma for name in names]), OUTLIER_METERS))
+
+
+def _exchanged(flight: Flight, names: list[str], source: np.ndarray) -> bool:
+    """Whether latitudes and longitudes, exchanged, fit camera centers (N, 3)."""
+    geodetic = np.array([flight.tags[name].geodetic for name in names])[:, [1, 0, 2]]
+    if np.abs(geodetic[:, 0]).max() > 90:
+        return False
+    target = geodetic_to_enu(geodetic, triple(geodetic[0]))
+    return bool(fit_similarity_robust(source, target, _tolerance(flight, names))[1].mean() > 0.5)
 
 
 def place(flight: Flight, centers: dict[str, np.ndarray], points: np.ndarray) -> Similarity | None:
-    """Similarity from a model's frame to the flight's ENU.
+    """Similarity from a model's frame to the flight's ENU; of a flight that has been through `agree` all
+    positions count.
 
     centers: camera center (3,) by photo name, photos without GPS included; points: (P, 3) of the model, for
         the level of a flight along a line
@@ -101,16 +259,9 @@ def place(flight: Flight, centers: dict[str, np.ndarray], points: np.ndarray) ->
         np.array([centers[name] for name in names]),
         np.array([flight.positions[name] for name in names]),
     )
-    sigma = np.median([flight.tags[name].sigma for name in names])
-    fit, kept = fit_similarity_robust(source, target, max(OUTLIER * sigma, OUTLIER_METERS))
+    fit, kept = fit_similarity_robust(source, target, _tolerance(flight, names))
     if kept.sum() < MIN_GPS:
         return None
-    if not kept.all():
-        logger.warning(
-            "GPS of %d photos is wrong and left out of the alignment: %s",
-            (~kept).sum(),
-            ", ".join(np.array(names)[~kept]),
-        )
     return _rolled(fit, target[kept], points) if flight.shape == "line" else fit
 
 
@@ -172,9 +323,11 @@ def find_georeference(
     crs = _in_crs(flight, centers, epsg)
     if crs is not None:
         return crs
-    fit = place(flight, centers, points)
-    if fit is None:
+    agreed = agree(flight, centers)
+    fit = place(agreed, centers, points) if agreed else None
+    if agreed is None or fit is None:
         return None
+    flight = agreed
     if abs(fit.scale - 1) < SAME_SCALE and fit.angle < SAME_ANGLE:
         origin = triple(enu_to_geodetic(fit.apply(np.zeros((1, 3))), flight.origin)[0])
         return from_origin(origin, epsg, figures={"gps": residuals(replace(flight, origin=origin), centers)})

@@ -4,6 +4,7 @@ classes and whatever else they hold.
 
 from __future__ import annotations
 
+import logging
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,17 +14,45 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.clouds import read_cloud, read_mesh
-from sc3d.io.las import check_las
-from sc3d.io.ply import read_header
+from sc3d.io.colors import COLORS, color_names, to_bytes
+from sc3d.io.crs import read_las_crs
+from sc3d.io.las import open_las
+from sc3d.io.ply import RESERVED, read_header
+from sc3d.io.splats import OTHER_FORMATS, SPLATS
+from sc3d.io.text_clouds import read_table
 
 if TYPE_CHECKING:
     import laspy
     import open3d as o3d
 
+logger = logging.getLogger(__name__)
+
 CLOUDS = {".ply", ".las", ".laz", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts", ".txt", ".csv", ".asc"}
 MESHES = {".ply", ".obj"}
+# clouds and meshes that are refused by name
+UNREAD = {
+    ".e57",
+    ".ptx",
+    ".rcp",
+    ".rcs",
+    ".fls",
+    ".stl",
+    ".glb",
+    ".gltf",
+    ".fbx",
+    ".dae",
+    ".off",
+} | OTHER_FORMATS
 # as PDAL and CloudCompare name it
 CLASSIFICATION = ("classification", "scalar_Classification", "scalar_classification", "Classification")
+# as CloudCompare and PDAL name them in LAS, and PCL in PCD
+NORMALS = (
+    ("NormalX", "NormalY", "NormalZ"),
+    ("normalx", "normaly", "normalz"),
+    ("nx", "ny", "nz"),
+    ("normal_x", "normal_y", "normal_z"),
+)
+AXES = (("x", "easting", "east", "e"), ("y", "northing", "north", "n"), ("z", "height", "elevation", "h"))
 LAS_EXTRAS = ("intensity", "return_number", "number_of_returns")
 
 
@@ -55,8 +84,12 @@ def read_geometry(path: Path) -> Geometry:
         found = _read_open3d(path)
     elif suffix in CLOUDS:
         found = _read_text(path)
+    elif suffix in OTHER_FORMATS:
+        raise InputError(f"{path} {SPLATS}")
     else:
-        raise InputError(f"{path}: {', '.join(sorted(CLOUDS | MESHES))} can be read")
+        raise InputError(
+            f"{path}: {', '.join(sorted(CLOUDS | MESHES))} can be read: save it as LAS, LAZ or PLY (meshes: PLY or OBJ)"
+        )
     if not len(found.positions):
         raise InputError(f"{path} holds no points")
     if not np.isfinite(found.positions).all():
@@ -86,25 +119,19 @@ def to_open3d(geometry: Geometry) -> o3d.t.geometry.PointCloud | o3d.t.geometry.
             )
         )
     for name, values in geometry.attributes.items():
-        table[name] = tensor(np.ascontiguousarray(values.reshape(len(values), -1)))
+        columns = np.ascontiguousarray(values.reshape(len(values), -1))
+        if name not in RESERVED:
+            table[name] = tensor(columns)
+        elif name == "normals" and columns.shape[1] == 3:
+            table.normals = tensor(columns)
+        else:  # not what Open3D means by it
+            table[f"{name}_"] = tensor(columns)
     return made
 
 
 def _read_las(path: Path) -> Geometry:
-    import laspy
-
-    check_las(path)
-    try:
-        # not laszip, which ends the process for broken files
-        file = laspy.read(path, laz_backend=(laspy.LazBackend.LazrsParallel, laspy.LazBackend.Lazrs))
-        return _las_geometry(file, path)
-    except (KeyboardInterrupt, InputError):
-        raise
-    # laspy raises many kinds for broken files; a panic of lazrs is no Exception
-    except BaseException as error:
-        raise InputError(
-            f"cannot read {path}: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
-        ) from None
+    with open_las(path) as reader:
+        return _las_geometry(reader.read(), path)
 
 
 def _las_geometry(file: laspy.LasData, path: Path) -> Geometry:
@@ -116,30 +143,22 @@ def _las_geometry(file: laspy.LasData, path: Path) -> Geometry:
     attributes |= {name: np.asarray(file[name]) for name in file.point_format.extra_dimension_names}
     colors = None
     if {"red", "green", "blue"} <= names:
-        colors = np.stack([np.asarray(file[name]) for name in ("red", "green", "blue")], axis=1)
-        colors = (colors >> 8 if colors.max(initial=0) > 255 else colors).astype(np.uint8)
-    return Geometry(
-        np.asarray(file.xyz, np.float64),
-        colors,
-        {name: _storable(values) for name, values in attributes.items()},
-        epsg=_las_epsg(file.header, path),
-    )
+        colors = to_bytes(np.stack([np.asarray(file[name]) for name in ("red", "green", "blue")], axis=1))
+    crs = read_las_crs(file.header, path)
+    positions = np.asarray(file.xyz, np.float64)
+    positions[:, 2] *= crs.height_scale
+    return Geometry(positions, colors, _with_normals(attributes), epsg=crs.epsg)
 
 
-def _las_epsg(header: laspy.LasHeader, path: Path) -> int | None:
-    """EPSG code of the horizontal CRS in a LAS header."""
-    import pyproj
-
-    try:
-        crs = header.parse_crs()
-    except (pyproj.exceptions.CRSError, ValueError, IndexError):
-        return None
-    if crs is None:
-        return None
-    crs = crs.sub_crs_list[0] if crs.is_compound else crs
-    if crs.is_geographic:
-        raise InputError(f"{path} is in {crs.name}, in degrees: convert it to a projected CRS first")
-    return crs.to_epsg()
+def _with_normals(attributes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same attributes, with normals in three of them under their usual name."""
+    for names in NORMALS:
+        if set(names) <= attributes.keys():
+            normals = np.stack([attributes[name] for name in names], axis=1).astype(np.float32)
+            return {name: values for name, values in attributes.items() if name not in names} | {
+                "normals": normals
+            }
+    return attributes
 
 
 def _read_open3d(path: Path) -> Geometry:
@@ -147,27 +166,20 @@ def _read_open3d(path: Path) -> Geometry:
     table = {name: values.numpy() for name, values in cloud.point.items()}
     colors = table.pop("colors", None)
     positions = table.pop("positions")
-    if colors is not None and colors.dtype != np.uint8:
-        colors = np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8)
     return Geometry(
         positions.astype(np.float64),
         colors,
-        _classified({name: _storable(values) for name, values in table.items()}),
+        _with_normals(_classified(table)),
     )
 
 
 def _read_ply_mesh(path: Path) -> Geometry:
-    """A PLY mesh with Open3D's older reader, which keeps float64; further attributes of the vertices are
-    lost.
-    """
-    import open3d as o3d
-
-    read_mesh(path)  # checks that it is whole
-    mesh = o3d.io.read_triangle_mesh(str(path))
-    colors = (
-        np.rint(np.asarray(mesh.vertex_colors) * 255).astype(np.uint8) if mesh.has_vertex_colors() else None
+    """Further attributes of the vertices are lost."""
+    mesh = read_mesh(path)
+    colors = to_bytes(mesh.vertex.colors.numpy()) if "colors" in mesh.vertex else None
+    return Geometry(
+        mesh.vertex.positions.numpy().astype(np.float64), colors, {}, mesh.triangle.indices.numpy()
     )
-    return Geometry(np.asarray(mesh.vertices), colors, {}, np.asarray(mesh.triangles))
 
 
 def _read_obj(path: Path) -> Geometry:
@@ -176,7 +188,7 @@ def _read_obj(path: Path) -> Geometry:
     """
     vertices, faces = [], []
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
             for line in file:
                 if line.startswith("v "):
                     vertices.append([float(word) for word in line.split()[1:]])
@@ -192,50 +204,66 @@ def _read_obj(path: Path) -> Geometry:
         raise InputError(f"{path} cannot be read as OBJ: {error}") from None
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(table):
         raise InputError(f"{path} holds no triangles, or triangles of vertices that it does not hold")
-    colors = table[:, 3:6] if table.shape[1] >= 6 else None
-    colors = (
-        None
-        if colors is None
-        else np.clip(np.rint(colors * (255 if colors.max() <= 1 else 1)), 0, 255).astype(np.uint8)
-    )
+    colors = to_bytes(table[:, 3:6]) if table.shape[1] >= 6 else None
     return Geometry(table[:, :3], colors, {}, triangles)
 
 
 def _read_text(path: Path) -> Geometry:
-    """x y z per line, then colors (three whole numbers up to 255) or normals; separated by blanks, commas,
-    semicolons or tabs; a header is skipped.
+    """A cloud as text (`io.text_clouds`), by its header, or x y z and then colors or normals, by their
+    values.
     """
-    rows = []
-    with path.open(encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file, start=1):
-            words = line.replace(",", " ").replace(";", " ").split()
-            if not words or words[0].startswith(("#", "//")):
-                continue
-            try:
-                rows.append([float(word) for word in words])
-            except ValueError:
-                if rows:
-                    raise InputError(
-                        f"{path}, line {number}: numbers are expected, not {line.strip()[:60]!r}"
-                    ) from None
-    width = len(rows[-1]) if rows else 0
-    # PTS starts with the number of points
-    rows = [row for row in rows if len(row) == width] if rows and len(rows[0]) == 1 else rows
-    if width < 3 or any(len(row) != width for row in rows):
-        raise InputError(f"{path}: x y z [r g b] with as many numbers in every line are expected")
-    table = np.array(rows)
+    names, table = read_table(path)
+    columns = dict(zip(names, table.T, strict=True)) if names else {}
+    axes = [next((name for name in known if name in columns), "") for known in AXES]
+    if not all(axes):
+        if names:
+            logger.warning(
+                "%s: its header (%s) names no x, y and z: the first three columns are taken",
+                path,
+                " ".join(names),
+            )
+        columns, axes = _unnamed(path, table), list("xyz")
+    positions = np.stack([columns.pop(axis) for axis in axes], axis=1)
+    found = color_names(columns)
+    colors = None if found is None else np.stack([columns.pop(name) for name in found], axis=1)
+    if colors is not None:
+        are_bytes = colors.max(initial=0) > 1 and bool((colors == np.rint(colors)).all())
+        colors = to_bytes(colors.astype(np.int64) if are_bytes else colors)
+    return Geometry(positions, colors, _with_normals(_classified(columns)))
+
+
+def _unnamed(path: Path, table: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns by what their values look like: x y z, then three colors or normals."""
+    columns = dict(zip("xyz", table[:, :3].T, strict=True))
     # PTS has the intensity in front of the colors
-    offset = 4 if path.suffix.lower() == ".pts" and width == 7 else 3
-    rest = table[:, offset : offset + 3]
-    colored = (
-        rest.shape[1] == 3 and (rest >= 0).all() and (rest <= 255).all() and (rest == np.rint(rest)).all()
-    )
-    normals = rest.shape[1] == 3 and not colored and np.allclose(np.linalg.norm(rest, axis=1), 1, atol=0.05)
-    return Geometry(
-        table[:, :3],
-        rest.astype(np.uint8) if colored else None,
-        {"normals": rest.astype(np.float32)} if normals else {},
-    )
+    start = 4 if path.suffix.lower() == ".pts" and table.shape[1] >= 7 else 3
+    kinds = []
+    for first in range(start, table.shape[1] - 2, 3):
+        part = table[:, first : first + 3]
+        names = _kind(part)
+        if names is None or names in kinds:
+            break
+        kinds.append(names)
+        columns |= dict(zip(names, part.T, strict=True))
+    used = start + 3 * len(kinds)
+    if used < table.shape[1]:
+        logger.warning(
+            "%s: %d of its %d columns have no names and are left out",
+            path,
+            table.shape[1] - used + start - 3,
+            table.shape[1],
+        )
+    return columns
+
+
+def _kind(part: np.ndarray) -> tuple[str, str, str] | None:
+    """Names of three columns (N, 3): normals, colors or None."""
+    whole, low, high = bool((part == np.rint(part)).all()), part.min(), part.max()
+    if (not whole or low < 0) and np.allclose(np.linalg.norm(part, axis=1), 1, atol=0.05):
+        return NORMALS[0]
+    if low >= 0 and (high <= 1 or whole and high <= 65535):
+        return COLORS
+    return None
 
 
 def is_mesh(path: Path) -> bool:
@@ -260,17 +288,3 @@ def _classified(attributes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             values = attributes.pop(name)
             return attributes | {"classification": np.clip(np.rint(values), 0, 255).astype(np.uint8)}
     return attributes
-
-
-def _storable(values: np.ndarray) -> np.ndarray:
-    """Numbers of a type that Open3D writes to PLY."""
-    if values.dtype == bool:
-        return values.astype(np.uint8)
-    if (
-        values.dtype.kind == "u"
-        and values.dtype.itemsize > 1
-        or values.dtype.kind == "i"
-        and values.dtype.itemsize > 4
-    ):
-        return values.astype(np.int32 if values.max(initial=0) < 2**31 else np.float64)
-    return values.astype(np.float32) if values.dtype == np.float16 else values

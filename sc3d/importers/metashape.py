@@ -6,28 +6,31 @@ chunk) is a similarity from there to geocentric coordinates, or to local ones wi
     x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 xy    u = w/2 + cx + x' f + x' b1 + y' b2
     y' = y (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p2 (r2 + 2 y2) + 2 p1 xy    v = h/2 + cy + y' f
 so p1 and p2 are OpenCV's p2 and p1. A fisheye has the angle from the axis in place of the radius.
+p3 and p4 multiply the tangential terms by 1 + p3 r2 + p4 r4. Additional corrections (<corrections>) are added
+to u, v: a Fourier series over the photo in pixels, with 48 pairs of coefficients for u and v. What no COLMAP
+model has costs pixels, which are compared with a tolerance.
+
+Cameras without a pose of their own are left out: those that were not aligned, and those of a rig but for its
+master (`master_id`), as the units of a rig's offsets are not stated.
 """
 
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+import pycolmap
 import pyproj
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
-from sc3d.geometry.distortion import DistortionModel, to_camera
-from sc3d.georeferencing.alignment import Similarity, fit_similarity
-from sc3d.georeferencing.georeference import (
-    Georeference,
-    crs_to_geodetic,
-    from_origin,
-    geodetic_to_enu,
-    triple,
-)
+from sc3d.geometry.distortion import DistortionModel, Lenses, NoModelError
+from sc3d.georeferencing.alignment import Similarity
+from sc3d.georeferencing.georeference import Georeference, crs_to_geodetic, from_origin
+from sc3d.importers.frames import enu_of_geocentric, moved_view
 from sc3d.importers.project import Project, rigid
 from sc3d.settings.reconstruction import Import
 
@@ -58,7 +61,7 @@ def matches(path: Path) -> bool:
     if path.suffix.lower() != ".xml" or not path.is_file():
         return False
     with path.open("rb") as file:
-        head = file.read(1 << 16)
+        head = file.read(1 << 16).replace(b"\0", b"")  # UTF-16, too
     return b"<chunk" in head and b"<sensor" in head
 
 
@@ -68,41 +71,40 @@ def files(path: Path) -> list[Path]:
 
 def read(path: Path, settings: Import) -> Project:
     chunk = _chunk(path)
-    cameras = {
-        sensor.get("id"): to_camera(
-            _distortion_model(sensor, path), settings.tolerance, f"{path}, sensor {sensor.get('label')!r}"
-        )
-        for sensor in chunk.iterfind("./sensors/sensor")
-        if _calibration(sensor) is not None
-    }
-    enabled = [
-        camera
-        for camera in chunk.iterfind("./cameras//camera")
-        if camera.get("enabled", "true") not in ("0", "false")
-    ]
-    placed = [
-        camera
-        for camera in enabled
-        if camera.find("transform") is not None and camera.get("sensor_id") in cameras
-    ]
-    transforms = _transforms(chunk, placed, path)
-    kept = [camera for camera in placed if camera.get("component_id") in transforms]
-    if len(kept) < len(placed):
-        logger.warning(
-            "%s: %d photos of other components are left out, as nothing says how these lie to one another",
-            path,
-            len(placed) - len(kept),
-        )
+    enabled, left_out = _sorted_cameras(chunk)
+    transforms = _transforms(chunk, enabled, path)
+    cameras, no_model = _cameras(chunk, enabled, path, settings.tolerance)
+    kept = []
+    for camera in enabled:
+        if camera.get("component_id") not in transforms:
+            reason = "of other components, which nothing places to the others"
+        elif camera.get("sensor_id") not in cameras:
+            reason = no_model.get(camera.get("sensor_id"), "without a calibrated sensor")
+        else:
+            kept.append(camera)
+            continue
+        left_out.setdefault(reason, []).append(_label(camera))
     poses = [_pose(camera, transforms[camera.get("component_id")], path) for camera in kept]
     views = [
-        View(camera.get("label", ""), cameras[camera.get("sensor_id")], pose)
-        for camera, pose in zip(kept, poses)
+        View(name, cameras[camera.get("sensor_id")], pose)
+        for name, camera, pose in zip(_names(chunk, kept), kept, poses)
     ]
+    _warn_of_shutter(chunk, kept, path)
+    if len(transforms) > 1 and _crs(chunk, path) is None:
+        logger.warning(
+            "%s: %d components are read as of one frame, but no CRS says that they are: check how they lie to one another",
+            path,
+            len(transforms),
+        )
     moved, georeference = _to_local(views, chunk, path)
-    return Project("metashape", moved, georeference=georeference, notes={"chunk": chunk.get("label", "")})
+    notes: dict[str, object] = {"chunk": chunk.get("label", "")}
+    if chunk.find("transform") is None and chunk.find("./components/component/transform") is None:
+        notes["scale"] = "arbitrary, as the chunk is not referenced"
+    return Project("metashape", moved, georeference=georeference, notes=notes, left_out=left_out)
 
 
 def _chunk(path: Path) -> ElementTree.Element:
+    """The chunk with most cameras that have a pose."""
     try:
         root = ElementTree.parse(path, ElementTree.XMLParser(target=_Builder())).getroot()
     except (ElementTree.ParseError, LookupError, ValueError) as error:
@@ -110,9 +112,117 @@ def _chunk(path: Path) -> ElementTree.Element:
     chunks = [root] if root.tag == "chunk" else list(root.iter("chunk"))
     if not chunks:
         raise InputError(f"{path} has no chunk: {EXPECTED}")
+    chunk = max(chunks, key=lambda chunk: len(_sorted_cameras(chunk)[0]))
     if len(chunks) > 1:
-        logger.warning("%s has %d chunks: the first one is read", path, len(chunks))
-    return chunks[0]
+        told = [
+            f"{other.get('label')!r} ({len(_sorted_cameras(other)[0])} photos)"
+            for other in chunks
+            if other is not chunk
+        ]
+        logger.warning(
+            "%s has %d chunks: %r, with most placed photos (%d), is read; left out: %s",
+            path,
+            len(chunks),
+            chunk.get("label"),
+            len(_sorted_cameras(chunk)[0]),
+            ", ".join(told),
+        )
+    return chunk
+
+
+def _sorted_cameras(chunk: ElementTree.Element) -> tuple[list[ElementTree.Element], dict[str, list[str]]]:
+    """The cameras that are enabled and have a pose, and the labels of all others by reason."""
+    placed: list[ElementTree.Element] = []
+    left_out: dict[str, list[str]] = {}
+    for camera in chunk.iterfind("./cameras//camera"):
+        if camera.get("enabled", "true") in ("0", "false"):
+            reason = "disabled"
+        elif camera.find("transform") is not None:
+            placed.append(camera)
+            continue
+        else:
+            reason = (
+                "of a rig but for its master, without a pose of their own"
+                if camera.get("master_id") not in (None, camera.get("id"))
+                else "without a position, as they are not aligned"
+            )
+        left_out.setdefault(reason, []).append(_label(camera))
+    return placed, left_out
+
+
+def _label(camera: ElementTree.Element) -> str:
+    return camera.get("label", "")
+
+
+def _names(chunk: ElementTree.Element, cameras: list[ElementTree.Element]) -> list[str]:
+    """Labels of cameras, behind that of their group where several cameras have the same."""
+    groups = {
+        camera.get("id"): group.get("label", "")
+        for group in chunk.iterfind("./cameras//group")
+        for camera in group.iter("camera")
+    }
+    counts = Counter(map(_label, cameras))
+    return [
+        f"{groups[camera.get('id')]}/{_label(camera)}"
+        if counts[_label(camera)] > 1 and groups.get(camera.get("id"))
+        else _label(camera)
+        for camera in cameras
+    ]
+
+
+def _cameras(
+    chunk: ElementTree.Element, placed: list[ElementTree.Element], path: Path, tolerance: float
+) -> tuple[dict[str | None, pycolmap.Camera], dict[str | None, str]]:
+    """COLMAP cameras of the sensors that cameras use, by id; and why some are of no kind that COLMAP has,
+    unless all are.
+    """
+    lenses, used = Lenses(tolerance), {camera.get("sensor_id") for camera in placed}
+    cameras: dict[str | None, pycolmap.Camera] = {}
+    no_model: dict[str | None, NoModelError] = {}
+    for sensor in chunk.iterfind("./sensors/sensor"):
+        where = f"{path}, sensor {sensor.get('label')!r}"
+        if sensor.get("id") not in used:
+            continue
+        try:
+            _check_kind(sensor, where)
+            if _calibration(sensor) is not None:
+                cameras[sensor.get("id")] = lenses.camera(_distortion_model(sensor, path), where)
+        except NoModelError as error:
+            no_model[sensor.get("id")] = error
+    if no_model and not cameras:
+        raise next(iter(no_model.values()))
+    lenses.warn(path)
+    return cameras, {
+        key: f"of a sensor without a COLMAP model ({str(error).removeprefix(f'{path}, ').split(';')[0]})"
+        for key, error in no_model.items()
+    }
+
+
+def _warn_of_shutter(chunk: ElementTree.Element, kept: list[ElementTree.Element], path: Path) -> None:
+    used = {camera.get("sensor_id") for camera in kept}
+    rolling = {
+        sensor.get("id")
+        for sensor in chunk.iterfind("./sensors/sensor")
+        for entry in sensor.iterfind("./property[@name='rolling_shutter']")
+        if entry.get("value", "").lower() not in ("", "0", "false", "none", "disabled")
+    } & used
+    count = sum(camera.get("sensor_id") in rolling for camera in kept)
+    if count:
+        logger.warning(
+            "%s: %d of %d photos have a rolling shutter that Metashape corrects: here each is read as if exposed at once",
+            path,
+            count,
+            len(kept),
+        )
+
+
+def _check_kind(sensor: ElementTree.Element, where: str) -> None:
+    calibration = _calibration(sensor)
+    kind = (calibration.get("type") if calibration is not None else None) or sensor.get("type", "frame")
+    if kind != "frame" and kind not in FISHEYE:
+        raise NoModelError(
+            f"{where}: {kind} sensors have no COLMAP model; only frame and fisheye (equidistant) have"
+        )
 
 
 def _calibration(sensor: ElementTree.Element) -> ElementTree.Element | None:
@@ -128,10 +238,6 @@ def _distortion_model(sensor: ElementTree.Element, path: Path) -> DistortionMode
     if calibration is None:
         raise InputError(f"{where} has no calibration")
     kind = calibration.get("type") or sensor.get("type", "frame")
-    if kind != "frame" and kind not in FISHEYE:
-        raise InputError(
-            f"{where}: {kind} sensors have no COLMAP model: only frame and fisheye (equidistant) have"
-        )
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     try:
@@ -141,10 +247,6 @@ def _distortion_model(sensor: ElementTree.Element, path: Path) -> DistortionMode
         focal = values["f"] if "f" in values else values["fy"]
     except (ValueError, KeyError):
         raise InputError(f"{where}: its calibration lacks size or focal length") from None
-    if values.get("p3", 0) or values.get("p4", 0):
-        raise InputError(
-            f"{where}: p3 and p4 have no COLMAP model: optimize the cameras without them, or export undistorted photos"
-        )
     stretch = values["fx"] - focal if "fx" in values else values.get("b1", 0)
     # PhotoScan 1.0: absolute
     principal = (
@@ -161,7 +263,47 @@ def _distortion_model(sensor: ElementTree.Element, path: Path) -> DistortionMode
         (values.get("p2", 0.0), values.get("p1", 0.0)),
         kind in FISHEYE,
         values.get("b2", values.get("skew", 0.0)),
+        left_out=(
+            *_tangential_cost(values, float(np.hypot(width, height)) / 2 / focal, focal),
+            *_corrections_cost(calibration, where),
+        ),
     )
+
+
+def _tangential_cost(values: dict[str, float], reach: float, focal: float) -> tuple[tuple[str, float], ...]:
+    """What it costs at most to leave out p3 and p4, px; reach: from the middle to a corner, normalized."""
+    size = float(np.hypot(values.get("p1", 0.0), values.get("p2", 0.0))) * 3 * reach**2
+    stretch = abs(values.get("p3", 0.0)) * reach**2 + abs(values.get("p4", 0.0)) * reach**4
+    return (("p3 and p4", size * stretch * focal),) if stretch else ()
+
+
+def _corrections_cost(calibration: ElementTree.Element, where: str) -> tuple[tuple[str, float], ...]:
+    """What it costs to leave out the additional corrections, px."""
+    corrections = calibration.find("corrections")
+    words = [] if corrections is None else (corrections.findtext("coeffs") or "").split()
+    try:
+        pairs = np.array(words, np.float64).reshape(-1, 2)
+    except ValueError:
+        raise InputError(f"{where}: its additional corrections are no pairs of numbers") from None
+    return (("additional corrections", largest_correction(pairs)),) if pairs.any() else ()
+
+
+def largest_correction(pairs: np.ndarray) -> float:
+    """Largest length, px, of a Fourier series over a photo; of an unknown one, the bound.
+
+    pairs: (48, 2) coefficients of u and v, px: rings of frequencies from 1 to 3, of each the cosines and then
+        the sines
+    """
+    if len(pairs) != 48:
+        return float(np.hypot(*np.abs(pairs).sum(axis=0)))
+    x, y = np.meshgrid(*2 * [np.linspace(-np.pi, np.pi, 64, endpoint=False)])
+    waves: list[np.ndarray] = []
+    for ring in (1, 2, 3):
+        up, down = [(m, ring) for m in range(ring + 1)], [(m, -ring) for m in range(ring - 1, 0, -1)]
+        side = [(ring, n) for n in range(ring - 1, -ring - 1, -1)]
+        angles = [m * x + n * y for m, n in [*up, *side, *down]]
+        waves += [*map(np.cos, angles), *map(np.sin, angles)]
+    return float(np.linalg.norm(np.tensordot(pairs.T, np.array(waves), 1), axis=0).max())
 
 
 def _transforms(
@@ -236,17 +378,9 @@ def _to_local(
             "%s names a CRS, but its cameras are not in geocentric coordinates: the place stays unknown", path
         )
         return views, None
-    # points that show how one frame lies in the other
-    frame = middle + 1000 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
     axes = crs.ellipsoid.semi_major_metre, crs.ellipsoid.semi_minor_metre
-    geodetic = _geodetic(frame, axes, crs.geodetic_crs)
-    origin = triple(round(float(value), digits) for value, digits in zip(geodetic[0], (6, 6, 0)))
-    enu = fit_similarity(frame - middle, geodetic_to_enu(geodetic, origin))
-    centers = enu.apply(np.array([view.center for view in views]) - middle)
-    moved = [
-        View(view.name, view.camera, rigid(view.cam_from_world[:3, :3] @ enu.rotation.T, center, str(path)))
-        for view, center in zip(views, centers)
-    ]
+    origin, enu = enu_of_geocentric(middle, lambda points: _geodetic(points, axes, crs.geodetic_crs))
+    moved = [moved_view(view, middle, enu) for view in views]
     return moved, from_origin(origin, crs.to_epsg() if crs.is_projected else None)
 
 

@@ -47,6 +47,7 @@ def write_project(
     return {
         "program": project.program,
         "photos": len(project.views),
+        "left_out": project.counts_left_out(),
         "points": len(points),
         "points_are": told if len(points) else "none",
         "images": str(photos.resolve()) if photos else "not found: link them to SCENE/images",

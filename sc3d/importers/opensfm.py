@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.geometry.cameras import View
-from sc3d.geometry.distortion import DistortionModel, to_camera
-from sc3d.georeferencing.control_points import parse_crs
+from sc3d.geometry.distortion import DistortionModel, Lenses, NoModelError
+from sc3d.georeferencing.gcp_list import parse_crs
 from sc3d.georeferencing.georeference import Georeference, from_origin, triple
 from sc3d.importers.project import Project, require_found, rigid
 from sc3d.io.json_files import read_json
@@ -29,6 +29,8 @@ logger = logging.getLogger(__name__)
 
 EXPECTED = "a folder with reconstruction.json, or with opensfm/reconstruction.json (ODM), is expected"
 FILE, TOPOCENTRIC = "reconstruction.json", "reconstruction.topocentric.json"
+NO_GPS = 999999.0  # gps_dop of a photo without GPS
+NEAR_ZERO = 1e-6  # degrees, a decimeter
 # projection types: names of the radial coefficients, and whether p1, p2 and a principal point belong to them
 PERSPECTIVE = {
     "perspective": ("k1", "k2"),
@@ -73,18 +75,15 @@ def read(path: Path, settings: Import) -> Project:
     ):
         raise InputError(f"{file} is no list of reconstructions")
     part = max(parts, key=lambda part: len(part["shots"]))
-    if len(parts) > 1:
-        logger.warning(
-            "%s has %d separate reconstructions: the one with most photos (%d) is taken",
-            file,
-            len(parts),
-            len(part["shots"]),
-        )
-    cameras = {}
-    for name, camera in part["cameras"].items():
-        where = f"{file}, camera {name!r}"
-        cameras[name] = to_camera(_distortion_model(camera, where), settings.tolerance, where)
-    views = [_view(name, shot, cameras, f"{file}, shot {name!r}") for name, shot in part["shots"].items()]
+    _warn_of_others(parts, part, file)
+    cameras, unknown = _cameras(part, file, settings.tolerance)
+    left_out = {
+        f"of the camera {camera!r}, whose {reason}": names
+        for camera, reason in unknown.items()
+        if (names := [name for name, shot in part["shots"].items() if shot.get("camera") == camera])
+    }
+    shots = {name: shot for name, shot in part["shots"].items() if shot.get("camera") not in unknown}
+    views = [_view(name, shot, cameras, f"{file}, shot {name!r}") for name, shot in shots.items()]
     points, colors, rows = _points(part.get("points", {}), file)
     root = folder.parent if folder.name == "opensfm" else folder
     observations = _observations(folder / "tracks.csv", views, rows)
@@ -98,7 +97,50 @@ def read(path: Path, settings: Import) -> Project:
         root / "images",
         _georeference(part, file, root, views),
         {"read": file.name},
+        left_out=left_out,
     )
+
+
+def _warn_of_others(parts: list[dict], taken: dict, file: Path) -> None:
+    """Say what is in the other reconstructions, which share no frame with the one that is taken."""
+    others = [part for part in parts if part is not taken]
+    lost = sorted({name for part in others for name in part["shots"]} - set(taken["shots"]))
+    if others:
+        logger.warning(
+            "%s has %d separate reconstructions: the one with most photos (%d) is taken; left out are those of %s photos, of which %d are not in it%s",
+            file,
+            len(parts),
+            len(taken["shots"]),
+            ", ".join(str(len(part["shots"])) for part in others),
+            len(lost),
+            f" ({examples(lost)})" if lost else "",
+        )
+
+
+def _cameras(part: dict, file: Path, tolerance: float) -> tuple[dict[str, pycolmap.Camera], dict[str, str]]:
+    """COLMAP cameras of those that shots use, by name; and why some are of no kind that COLMAP has, unless
+    all are.
+    """
+    lenses = Lenses(tolerance)
+    used = [name for name in dict.fromkeys(_camera_names(part)) if name in part["cameras"]]
+    cameras: dict[str, pycolmap.Camera] = {}
+    unknown: dict[str, str] = {}
+    for name in used:
+        where = f"{file}, camera {name!r}"
+        try:
+            cameras[name] = lenses.camera(_distortion_model(part["cameras"][name], where), where)
+        except NoModelError as error:
+            if len(used) == 1:
+                raise
+            unknown[name] = str(error).removeprefix(f"{where}: the ").split(":")[0]
+    if used and not cameras:
+        raise InputError(f"{file}: no camera has a COLMAP model: undistort the photos first")
+    lenses.warn(file)
+    return cameras, unknown
+
+
+def _camera_names(part: dict) -> list[str]:
+    return [str(shot.get("camera")) for shot in part["shots"].values()]
 
 
 def _folder(path: Path) -> Path | None:
@@ -118,7 +160,7 @@ def _folder(path: Path) -> Path | None:
 def _distortion_model(camera: dict, where: str) -> DistortionModel:
     kind = camera.get("projection_type", "perspective")
     if kind not in PERSPECTIVE | FISHEYE:
-        raise InputError(
+        raise NoModelError(
             f"{where}: the projection type {kind!r} has no COLMAP model: undistort the photos first"
         )
     try:
@@ -140,10 +182,6 @@ def _distortion_model(camera: dict, where: str) -> DistortionModel:
         prism = [float(camera.get(f"s{number}", 0)) for number in range(4)]
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{where} lacks a number: {error}") from None
-    if kind == "fisheye624" and (prism[1] or prism[3]):
-        raise InputError(
-            f"{where}: a thin prism of the fourth order has no COLMAP model: undistort the photos first"
-        )
     return DistortionModel(
         width,
         height,
@@ -153,7 +191,16 @@ def _distortion_model(camera: dict, where: str) -> DistortionModel:
         tangential,
         kind in FISHEYE,
         prism=(prism[0], prism[2]) if kind == "fisheye624" else (0.0, 0.0),
+        left_out=_prism_cost(prism, float(np.hypot(width, height)) / 2, focal[0])
+        if kind == "fisheye624"
+        else (),
     )
+
+
+def _prism_cost(prism: list[float], reach: float, focal: float) -> tuple[tuple[str, float], ...]:
+    """What it costs to leave out a thin prism of the fourth order; reach: from the middle to a corner, px."""
+    cost = float(np.hypot(prism[1], prism[3])) * (reach / focal) ** 4 * focal
+    return (("a thin prism of the fourth order", cost),) if cost else ()
 
 
 def _view(name: str, shot: dict, cameras: dict[str, pycolmap.Camera], where: str) -> View:
@@ -207,7 +254,7 @@ def _observations(
     if not file.is_file():
         return None
     seen: dict[str, tuple[list[int], list[tuple[float, float]]]] = {view.name: ([], []) for view in views}
-    with file.open(encoding="utf-8", errors="replace") as lines:
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
         for line in lines:
             words = line.rstrip("\n").split("\t")
             if len(words) >= 8 and words[1] in rows and words[0] in seen:
@@ -226,10 +273,28 @@ def _georeference(part: dict, file: Path, root: Path, views: list[View]) -> Geor
         return _utm(coords)
     if reference is None:
         return None
+    if not _has_gps(part):
+        logger.warning(
+            "%s: its photos have no GPS: the place stays unknown, scale and units are arbitrary", file
+        )
+        return None
     try:
         return from_origin(triple(reference[key] for key in ("latitude", "longitude", "altitude")))
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{file}: reference_lla has no latitude, longitude and altitude") from None
+
+
+def _has_gps(part: dict) -> bool:
+    """Whether the reference is a place: OpenSfM writes 0 N 0 E where no photo has GPS, whose positions are
+    then zero and their dilution of precision NO_GPS. A flight at 0 N 0 E with GPS is one in the Gulf of Guinea.
+    """
+    reference = part["reference_lla"]
+    if any(abs(float(reference.get(key) or 0.0)) > NEAR_ZERO for key in ("latitude", "longitude")):
+        return True
+    return any(
+        any(shot.get("gps_position") or []) and float(shot.get("gps_dop") or 0.0) < NO_GPS
+        for shot in part["shots"].values()
+    )
 
 
 def _is_topocentric(part: dict, views: list[View]) -> bool:
@@ -245,7 +310,7 @@ def _is_topocentric(part: dict, views: list[View]) -> bool:
 
 
 def _utm(coords: Path) -> Georeference:
-    lines = coords.read_text(encoding="utf-8").splitlines()
+    lines = coords.read_text(encoding="utf-8-sig").splitlines()
     try:
         crs, offset = parse_crs(lines[0], coords), [float(word) for word in lines[1].split()[:2]]
     except (IndexError, ValueError):

@@ -8,17 +8,20 @@ offset; (0, 0) is the corner of the first pixel.
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pyproj
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.geometry.cameras import View
-from sc3d.geometry.distortion import DistortionModel, to_camera
+from sc3d.geometry.distortion import DistortionModel, Lenses
 from sc3d.georeferencing.georeference import Georeference, triple
+from sc3d.importers.frames import LARGE, near_origin
 from sc3d.importers.project import Project, require_found, rigid
+from sc3d.io.crs import split_crs
 from sc3d.settings.reconstruction import Import
 
 logger = logging.getLogger(__name__)
@@ -41,13 +44,8 @@ def files(path: Path) -> list[Path]:
 
 def read(path: Path, settings: Import) -> Project:
     file = require_found(_file(path), path, EXPECTED)
-    try:
-        lines = [
-            (number, line.strip())
-            for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines(), start=1)
-        ]
-    except UnicodeDecodeError:
-        raise InputError(f"{file} is no text file") from None
+    _warn_of_others(path, file)
+    lines = [(number, line.strip()) for number, line in enumerate(_read_text(file).splitlines(), start=1)]
     header = [line.lower() for _, line in lines[:8]]
     if any("fisheye" in line for line in header):
         raise InputError(f"{file}: Pix4D's fisheye polynomial has no COLMAP model: export undistorted photos")
@@ -56,31 +54,55 @@ def read(path: Path, settings: Import) -> Project:
         raise InputError(
             f"{file} is cut off or of another layout: {LINES} lines per photo are expected after the header, {len(body)} lines are there"
         )
-    cameras: dict[DistortionModel, pycolmap.Camera] = {}
-    views = []
+    lenses, views = Lenses(settings.tolerance), []
     for start in range(0, len(body), LINES):
         name, distortion, rotation, center = _block(body[start : start + LINES], file)
-        if distortion not in cameras:
-            cameras[distortion] = to_camera(distortion, settings.tolerance, f"{file}, {name}")
-        views.append(View(name, cameras[distortion], rigid(rotation, center, f"{file}, {name}")))
-    return Project("pix4d", views, georeference=_georeference(file), notes={"read": file.name})
+        where = f"{file}, {name}"
+        views.append(View(name, lenses.camera(distortion, where), rigid(rotation, center, where)))
+    lenses.warn(file)
+    georeference = _georeference(file)
+    project = Project("pix4d", views, georeference=georeference, notes={"read": file.name})
+    if georeference is None or _place_files(file)[1].is_file():
+        return project
+    if all(np.abs(view.center).max() < LARGE for view in views):
+        logger.warning(
+            "%s is missing, and the positions are not those of a CRS: the place stays unknown",
+            _place_files(file)[1],
+        )
+    return near_origin(replace(project, georeference=None), georeference.epsg)
+
+
+def _files(path: Path) -> list[Path]:
+    if path.is_file():
+        return [path] if path.name.endswith(SUFFIX) else []
+    folders = (path, path / "params", path / "1_initial" / "params")
+    return [file for folder in folders for file in sorted(folder.glob(f"*{SUFFIX}"))]
 
 
 def _file(path: Path) -> Path | None:
-    if path.is_file():
-        return path if path.name.endswith(SUFFIX) else None
-    return next(
-        (
-            file
-            for folder in (path, path / "params", path / "1_initial" / "params")
-            for file in sorted(folder.glob(f"*{SUFFIX}"))
-        ),
-        None,
-    )
+    """The largest file, if there are several: it has most photos."""
+    return max(_files(path), key=lambda file: file.stat().st_size, default=None)
+
+
+def _warn_of_others(path: Path, file: Path) -> None:
+    others = [other.name for other in _files(path) if other != file]
+    if others:
+        logger.warning("%s: only %s is read, left out: %s", path, file.name, examples(others))
+
+
+def _read_text(file: Path) -> str:
+    """Text as UTF-8, or else as Windows writes it in Western Europe."""
+    content = file.read_bytes()
+    for encoding in ("utf-8-sig", "cp1252"):
+        with suppress(UnicodeDecodeError):
+            return content.decode(encoding)
+    raise InputError(f"{file} is no text file")
 
 
 def _header_length(lines: list[tuple[int, str]], file: Path) -> int:
-    """Lines in front of the first photo, empty ones not counted: up to the one that states the camera model."""
+    """Lines in front of the first photo, empty ones not counted: up to the one that states the camera
+    model.
+    """
     filled = [line for _, line in lines if line]
     found = [row for row, line in enumerate(filled[:12]) if line.lower().startswith("camera model")]
     if not found:
@@ -139,9 +161,9 @@ def _georeference(file: Path) -> Georeference | None:
     if not projection.is_file():
         return None
     try:
-        crs = pyproj.CRS.from_wkt(projection.read_text(encoding="utf-8").strip())
+        crs = pyproj.CRS.from_wkt(_read_text(projection).strip())
         offset = (
-            np.array(offset_file.read_text(encoding="utf-8").replace(",", " ").split(), np.float64)[:3]
+            np.array(_read_text(offset_file).replace(",", " ").split(), np.float64)[:3]
             if offset_file.is_file()
             else np.zeros(3)
         )
@@ -149,11 +171,18 @@ def _georeference(file: Path) -> Georeference | None:
         raise InputError(
             f"{projection} or {offset_file} cannot be understood: a WKT of a CRS and three numbers are expected"
         ) from None
-    crs = crs.sub_crs_list[0] if crs.is_compound else crs
+    crs, height_unit = split_crs(crs)
+    if crs.is_engineering:
+        logger.warning("%s: the project has local coordinates: the place stays unknown", projection)
+        return None
     epsg = crs.to_epsg()
     if not crs.is_projected or epsg is None or offset.shape != (3,):
         logger.warning(
             "%s: %s has no EPSG code of a projected CRS: the place stays unknown", projection, crs.name
         )
         return None
+    if height_unit is not None and abs(height_unit / crs.axis_info[0].unit_conversion_factor - 1) > 1e-9:
+        raise InputError(
+            f"{projection} has heights in another unit than eastings: export the project with one unit"
+        )
     return Georeference(epsg, triple(offset))

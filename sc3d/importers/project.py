@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import logging
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
@@ -10,12 +12,14 @@ from types import ModuleType
 import numpy as np
 import pycolmap
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.geometry.cameras import View
 from sc3d.georeferencing.georeference import Georeference, read_georeference
 from sc3d.io.limits import FARTHEST
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import
+
+logger = logging.getLogger(__name__)
 
 # in the order in which they are tried
 PROGRAMS = ("nerfstudio", "opensfm", "odm", "metashape", "pix4d", "colmap")
@@ -36,6 +40,7 @@ class Project:
     model: the COLMAP model that all this was read from, whose further contents are kept; None = another
         program's
     offset: (3,) what was subtracted from the coordinates of `model`
+    left_out: names of the photos that are not among the views, by reason
     """
 
     program: str
@@ -48,6 +53,45 @@ class Project:
     notes: dict[str, object] = field(default_factory=dict)
     model: pycolmap.Reconstruction | None = None
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    left_out: dict[str, list[str]] = field(default_factory=dict)
+
+    def without(self, rows: Collection[int], reason: str) -> Project:
+        """The project without the views of some rows; `model` goes if there are any, as it holds them."""
+        if not rows:
+            return self
+        out = set(rows)
+        kept = [row for row in range(len(self.views)) if row not in out]
+        names = [self.views[row].name for row in sorted(rows)]
+        return replace(
+            self,
+            views=[self.views[row] for row in kept],
+            observations=None if self.observations is None else [self.observations[row] for row in kept],
+            model=None,
+            left_out=self.left_out | {reason: self.left_out.get(reason, []) + names},
+        )
+
+    def counts_left_out(self) -> dict[str, int]:
+        """How many photos are left out, by reason."""
+        return {reason: len(names) for reason, names in self.left_out.items()}
+
+
+def warn_of_left_out(project: Project, path: Path) -> None:
+    """Say in one line how many photos are left out, why, and which."""
+    count = sum(project.counts_left_out().values())
+    if count:
+        logger.warning(
+            "%s: %d of %d photos left out: %s",
+            path,
+            count,
+            count + len(project.views),
+            _told(project),
+        )
+
+
+def _told(project: Project) -> str:
+    return "; ".join(
+        f"{len(names)} {reason} ({examples(names)})" for reason, names in project.left_out.items()
+    )
 
 
 def read_project(path: Path, settings: Import) -> Project:
@@ -69,7 +113,8 @@ def read_project(path: Path, settings: Import) -> Project:
             f"{path} is damaged or of another layout: {type(error).__name__}, {str(error)[:200]}"
         ) from error
     if not project.views:
-        raise InputError(f"{path} has no photo with a position: orient the photos first")
+        told = f" ({_told(project)})" if project.left_out else ""
+        raise InputError(f"{path} has no photo with a position{told}: orient the photos first")
     folder = path if path.is_dir() else path.parent
     # as our own exports have it beside them
     return (

@@ -5,16 +5,22 @@ killed runs leave behind is found and removed.
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import platform
 import re
 import shutil
+import stat
+import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sc3d.errors import InputError
+
+logger = logging.getLogger(__name__)
 
 HOST = re.sub(r"\W+", "_", platform.node(), flags=re.ASCII)[:32] or "host"
 LEFTOVER = re.compile(r"\..*\.(?P<host>\w+)-(?P<process>\d+)\.tmp")
@@ -83,6 +89,56 @@ def discard(folder: Path) -> None:
         remove(hidden)
 
 
+def claim(path: Path) -> Path:
+    """What a run leaves under a name that the next one finds again (`path`, a file or folder), before it is
+    gone on with: it must be this user's own, without links, pipes or other names for its files in it.
+
+    A scene of somebody else may hold a link of that name, and what it leads to would be overwritten: it is
+    removed, not followed, and a warning says so. Returns `path`.
+    Raises InputError for what belongs to another user, who could change it at any time.
+    """
+    if not os.path.lexists(path):
+        return path
+    owner = _new_owner(path.parent)
+    for entry in _entries(path):
+        found = entry.lstat()
+        if found.st_uid != owner:
+            raise InputError(
+                f"{entry} belongs to another user: let them finish, or remove it, and the work that waits there is done anew"
+            )
+        if not _is_plain(found):
+            reject(path, f"{entry.name} leads elsewhere")
+            break
+    return path
+
+
+def reject(path: Path, reason: str) -> None:
+    """Remove what was to be gone on with but is not from sc3d, and say so. InputError if that is not possible."""
+    logger.warning("%s is not from sc3d (%s): removed, its work is done anew", path, reason)
+    remove(path)
+    if os.path.lexists(path):
+        raise InputError(f"{path} cannot be removed by sc3d: remove it")
+
+
+def _entries(path: Path) -> Iterator[Path]:
+    """A file or folder and all that is in it; links are not followed."""
+    yield path
+    if path.is_dir() and not path.is_symlink():
+        for entry in path.iterdir():
+            yield from _entries(entry)
+
+
+def _is_plain(entry: os.stat_result) -> bool:
+    """Whether something is a folder, or a file that has one name only."""
+    return stat.S_ISDIR(entry.st_mode) or (stat.S_ISREG(entry.st_mode) and entry.st_nlink <= 1)
+
+
+def _new_owner(folder: Path) -> int:
+    """Who owns what this process makes in a folder: not always its user, on network file systems."""
+    with tempfile.TemporaryDirectory(prefix=temporary_name("owner"), dir=folder) as probe:
+        return os.lstat(probe).st_uid
+
+
 def remove_leftovers(folder: Path) -> None:
     """Remove what killed processes of this machine, or of others more than a day ago, left unfinished in a
     folder. Linked folders are let alone.
@@ -92,7 +148,8 @@ def remove_leftovers(folder: Path) -> None:
     for entry in folder.iterdir():
         found = LEFTOVER.match(entry.name)
         if found and _is_dead(found["host"], int(found["process"]), entry):
-            remove(entry)
+            with suppress(OSError):  # another user's, where all may write
+                remove(entry)
 
 
 def require_room(path: Path, num_bytes: int = 0) -> None:
@@ -114,6 +171,21 @@ def _free_bytes(folder: Path) -> int | None:
         return None
     free = found.f_bfree if os.geteuid() == 0 else found.f_bavail
     return free * found.f_frsize if found.f_blocks else None
+
+
+FULL = re.compile(r"disk is full|No space left|quota exceeded|requested and \d+ written", re.IGNORECASE)
+
+
+def full_folder(error: Exception, folders: list[Path]) -> Path | None:
+    """Which folder has no room left, if that is what an error says: that of the file it names, else that of the
+    folders with the least room; None for other errors.
+    """
+    if getattr(error, "errno", None) not in (errno.ENOSPC, errno.EDQUOT) and not FULL.search(str(error)):
+        return None
+    name = getattr(error, "filename", None)
+    if name and not isinstance(name, int):
+        return Path(os.fsdecode(name)).parent
+    return min(folders, key=lambda folder: room if (room := _free_bytes(folder)) is not None else sys.maxsize)
 
 
 @contextmanager
@@ -172,6 +244,7 @@ def _replace(temporary: Path, path: Path) -> None:
         raise InputError(f"{path} is a link: remove it, so that the folder it leads to is not overwritten")
     if is_folder and path.is_dir():  # folders cannot be replaced in one step
         before = temporary.with_name(f"{temporary.name}.before")
+        remove(before)
         path.rename(before)
         try:
             temporary.rename(path)

@@ -1,5 +1,7 @@
 """COLMAP models, read by pycolmap after a look at them, taken apart, put together and written.
 
+Photo names of text models are read here, to the end of their line: pycolmap stops at a blank.
+
 pycolmap believes the counts in binary files: one that is too large makes it fill the memory, or read on
 behind the end for ever. In text files a count never leads beyond its line. Cameras and poses are not checked
 by pycolmap at all.
@@ -9,9 +11,14 @@ Layout: https://colmap.github.io/format.html; rigs.bin and frames.bin as COLMAP 
 
 from __future__ import annotations
 
+import codecs
+import logging
 import mmap
+import shutil
 import struct
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Protocol
@@ -23,6 +30,8 @@ from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
 from sc3d.io.limits import FARTHEST, MAX_PIXELS, MAX_SIDE, DamagedFileError
 
+logger = logging.getLogger(__name__)
+
 FILES = ("cameras", "rigs", "frames", "images", "points3D")  # rigs and frames only in newer models
 LARGEST = 1 << 62  # count of a list: bounded by the size of the file alone
 # id, position, color, error; track of photo and keypoint
@@ -30,6 +39,7 @@ POINT = np.array([[0, 43, 0, 0, 0], [8, 8, 0, LARGEST, 0]])
 # id, rig, rotation, translation; sensor and photo
 FRAME = np.array([[0, 64, 0, 0, 0], [4, 16, 0, LARGEST, 0]])
 MAX_NAME = 4096  # bytes of a photo name
+POSE_FIELDS = 9  # words in front of the name in images.txt
 NO_POINTS, NO_ROWS, NO_PIXELS = np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2))
 NOT_RIGID = 0.01  # largest error of R R^T: text models are rounded
 
@@ -38,16 +48,25 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a model, binary or text; InputError if it is missing, damaged, without photos, or has cameras or
     poses that are none.
     """
-    if not any((folder / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+    if not is_model(folder):
+        above = f" (one is in {folder.parent}: move its files there)" if is_model(folder.parent) else ""
         raise InputError(
-            f"no cameras in {folder}: run `sc3d reconstruct PHOTOS SCENE`, or put a COLMAP model there"
+            f"no cameras in {folder}: run `sc3d reconstruct PHOTOS SCENE`, or put a COLMAP model there{above}"
         )
     check_counts(folder)
     try:
-        model = pycolmap.Reconstruction(str(folder))
+        with _as_pycolmap_reads(folder) as readable:
+            model = pycolmap.Reconstruction(str(readable))
         images = [model.image(image_id) for image_id in model.reg_image_ids()]
+        if not _is_binary(folder):
+            full_names = _text_names(folder)
+            for image in images:
+                image.name = full_names[image.image_id]
         names = [image.name for image in images]
+        _check_rigs(model, folder)
         poses = [image.cam_from_world() for image in images]
+    except InputError:
+        raise
     # pycolmap raises bare RuntimeError, ValueError, IndexError, MemoryError and UnicodeDecodeError for broken
     # files
     except Exception as error:
@@ -60,6 +79,87 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
         _check_camera(model.camera(camera_id), folder)
     _check_poses(poses, names, folder)
     return model
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder holds the cameras of a model, binary or text."""
+    return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+
+def photo_names(folder: Path) -> list[str]:
+    """Names of the photos of a model, of which nothing else is read; InputError if it is damaged."""
+    if not _is_binary(folder):
+        try:
+            return list(_text_names(folder).values())
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot read the COLMAP model in {folder}: {error}") from None
+    names: list[str] = []
+    _check_part(folder, "images", lambda data, count: _walk_images(data, count, names))
+    return names
+
+
+def warn_of_larger(folder: Path) -> None:
+    """Say if a model beside this one, as COLMAP numbers them, has more photos."""
+    others = [other for other in sorted(folder.parent.glob("[0-9]*")) if other != folder and is_model(other)]
+    if not others:
+        return
+    with suppress(InputError):  # one that is damaged is in nobody's way
+        count, counts = len(photo_names(folder)), [len(photo_names(other)) for other in others]
+        if max(counts) > count:
+            logger.warning(
+                "%s has %d photos, but the model beside it in %s has %d: take that one, if it is meant",
+                folder,
+                count,
+                others[counts.index(max(counts))],
+                max(counts),
+            )
+
+
+def _is_binary(folder: Path) -> bool:
+    """As pycolmap decides it, which asks for points, too."""
+    cameras = all((folder / f"{name}.bin").exists() for name in ("cameras", "images"))
+    return cameras and ((folder / "points3D.bin").exists() or not (folder / "points3D.txt").exists())
+
+
+def _text_names(folder: Path) -> dict[int, str]:
+    """Name by id of the photos in images.txt, blanks included; a line of keypoints follows each."""
+    names = {}
+    with (folder / "images.txt").open(encoding="utf-8-sig") as lines:
+        for line in lines:
+            words = line.strip().split(maxsplit=POSE_FIELDS)
+            if not words or words[0].startswith("#"):
+                continue
+            names[int(words[0])] = words[POSE_FIELDS] if len(words) > POSE_FIELDS else ""
+            next(lines, None)
+    return names
+
+
+@contextmanager
+def _as_pycolmap_reads(folder: Path) -> Iterator[Path]:
+    """The folder itself, or for the time of the block a copy without what pycolmap does not bear: byte order
+    marks in text, and no file of points.
+    """
+    is_binary = _is_binary(folder)
+    files = [folder / f"{name}.{'bin' if is_binary else 'txt'}" for name in FILES]
+    marked = not is_binary and any(file.is_file() and _starts_with_mark(file) for file in files)
+    if not files[FILES.index("images")].is_file():
+        raise InputError(f"the COLMAP model in {folder} has no file of photos (images.bin or images.txt)")
+    if not marked and files[-1].exists():
+        yield folder
+        return
+    with tempfile.TemporaryDirectory(prefix="sc3d-colmap-") as name:
+        copy = Path(name)
+        (copy / files[-1].name).write_bytes(struct.pack("<Q", 0) if is_binary else b"")
+        for file in filter(Path.is_file, files):
+            with file.open("rb") as source, (copy / file.name).open("wb") as target:
+                source.seek(len(codecs.BOM_UTF8) if marked and _starts_with_mark(file) else 0)
+                shutil.copyfileobj(source, target)
+        yield copy
+
+
+def _starts_with_mark(file: Path) -> bool:
+    with file.open("rb") as stream:
+        return stream.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8
 
 
 class PosedCamera(Protocol):
@@ -151,8 +251,22 @@ def write_model(path: Path, model: pycolmap.Reconstruction) -> None:
         model.write_binary(str(temporary))
 
 
+def _check_rigs(model: pycolmap.Reconstruction, folder: Path) -> None:
+    for rig_id, rig in model.rigs.items():
+        unplaced = [sensor.id for sensor, pose in rig.non_ref_sensors.items() if pose is None]
+        if unplaced:
+            raise InputError(
+                f"{folder}: camera {unplaced[0]} of rig {rig_id} has no pose in the rig, so its photos have no position: "
+                "calibrate the rig (colmap rig_configurator, mapper) or take the model without it"
+            )
+
+
 def _check_camera(camera: pycolmap.Camera, folder: Path) -> None:
     where = f"{folder}: camera {camera.camera_id}"
+    if camera.model_name == "EQUIRECTANGULAR":
+        raise InputError(
+            f"{where} is spherical (EQUIRECTANGULAR), which has no image plane: cut its photos into perspective ones first"
+        )
     if not (
         0 < camera.width <= MAX_SIDE
         and 0 < camera.height <= MAX_SIDE
@@ -187,7 +301,7 @@ def check_counts(folder: Path) -> None:
     """InputError if a file of a binary model is not as long as its counts say, or an id is used twice; a text
     model is left to pycolmap.
     """
-    if not all((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D")):
+    if not _is_binary(folder):
         return
     walks = {
         "cameras": _walk_cameras,
@@ -197,16 +311,19 @@ def check_counts(folder: Path) -> None:
         "points3D": _walk_points,
     }
     for name in FILES:
-        file = folder / f"{name}.bin"
-        if not file.exists():
-            continue
-        try:
-            _check_file(file, walks[name])
-        except (DamagedFileError, struct.error) as error:
-            what = str(error) if isinstance(error, DamagedFileError) else "is cut off"
-            raise InputError(
-                f"{file.name} of the COLMAP model in {folder} {what}: it is damaged, write or copy it again"
-            ) from None
+        if (folder / f"{name}.bin").exists():
+            _check_part(folder, name, walks[name])
+
+
+def _check_part(folder: Path, name: str, walk: Callable[[mmap.mmap, int], int]) -> None:
+    file = folder / f"{name}.bin"
+    try:
+        _check_file(file, walk)
+    except (DamagedFileError, struct.error) as error:
+        what = str(error) if isinstance(error, DamagedFileError) else "is cut off"
+        raise InputError(
+            f"{file.name} of the COLMAP model in {folder} {what}: it is damaged, write or copy it again"
+        ) from None
 
 
 def _check_file(file: Path, walk: Callable[[mmap.mmap, int], int]) -> None:
@@ -281,7 +398,8 @@ def _walk_records(data: mmap.mmap, count: int, fields: np.ndarray) -> int:
     return end
 
 
-def _walk_images(data: mmap.mmap, count: int) -> int:
+def _walk_images(data: mmap.mmap, count: int, names: list[str] | None = None) -> int:
+    """names: gets the names of the photos."""
     position: int = 8
     ids: set[int] = set()
     for _ in range(count):
@@ -289,6 +407,8 @@ def _walk_images(data: mmap.mmap, count: int) -> int:
         end = data.find(b"\0", position + 64, position + 64 + MAX_NAME)
         if end < 0:
             raise DamagedFileError(f"has a photo whose name does not end within {MAX_NAME} bytes")
+        if names is not None:
+            names.append(data[position + 64 : end].decode(errors="replace"))
         points = _read("<Q", data, end + 1)[0]
         position = end + 9 + 24 * points
         if position > len(data):

@@ -3,30 +3,56 @@
 from __future__ import annotations
 
 import base64
+import logging
 import mmap
 import os
 import shutil
 import struct
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
+from sc3d.io.folders import files_below
 from sc3d.io.limits import MAX_PIXELS, MAX_SIDE
+from sc3d.io.orientation import (
+    ORIENTATION,
+    inverse,
+    mask_turn,
+    turned,
+    turned_size,
+    with_orientation,
+)
+from sc3d.io.photo_depth import FLOAT, bits_of, raw_mode, stretch, value_range
 
 if TYPE_CHECKING:
     from types import ModuleType
 
     from PIL import Image
 
+logger = logging.getLogger(__name__)
+
+SAMPLED_PHOTOS = 16  # whose values are looked at for the range of a set
+
 # JPEG holds MPO as well; Pillow knows many more, of which one runs a program
 FORMATS = ("JPEG", "PNG", "TIFF")
+# by their first bytes
+OTHER_FORMATS: dict[str, Callable[[bytes], bool]] = {
+    "HEIC or AVIF": lambda head: head[4:8] == b"ftyp",
+    "WebP": lambda head: head[:4] == b"RIFF" and head[8:12] == b"WEBP",
+    "GIF": lambda head: head[:4] == b"GIF8",
+    "BMP": lambda head: head[:2] == b"BM",
+    "JPEG 2000": lambda head: head[4:8] == b"jP  ",
+    "JPEG XL": lambda head: head[:2] == b"\xff\x0a" or head[4:8] == b"JXL ",
+    "PSD": lambda head: head[:4] == b"8BPS",
+}
+STRIPS_AND_TILES = (273, 279), (324, 325)  # tags of TIFF: offsets and lengths
 END_OF_IMAGE, START_OF_SCAN = b"\xff\xd9", 0xDA
 
 
@@ -39,7 +65,8 @@ def open_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
     try:
         if not path.is_file():  # a pipe or a device could be opened, and waited for
             raise FileNotFoundError
-        with pillow.open(path, formats=FORMATS) as image:
+        # from a stream: what Pillow maps into memory by name, uncompressed TIFF, it scrambles if it is turned
+        with path.open("rb") as file, pillow.open(file, formats=FORMATS) as image:
             _check_size(path, image.size, what)
             yield image
     except InputError:
@@ -53,9 +80,35 @@ def open_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
     # Pillow raises OSError, ValueError, SyntaxError, struct.error, KeyError, TypeError and more for damaged
     # files
     except Exception:
-        raise InputError(
-            f"cannot read the {what} {path}: it is missing, damaged or not a JPEG, PNG or TIFF image"
-        ) from None
+        raise InputError(f"cannot read the {what} {path}: {_what_is_wrong(path)}") from None
+
+
+def broken_link(link: Path) -> str:
+    """What to say of a link to nothing."""
+    return (
+        f"{link} is a link to {link.readlink()}, which is not there: has it been moved? "
+        "Put it back, or make the link anew"
+    )
+
+
+def _what_is_wrong(path: Path) -> str:
+    """Why an image cannot be opened, and what to do."""
+    broken = next((link for link in (path, *path.parents) if link.is_symlink() and not link.exists()), None)
+    if broken is not None:
+        return broken_link(broken)
+    head = b""
+    with suppress(OSError):
+        if path.is_file():
+            with path.open("rb") as file:
+                head = file.read(32)
+    name = next((name for name, found in OTHER_FORMATS.items() if found(head)), None)
+    if name is not None:
+        return f"it is a {name} image, not a JPEG, PNG or TIFF: convert it"
+    if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return (
+            "it is damaged, or a TIFF of a kind that is not supported: save it with 8 or 16 bits per channel"
+        )
+    return "it is missing, damaged or not a JPEG, PNG or TIFF image"
 
 
 def _check_size(path: Path, size: tuple[int, int], what: str) -> None:
@@ -75,14 +128,31 @@ def _pillow() -> ModuleType:
 
 
 def check_end(path: Path) -> None:
-    """InputError for a JPEG that stops within its picture: decoders fill the rest with gray and say nothing."""
+    """InputError for a JPEG, PNG or TIFF that stops within its picture: decoders fill the rest with gray and
+    say nothing.
+    """
     with path.open("rb") as file:
-        if file.read(2) != b"\xff\xd8":
-            return
+        head = file.read(8)
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            scan = _find_scan(data)
-            if scan < 0 or data.rfind(END_OF_IMAGE, scan) < 0:
-                raise InputError(f"the photo {path} is cut off: copy it again from the camera")
+            if head[:2] == b"\xff\xd8":
+                scan = _find_scan(data)
+                whole = scan >= 0 and data.rfind(END_OF_IMAGE, scan) >= 0
+            elif head == b"\x89PNG\r\n\x1a\n":
+                whole = data.rfind(b"IEND") >= 0
+            else:
+                whole = _end_of_tiff(path) <= len(data)
+    if not whole:
+        raise InputError(f"the photo {path} is cut off: copy it again from the camera")
+
+
+def _end_of_tiff(path: Path) -> int:
+    """Where the pixels of the first page of a TIFF end, byte; 0 for other files."""
+    with open_image(path) as image:
+        tags = getattr(image, "tag_v2", {})
+        ends = [0]
+        for offsets, counts in STRIPS_AND_TILES:
+            ends += [a + b for a, b in zip(tags.get(offsets, ()), tags.get(counts, ()), strict=False)]
+        return max(ends)
 
 
 def _find_scan(data: mmap.mmap) -> int:
@@ -104,26 +174,77 @@ def _find_scan(data: mmap.mmap) -> int:
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
 
-def find_photos(folder: Path) -> list[Path]:
-    """Photos of a folder and its subfolders, by name; InputError if there are none, two share a stem, or one
-    is a link that leads elsewhere.
+OTHER_SUFFIXES = {
+    ".heic",
+    ".heif",
+    ".avif",
+    ".webp",
+    ".bmp",
+    ".gif",
+    ".jp2",
+    ".jxl",
+    ".dng",
+    ".raw",
+    ".cr2",
+    ".nef",
+    ".arw",
+}
+NO_PHOTOS = {"__macosx", "@eadir", "thumbnails", "thumbs"}  # folders of archives, file servers and viewers
+
+
+def list_photos(folder: Path) -> list[Path]:
+    """Photos of a folder and its subfolders, by path. No photos are what sc3d has written there, hidden files
+    and folders, and thumbnails.
     """
+    return _survey(folder)[0]
+
+
+def left_out(folder: Path) -> str:
+    """What in a folder of photos is not used, by reason, with numbers and examples; "" if nothing is."""
+    parts = []
+    for reason, files in _survey(folder)[1].items():
+        shown = [str(file.relative_to(folder)) for file in files[:3]] + ["..."] * (len(files) > 3)
+        parts += [f"{len(files)} {reason} ({', '.join(shown)})"] if files else []
+    return "; ".join(parts)
+
+
+def _survey(folder: Path) -> tuple[list[Path], dict[str, list[Path]]]:
+    """Photos, and the files and folders that are left out, by reason."""
+    files, made = files_below(folder)
+    hidden, thumbnails, others, photos = list[Path](), list[Path](), list[Path](), list[Path]()
+    for file in files:
+        suffix, parts = file.suffix.lower(), file.relative_to(folder).parts
+        if suffix not in IMAGE_SUFFIXES | OTHER_SUFFIXES:
+            continue
+        if any(part.startswith(".") for part in parts):
+            hidden.append(file)
+        elif any(part.lower() in NO_PHOTOS for part in parts[:-1]):
+            thumbnails.append(file)
+        else:
+            (photos if suffix in IMAGE_SUFFIXES else others).append(file)
+    reasons = {
+        "of a format that is not read, convert them to JPEG": others,
+        "written by sc3d": made,
+        "hidden": hidden,
+        "thumbnails or leftovers of an archive": thumbnails,
+    }
+    return photos, reasons
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """As `list_photos`; InputError if there are none, or one is a link that leads elsewhere."""
+    if folder.is_symlink() and not folder.exists():
+        raise InputError(broken_link(folder))
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: give the folder that holds the photos")
-    photos = sorted(
-        file
-        for file in folder.rglob("*")
-        if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".") and file.is_file()
-    )
+    photos = list_photos(folder)
     if not photos:
-        raise InputError(f"no photos in {folder}: JPEG, PNG or TIFF files are expected")
-    by_stem: dict[str, Path] = {}
+        others = left_out(folder)
+        raise InputError(
+            f"no photos in {folder}: JPEG, PNG or TIFF files are expected"
+            + (f"; left out: {others}" if others else "")
+        )
     for photo in photos:
-        other = by_stem.setdefault(photo.stem, photo)
-        if other is not photo:
-            raise InputError(
-                f"{other} and {photo} share the name {photo.stem!r}, by which masks are found: rename one"
-            )
         require_within(photo, folder)
     return photos
 
@@ -156,45 +277,202 @@ def require_within(file: Path, folder: Path) -> None:
         )
 
 
-def read_image(path: Path) -> np.ndarray:
-    """(H, W, 3) uint8 RGB, as stored (EXIF orientation is not applied, as in COLMAP); InputError if it is
-    damaged, cut off or too large.
+def read_image(path: Path, folder: Path | None = None, shown: bool = False) -> np.ndarray:
+    """(H, W, 3) uint8 RGB; InputError if it is damaged, cut off or too large.
+
+    folder: of all photos of the set, by whose range 16-bit photos are stretched; None: the photo's own
+    shown: turned by its EXIF orientation; else as stored (see `sc3d.io.orientation`)
     """
+    orientation = read_orientation(path)
+    image = stretch(read_stored(path), lambda: used_range(folder or path.parent))
+    return np.ascontiguousarray(turned(image, orientation if shown else 1))
+
+
+def read_stored(path: Path) -> np.ndarray:
+    """(H, W, 3) uint8 or uint16 RGB as stored, alpha left out; InputError as in `read_image`."""
     import cv2
 
     check_photo(path)
+    with open_image(path, "photo") as header:
+        # Pillow and OpenCV both turn TIFF, whatever they are told, and OpenCV multiplies colors by alpha
+        if (
+            header.format == "TIFF"
+            and bits_of(header) == 8
+            and (_orientation(header) != 1 or _has_alpha(header))
+        ):
+            orientation = _orientation(header)
+            rgba = np.array(header.convert("RGBA"))
+            return np.ascontiguousarray(turned(rgba[..., :3], inverse(orientation)))
+        if header.format == "TIFF" and _orientation(header) != 1:
+            raise InputError(
+                f"cannot read the photo {path}: it is a turned TIFF of more than 8 bits; save it upright, without EXIF orientation"
+            )
     try:
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         image = None
-    if image is None:
+    if image is None or image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"cannot read the photo {path}: it is missing, damaged or not an image")
     return np.ascontiguousarray(image[..., ::-1])
 
 
+def read_opaque(path: Path) -> np.ndarray | None:
+    """(H, W) bool pixels of a photo, as stored, whose alpha is not 0: alpha is a mask, and what it hides is
+    used nowhere. None if there is no alpha, or all is opaque.
+    """
+    with open_image(path, "photo") as image:
+        if not _has_alpha(image):
+            return None
+        orientation = _orientation(image) if image.format == "TIFF" else 1
+        opaque = np.array(image.convert("RGBA").getchannel("A")) > 0
+    return None if opaque.all() else np.ascontiguousarray(turned(opaque, inverse(orientation)))
+
+
+def has_alpha(path: Path) -> bool:
+    """Whether a photo has alpha, by its header."""
+    with open_image(path, "photo") as image:
+        return _has_alpha(image)
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    return image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
+
+
+@cache
+def used_range(folder: Path) -> tuple[int, int] | None:
+    """The range of values by which the 16-bit photos of a folder and its subfolders are stretched to 8 bits,
+    one for all, so that they stay comparable; None if they use at least half of all values, which need no
+    stretching.
+    """
+    files = [file for file in find_photos(folder) if photo_bits(file) == 16]
+    some = files[:: max(1, len(files) // SAMPLED_PHOTOS)]
+    found = value_range([read_stored(file) for file in some])
+    if found is not None:
+        logger.info(
+            "%s: %d photos have 16 bits and use the values %d to %d: stretched to 8 bits by this range, the same for all",
+            folder,
+            len(files),
+            *found,
+        )
+    return found
+
+
+def photo_bits(path: Path) -> int:
+    """Bits per channel of a photo, 8 or 16; InputError for others, such as floating point."""
+    with open_image(path) as image:
+        bits = bits_of(image)
+    if bits not in (8, 16):
+        kind = "floating point" if bits == FLOAT else f"{bits} bits"
+        raise InputError(
+            f"the photo {path} has {kind} per channel: save it with whole numbers of 8 or 16 bits"
+        )
+    return bits
+
+
+def num_pages(path: Path) -> int:
+    """Pages of a TIFF; 1 for others (the further pictures of an MPO are previews)."""
+    with open_image(path) as image:
+        return int(getattr(image, "n_frames", 1)) if image.format == "TIFF" else 1
+
+
+def read_orientation(path: Path) -> int:
+    """EXIF orientation of a photo or mask, 1 to 8; 1 if it states none, or there is no such file."""
+    if not path.is_file():
+        return 1
+    with open_image(path) as image:
+        return _orientation(image)
+
+
+def _orientation(image: Image.Image) -> int:
+    found = image.getexif().get(ORIENTATION, 1)
+    return found if isinstance(found, int) and 1 <= found <= 8 else 1
+
+
 def check_photo(path: Path) -> tuple[int, int]:
     """(width, height) of a photo whose header can be read and that is not cut off; InputError for any other."""
+    photo_bits(path)
     size = image_size(path)
     check_end(path)
     return size
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) from the header; InputError if the file is not an image, or too large a one."""
+    """(width, height) as stored, from the header; InputError if the file is not an image, or too large a one."""
     with open_image(path) as image:
-        return image.size
+        return _stored_size(image)
 
 
-def read_index_image(path: Path) -> np.ndarray:
-    """(H, W) uint8 of a gray or palette PNG (labels or confidence)."""
+def _stored_size(image: Image.Image) -> tuple[int, int]:
+    """Pillow states the size of a TIFF as shown."""
+    return turned_size(image.size, _orientation(image)) if image.format == "TIFF" else image.size
+
+
+class IndexImage(NamedTuple):
+    """A gray or palette picture as it is stored.
+
+    samples: (H, W) uint8 values, those of 1, 2 and 4 bits not scaled
+    bits: per value; palette: (K, 3) uint8 RGB, None if it is gray
+    """
+
+    samples: np.ndarray
+    bits: int
+    palette: np.ndarray | None
+
+    @property
+    def scale(self) -> int:
+        """Gray level of the value 1."""
+        return 255 // ((1 << self.bits) - 1)
+
+
+def read_samples(path: Path) -> IndexImage:
+    """Values of a gray or palette PNG of up to 8 bits; alpha 0 gives 0. InputError for other pictures."""
     with open_image(path, "mask") as image:
         if image.mode.startswith("I"):
             raise InputError(f"{path} has 16 bits per pixel: an 8-bit PNG with one id per pixel is expected")
-        if image.mode not in ("L", "P", "1"):
+        if image.mode not in ("L", "P", "1", "LA") or bits_of(image) != 8:
             raise InputError(
                 f"{path} has colors ({image.mode}): an 8-bit PNG with one id per pixel is expected"
             )
-        return np.array(image.convert("L") if image.mode == "1" else image, dtype=np.uint8)
+        raw = raw_mode(image)
+        bits = 1 if image.mode == "1" else next((bits for bits in (2, 4) if raw == f"L;{bits}"), 8)
+        if image.mode == "LA":
+            gray, alpha = np.moveaxis(np.array(image), -1, 0)
+            return IndexImage(np.where(alpha > 0, gray, 0).astype(np.uint8), 8, None)
+        colors = image.getpalette("RGB") if image.mode == "P" else None
+        samples = np.array(image, np.uint8)  # Pillow scales 2 and 4 bits to 255, and makes 1 bit 0 and 1
+    if colors is not None:
+        return IndexImage(samples, 8, np.array(colors, np.uint8).reshape(-1, 3))
+    return IndexImage(
+        samples // np.uint8(255 // ((1 << bits) - 1)) if bits in (2, 4) else samples, bits, None
+    )
+
+
+def read_index_image(path: Path) -> np.ndarray:
+    """(H, W) uint8 of a gray or palette PNG: gray levels of the one, indices of the other."""
+    image = read_samples(path)
+    return image.samples if image.palette is not None else image.samples * np.uint8(image.scale)
+
+
+def turned_onto(pixels: np.ndarray, path: Path, photo: Path | None) -> np.ndarray:
+    """(H, W) values of the mask `path` in the frame of its photo as stored (`mask_orientation`)."""
+    return np.ascontiguousarray(turned(pixels, mask_orientation(path, photo)[0]))
+
+
+def index_image_size(path: Path, photo: Path | None) -> tuple[int, int]:
+    """(width, height) of a mask in the frame of its photo as stored, from the header."""
+    return turned_size(image_size(path), mask_orientation(path, photo)[0])
+
+
+def mask_orientation(path: Path, photo: Path | None) -> tuple[int, bool]:
+    """How a mask is turned into the frame of its photo as stored, and whether only a rule says so
+    (`mask_turn`); (1, False) where there is no photo.
+    """
+    if photo is None or not photo.is_file():
+        return 1, False
+    with open_image(photo, "photo") as image:
+        orientation, size = _orientation(image), _stored_size(image)
+    with open_image(path, "mask") as image:
+        return mask_turn(_orientation(image), _stored_size(image), orientation, size)
 
 
 def data_uri(image: np.ndarray, suffix: str = ".jpg") -> str:
@@ -211,8 +489,10 @@ def data_uri(image: np.ndarray, suffix: str = ".jpg") -> str:
     return f"data:image/{kind};base64,{base64.b64encode(encoded.tobytes()).decode()}"
 
 
-def write_image(path: Path, image: np.ndarray) -> None:
-    """Write (H, W) or (H, W, 3) uint8 RGB; the suffix chooses the format."""
+def write_image(path: Path, image: np.ndarray, orientation: int = 1) -> None:
+    """Write (H, W) or (H, W, 3) uint8 RGB; the suffix chooses the format. orientation: for a PNG to state,
+    that of the photo in whose frame a mask lies.
+    """
     import cv2
 
     done, encoded = cv2.imencode(
@@ -221,4 +501,6 @@ def write_image(path: Path, image: np.ndarray) -> None:
     if not done:
         raise OSError(f"could not encode {path}")
     with atomic_path(path) as temporary:
-        temporary.write_bytes(encoded)  # not by cv2.imwrite, which does not always notice that a disk is full
+        temporary.write_bytes(
+            with_orientation(encoded.tobytes(), orientation)
+        )  # not by cv2.imwrite, which does not always notice that a disk is full

@@ -30,7 +30,7 @@ def read_json(path: Path, max_bytes: int | None = None) -> object:
             raise FileNotFoundError(errno.ENOENT, "No such file")
         if max_bytes is not None and path.stat().st_size > max_bytes:
             raise InputError(f"{path} is larger than {max_bytes >> 20} MiB: that is no file of this kind")
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_bytes())  # UTF-8, 16 or 32, with or without a byte order mark
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
     except (ValueError, RecursionError) as error:

@@ -1,20 +1,27 @@
 """LAS and LAZ files: are header, records and compressed chunks where the counts say?
 
 laspy reads as many records as are announced, whether they are there or not, and lazrs ends the process where
-a size leads to more memory than there is.
+a size leads to more memory than there is; it does not know points that are compressed as one stream, without
+chunks, as LASzip did at first.
 Layout: ASPRS LAS 1.4 R15; LASzip's VLR and layered chunks as in https://github.com/LASzip/LASzip (laszip_dll,
     lasreadpoint).
 """
 
 from __future__ import annotations
 
+import io
 import mmap
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from sc3d.errors import InputError
 from sc3d.io.limits import DamagedFileError
+
+if TYPE_CHECKING:
+    import laspy
 
 HEADER, HEADER_14 = 227, 375  # bytes, of versions up to 1.2 and of 1.4
 VLR, EVLR = 54, 60  # bytes of the header of a record
@@ -24,7 +31,7 @@ LASZIP = (b"laszip encoded\0\0", 22204)
 # bytes per type of item; 0 and 14 are bytes of any number
 ITEM_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # per type of item; bytes have one each
-POINTWISE, LAYERED = 2, 3  # kinds of compression
+STREAM, POINTWISE, LAYERED = 1, 2, 3  # kinds of compression: all points in one, in chunks, by layers
 RATIO, SLACK = 300, 1 << 20  # LAZ that claims to expand by more is refused: surveys come to 5 or 20
 # points of a chunk that says its number itself; bytes of a chunk larger than its file
 VARIABLE, LARGEST_CHUNK = 2**32 - 1, 64 << 20
@@ -33,7 +40,8 @@ STREAMED = -1  # the chunk table's position is at the end of the file
 
 class LasHeader(NamedTuple):
     """size: bytes, then num_vlrs records up to `offset`, where the points begin; form: point format, 128 more
-    if they are compressed; record: bytes of a point; evlrs: position and number of extended records.
+    if they are compressed; record: bytes of a point; evlrs: position and number of extended records;
+    stream: where LASzip's record begins, if the points are compressed without chunks, else 0.
     """
 
     size: int
@@ -43,6 +51,7 @@ class LasHeader(NamedTuple):
     record: int
     num_points: int
     evlrs: tuple[int, int]
+    stream: int = 0
 
     @property
     def has_colors(self) -> bool:
@@ -63,6 +72,43 @@ def check_las(path: Path) -> LasHeader:
             raise InputError(f"cannot read {path}: it {what}; write or copy it again") from None
 
 
+@contextmanager
+def open_las(path: Path) -> Iterator[laspy.LasReader]:
+    """A reader of a LAS or LAZ file that is checked before; InputError for whatever is wrong with it, also
+    while it is read.
+    """
+    import laspy
+
+    header = check_las(path)
+    try:
+        source = io.BytesIO(_in_one_chunk(path.read_bytes(), header)) if header.stream else path
+        # not laszip, which ends the process for broken files
+        backends = (laspy.LazBackend.LazrsParallel, laspy.LazBackend.Lazrs)
+        with laspy.open(source, laz_backend=backends) as reader:
+            yield reader
+    except (KeyboardInterrupt, SystemExit, GeneratorExit, InputError):
+        raise
+    # laspy raises many kinds for broken files; a panic of lazrs is no Exception
+    except BaseException as error:
+        what = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"cannot read {path}: {what}; write or copy it again") from None
+
+
+def _in_one_chunk(content: bytes, header: LasHeader) -> bytes:
+    """The same file with its stream of points as one chunk, which is coded alike: lazrs reads chunks only."""
+    import lazrs
+
+    head, points = bytearray(content[: header.offset]), content[header.offset :]
+    struct.pack_into("<H", head, header.stream, POINTWISE)
+    struct.pack_into("<I", head, header.stream + 12, max(header.num_points, 1))
+    items = struct.unpack_from("<H", head, header.stream + 32)[0]
+    record = bytes(head[header.stream : header.stream + 34 + 6 * items])
+    table = io.BytesIO()
+    lazrs.write_chunk_table(table, [(header.num_points, len(points))], lazrs.LazVlr(record))
+    start = struct.pack("<q", header.offset + 8 + len(points))
+    return bytes(head) + start + points + table.getvalue()
+
+
 def _check(data: mmap.mmap) -> LasHeader:
     header = _read_header(data)
     laszip = _walk_vlrs(data, header)
@@ -80,6 +126,9 @@ def _check(data: mmap.mmap) -> LasHeader:
         )
     if laszip is None:
         raise DamagedFileError("is compressed, but does not say how")
+    if struct.unpack_from("<H", data, laszip)[0] == STREAM:
+        _check_items(data, header, laszip)
+        return header._replace(stream=laszip)
     if header.num_points:
         _check_chunks(data, header, laszip)
     return header
@@ -101,8 +150,8 @@ def _read_header(data: mmap.mmap) -> LasHeader:
     return LasHeader(size, offset, num_vlrs, form, record, count, evlrs)
 
 
-def _walk_vlrs(data: mmap.mmap, header: LasHeader) -> bytes | None:
-    """The content of LASzip's record, if there is one."""
+def _walk_vlrs(data: mmap.mmap, header: LasHeader) -> int | None:
+    """Where the content of LASzip's record begins, if there is one."""
     position, found = header.size, None
     if header.num_vlrs * VLR > header.offset - header.size:
         raise DamagedFileError(f"announces {header.num_vlrs} records in {header.offset - header.size} bytes")
@@ -112,7 +161,7 @@ def _walk_vlrs(data: mmap.mmap, header: LasHeader) -> bytes | None:
         if position > header.offset:
             raise DamagedFileError("has a record that reaches into the points")
         if (user, number) == LASZIP:
-            found = data[position - length : position]
+            found = position - length
     return found
 
 
@@ -125,10 +174,19 @@ def _walk_evlrs(data: mmap.mmap, position: int, count: int) -> None:
             raise DamagedFileError("has an extended record that is cut off")
 
 
-def _check_chunks(data: mmap.mmap, header: LasHeader, laszip: bytes) -> None:
-    kind, chunk = struct.unpack_from("<H10xI", laszip)
-    num_items = struct.unpack_from("<H", laszip, 32)[0]
-    items = [struct.unpack_from("<HHH", laszip, 34 + 6 * row) for row in range(num_items)]
+def _check_items(data: mmap.mmap, header: LasHeader, laszip: int) -> list[tuple[int, int, int]]:
+    """What LASzip's record says that a point is made of: type, bytes and version of each item."""
+    num_items = struct.unpack_from("<H", data, laszip + 32)[0]
+    items = [struct.unpack_from("<HHH", data, laszip + 34 + 6 * row) for row in range(num_items)]
+    if sum(size for _, size, _ in items) != header.record or any(
+        ITEM_SIZES.get(item, size if item in (0, 14) else 0) != size for item, size, _ in items
+    ):
+        raise DamagedFileError("has points that are compressed in an unknown way")
+    return items
+
+
+def _check_chunks(data: mmap.mmap, header: LasHeader, laszip: int) -> None:
+    kind, chunk = struct.unpack_from("<H10xI", data, laszip)
     one_size = chunk != VARIABLE
     if (
         not one_size
@@ -137,10 +195,9 @@ def _check_chunks(data: mmap.mmap, header: LasHeader, laszip: bytes) -> None:
         and not 0 < chunk * header.record <= max(LARGEST_CHUNK, header.num_points * header.record)
     ):
         raise DamagedFileError(f"has compressed chunks of {chunk} points, which cannot be")
-    if kind not in (POINTWISE, LAYERED) or sum(size for _, size, _ in items) != header.record:
+    if kind not in (POINTWISE, LAYERED):
         raise DamagedFileError("has points that are compressed in an unknown way")
-    if any(ITEM_SIZES.get(item, size if item in (0, 14) else 0) != size for item, size, _ in items):
-        raise DamagedFileError("has points that are compressed in an unknown way")
+    items = _check_items(data, header, laszip)
     table = struct.unpack_from("<q", data, header.offset)[0]
     table = struct.unpack_from("<q", data, len(data) - 8)[0] if table == STREAMED else table
     if not header.offset + 8 <= table <= len(data) - 8:

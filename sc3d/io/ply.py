@@ -237,23 +237,32 @@ def read_records(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     return np.fromfile(path, header.record, header.elements[0].rows, offset=header.size), header.comments
 
 
+def read_columns(path: Path, header: Header, names: Sequence[str]) -> np.ndarray | None:
+    """(V, K) float64 of named properties of the vertices of a checked PLY; None unless the vertices come
+    first and have them all.
+    """
+    vertex = header.elements[0] if header.elements else None
+    if vertex is None or vertex.name != "vertex" or vertex.has_lists:
+        return None
+    known = [entry.name for entry in vertex.properties]
+    if not set(names) <= set(known):
+        return None
+    if header.order:
+        table = np.fromfile(path, header.record, vertex.rows, offset=header.size)
+        return np.stack([table[name].astype(np.float64) for name in names], axis=1)
+    with path.open("rb") as file:
+        file.seek(header.size)
+        numbers = np.fromfile(file, np.float64, vertex.rows * len(known), sep=" ").reshape(vertex.rows, -1)
+    return np.stack([numbers[:, known.index(name)] for name in names], axis=1)
+
+
 def read_positions(path: Path, header: Header) -> np.ndarray | None:
     """(V, 3) float64 x, y, z of the vertices of a checked PLY, which Open3D keeps for clouds only; None
     unless they are doubles and come first.
     """
     vertex = header.elements[0] if header.elements else None
-    if vertex is None or vertex.name != "vertex" or vertex.has_lists:
-        return None
-    columns = [entry.name for entry in vertex.properties]
-    if not {"x", "y", "z"} <= {entry.name for entry in vertex.properties if entry.dtype == "f8"}:
-        return None
-    if header.order:
-        table = np.fromfile(path, header.record, vertex.rows, offset=header.size)
-        return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    with path.open("rb") as file:
-        file.seek(header.size)
-        table = np.fromfile(file, np.float64, vertex.rows * len(columns), sep=" ").reshape(vertex.rows, -1)
-    return np.stack([table[:, columns.index(axis)] for axis in "xyz"], axis=1)
+    doubles = {entry.name for entry in vertex.properties if entry.dtype == "f8"} if vertex else set()
+    return read_columns(path, header, "xyz") if {"x", "y", "z"} <= doubles else None
 
 
 def _least(entry: Property, order: str) -> int:

@@ -9,18 +9,15 @@ from importlib import metadata
 from pathlib import Path
 
 import sc3d
+from sc3d.io.folders import files_below
 
 
 def digest(path: Path) -> str:
-    """Content hash of a file, or of all files of a folder with their names; "" if it does not exist."""
+    """Content hash of a file, or of all files of a folder with their names, but for what sc3d has written
+    there; "" if it does not exist.
+    """
     state = hashlib.blake2b(digest_size=16)
-    files = (
-        [path]
-        if path.is_file()
-        else sorted(file for file in path.rglob("*") if file.is_file())
-        if path.is_dir()
-        else []
-    )
+    files = [path] if path.is_file() else files_below(path)[0] if path.is_dir() else []
     if not files:
         return ""
     for file in files:

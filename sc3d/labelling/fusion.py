@@ -35,8 +35,8 @@ class Fusion:
 
     @property
     def votes(self) -> np.ndarray:
-        """(N, num_ids) float32 votes of the points' cells, in views of full weight; column 0 counts views."""
-        return self.grid.votes[self.rows].astype(np.float32) / SCALE
+        """(N, num_channels) float32 votes of the points' cells, in views of full weight; column 0 counts views."""
+        return np.divide(self.grid.votes[self.rows], SCALE, dtype=np.float32)
 
 
 def fuse(
@@ -44,14 +44,14 @@ def fuse(
     views: list[View],
     read_mask: ReadMask,
     surface: RayTarget | None,
-    num_ids: int,
+    num_channels: int,
     settings: Label,
 ) -> Fusion:
     """Fuse the masks of all views into labels of the cloud.
 
     read_mask: mask of a view, any size of the photo's aspect; masks are streamed
     surface: what blocks the view; None (or settings.depth_filter off) = labels penetrate
-    num_ids: largest class id + 1; settings.voxel_size must be set
+    num_channels: classes + 1; masks and labels hold channels, see `sc3d.scene.channels`; settings.voxel_size must be set
     """
     settings = settings.resolved
     weighting = VoteWeighting.from_settings(settings, cloud.extent, views)
@@ -59,7 +59,7 @@ def fuse(
     views = [view for view in views if may_see(view, low, high)]
     # multi-level voxel field: the rows of the grid are the accumulator
     accumulator = VoteAccumulator.for_cloud(
-        cloud, settings.voxel_size, num_ids, settings.mechanisms.reproject
+        cloud, settings.voxel_size, num_channels, settings.mechanisms.reproject
     )
     # pixel to first surface (eq. 4), semantic confidence voting
     seen = observations(views, read_mask, surface if settings.depth_filter else None, settings)
@@ -87,7 +87,7 @@ def fuse(
 
 
 def most_voted(votes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Winner of each cell. votes: (K, num_ids), column 0 is ignored.
+    """Winner of each cell. votes: (K, num_channels), column 0 is ignored.
 
     returns: (K,) uint8 label with most votes (0 = no votes; ties: smallest id), (K,) float32 its share of the votes
     """

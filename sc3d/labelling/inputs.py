@@ -4,34 +4,41 @@ both.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import open3d as o3d
 
-from sc3d.errors import InputError
-from sc3d.geometry.cameras import View
+from sc3d.errors import InputError, left_out
+from sc3d.geometry.cameras import View, may_see
 from sc3d.io.clouds import read_cloud
-from sc3d.io.images import image_size, read_index_image
 from sc3d.labelling.density import GaussianField, gaussian_density, kernel_density
 from sc3d.labelling.observation import Mask
+from sc3d.scene.channels import Channels
+from sc3d.scene.frame_check import Box, box_of, check_frame, describe
 from sc3d.scene.labelled_cloud import spacing_of
 from sc3d.scene.scene import Scene
 from sc3d.scene.splats import read_scene_splats
 
 FOOTPRINT_SAMPLE = 1000
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class Masks:
-    """The masks of a scene: files by view name, confidence maps where there are any, and the views that have
-    a mask.
+    """The masks of a scene: files by view name, confidence maps where there are any, the views that have a mask,
+    and the channels of the classes; without: names of the photos that have a camera and no mask.
     """
 
     files: dict[str, Path]
     confidences: dict[str, Path]
     views: list[View]
+    scene: Scene
+    channels: Channels
+    without: tuple[str, ...] = ()
 
     @classmethod
     def load(cls, scene: Scene, confidence: Path | None) -> Masks:
@@ -43,18 +50,41 @@ class Masks:
             hint="pass --classes FILE to `sc3d run`, or copy data/classes.json of the sc3d repository there and edit it",
         )
         scene.require(scene.masks, hint="run `sc3d segment SCENE` first, with --masks if you have some")
-        files = scene.mask_files(scene.masks, scene.class_table())
+        table = scene.class_table()
+        files = scene.mask_files(scene.masks, table)
         confidences = scene.mask_files(confidence) if confidence is not None and confidence.is_dir() else {}
         for name, path in confidences.items():
-            if name in files and image_size(path) != image_size(files[name]):
+            if name in files and scene.mask_size(path, name) != scene.mask_size(files[name], name):
                 raise InputError(f"{path} has another size than its mask: both must be the same")
-        return cls(files, confidences, [view for view in scene.model.views if view.name in files])
+        views = scene.model.views
+        masked = [view for view in views if view.name in files]
+        without = tuple(view.name for view in views if view.name not in files)
+        return cls(files, confidences, masked, scene, table.channels, without)
+
+    def tell_of_left_out(self, low: np.ndarray, high: np.ndarray) -> None:
+        """One line for each reason why photos do not vote, or not as others do. low, high: (3,) box of the
+        cloud, world.
+        """
+        count = len(self.views) + len(self.without)
+        away = [view.name for view in self.views if not may_see(view, low, high)]
+        sure = [view.name for view in self.views if view.name not in self.confidences]
+        if self.without:
+            logger.info(left_out(self.without, count, "photos have no mask and do not vote"))
+        if away:
+            logger.warning(left_out(away, count, "photos do not see the cloud and do not vote"))
+        if self.confidences and sure:
+            logger.warning(left_out(sure, count, "photos have no confidence map; their masks count as sure"))
 
     def read(self, view: View) -> Mask:
-        """As `fuse` wants it."""
+        """As `fuse` wants it: channels, not ids."""
         confidence = self.confidences.get(view.name)
-        sure = None if confidence is None else read_index_image(confidence)
-        return read_index_image(self.files[view.name]), sure
+        sure = None if confidence is None else self.scene.read_confidence(confidence, view.name)
+        file = self.files[view.name]
+        return self.channels.from_ids(self.scene.read_mask(file, view.name), file), sure
+
+    def size(self, view: View) -> tuple[int, int]:
+        """(width, height) px of the mask of a view."""
+        return self.scene.mask_size(self.files[view.name], view.name)
 
 
 def best_confidence(scene: Scene) -> Path:
@@ -62,8 +92,8 @@ def best_confidence(scene: Scene) -> Path:
     return scene.confidence_refined if scene.confidence_refined.is_dir() else scene.confidence
 
 
-def read_given_cloud(scene: Scene, file: Path | None) -> o3d.t.geometry.PointCloud:
-    """The cloud in `file`, or that of the scene, or the vertices of its mesh."""
+def given_cloud_path(scene: Scene, file: Path | None) -> Path:
+    """`file`, or the cloud of the scene, or its mesh, whose vertices do as well."""
     source = file or scene.cloud
     if file is None and not source.exists():
         source = scene.mesh
@@ -71,7 +101,28 @@ def read_given_cloud(scene: Scene, file: Path | None) -> o3d.t.geometry.PointClo
         raise InputError(
             f"{scene.path} has neither cloud.ply nor mesh.ply: run `sc3d extract SCENE`, or pass --cloud FILE"
         )
-    return read_cloud(source)
+    return source
+
+
+def read_given_cloud(scene: Scene, file: Path | None) -> o3d.t.geometry.PointCloud:
+    """The cloud of `given_cloud_path`."""
+    return read_cloud(given_cloud_path(scene, file))
+
+
+def require_in_view(path: Path, box: Box, masks: Masks, sparse_points: np.ndarray) -> None:
+    """InputError if no photo with a mask looks at the box around a cloud; a warning if the cloud lies
+    elsewhere than the scene.
+
+    box: world; sparse_points: (P, 3) world
+    """
+    if any(may_see(view, *box) for view in masks.views):
+        check_frame(path, np.array(box), masks.views, sparse_points)
+        return
+    cameras = box_of(np.array([view.center for view in masks.views]))
+    raise InputError(
+        f"no photo with a mask looks at {path}: its points are at {describe(box)}, the cameras at {describe(cameras)}."
+        " Is it in another frame? `sc3d import FILE SCENE --epsg` says which CRS it is in"
+    )
 
 
 def default_voxel_size(points: np.ndarray, masks: Masks) -> float:
@@ -85,7 +136,7 @@ def voxel_size_for(spacing: float, sample: np.ndarray, masks: Masks) -> float:
     """
     footprints = []
     for view in masks.views:
-        focal = view.focal * image_size(masks.files[view.name])[0] / view.width
+        focal = view.focal * masks.size(view)[0] / view.width
         footprints.append(np.median(np.linalg.norm(sample - view.center, axis=1)) / focal)
     return max(2 * spacing, 1.5 * float(np.median(footprints)))
 

@@ -132,7 +132,7 @@ class VoteAccumulator:
 
     cloud: the points; order: (N,) rows of the sorted points in the given cloud
     grid: the label field, to whose rows `cloud.rows` the votes are added
-    strict: (K, num_ids) int32 votes without mask edges, grazing views and doubtful depth; (0, num_ids) if not wanted
+    strict: (K, num_channels) int32 votes without mask edges, grazing views and doubtful depth; (0, num_channels) if not wanted
     overlay: (N,) uint8 label of the last view that saw a point, sorted; log: the votes view by view
     """
 
@@ -145,13 +145,13 @@ class VoteAccumulator:
 
     @classmethod
     def for_cloud(
-        cls, cloud: Cloud, voxel_size: float, num_ids: int, second: bool = False
+        cls, cloud: Cloud, voxel_size: float, num_channels: int, second: bool = False
     ) -> VoteAccumulator:
-        """No votes yet. num_ids: largest class id + 1; second: keep the strict votes too."""
+        """No votes yet. num_channels: classes + 1; second: keep the strict votes too."""
         voxels = sort_by_voxel(cloud.points, voxel_size, voxel_origin(cloud.extent.low, voxel_size))
-        grid = LabelGrid.from_voxels(voxels, num_ids)
+        grid = LabelGrid.from_voxels(voxels, num_channels)
         points, order = _sorted_cloud(cloud, voxels, grid)
-        strict = np.zeros((len(points.rows) if second else 0, num_ids), np.int32)
+        strict = np.zeros((len(points.rows) if second else 0, num_channels), np.int32)
         return cls(points, order, grid, strict, np.zeros(len(order), np.uint8), VoteLog())
 
     def add_view(self, view: View, observation: Observation, weighting: VoteWeighting) -> None:
@@ -166,7 +166,7 @@ class VoteAccumulator:
 
     @property
     def votes(self) -> np.ndarray:
-        """(K, num_ids) int32 copy of the votes of all cells."""
+        """(K, num_channels) int32 copy of the votes of all cells."""
         return self.grid.votes[self.cloud.rows]
 
     def verify(self, winner: np.ndarray, reweigh: bool) -> np.ndarray:
@@ -325,12 +325,12 @@ def _visibility(cloud, camera, observation, weighting, cell, point):
 
 @numba.njit(parallel=True, cache=True, error_model="numpy")
 def cast_votes(cloud, camera, observation, weighting, votes, strict, overlay, view_votes):
-    """Add a view to votes (rows, num_ids) int32 of the grid, and to strict and overlay as in `VoteAccumulator`; fill view_votes."""
-    num_ids, labels, weights = votes.shape[1], view_votes.labels, view_votes.weights
+    """Add a view to votes (rows, num_channels) int32 of the grid, and to strict and overlay as in `VoteAccumulator`; fill view_votes."""
+    num_channels, labels, weights = votes.shape[1], view_votes.labels, view_votes.weights
     for block in numba.prange(len(cloud.blocks) - 1):
         if not _in_frustum(camera, cloud.centers[block], cloud.radii[block]):
             continue
-        sums = np.zeros((2, num_ids), np.int64)  # row 1: strict sightings only
+        sums = np.zeros((2, num_channels), np.int64)  # row 1: strict sightings only
         for cell in range(cloud.blocks[block], cloud.blocks[block + 1]):
             count = strict_count = 0
             for point in range(cloud.cells[cell], cloud.cells[cell + 1]):

@@ -17,8 +17,8 @@ MIN_EXAMPLES = 500  # agreed points of a class; with fewer, its look is not know
 class LabelledPoints:
     """What is known of N points, canonical order.
 
-    points: (N, 3) world; seeds: labels of fusion; votes: (N, num_ids) float32 or None, column 0 is ignored;
-        colors: (N, 3) uint8 or None
+    points: (N, 3) world; seeds: labels of fusion, which are channels (`sc3d.scene.channels`); votes: (N, C + 1)
+        float32 or None, column 0 is ignored; colors: (N, 3) uint8 or None
     """
 
     points: np.ndarray
@@ -35,7 +35,7 @@ class LabelledPoints:
 
     @property
     def known_votes(self) -> np.ndarray:
-        """(N, num_ids) float32 votes, where the method needs them; ValueError if there are none."""
+        """(N, C + 1) float32 votes, where the method needs them; ValueError if there are none."""
         if self.votes is None:
             raise ValueError("these points have no votes, which the map method needs")
         return self.votes

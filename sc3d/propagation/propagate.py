@@ -4,7 +4,7 @@ method, in the paper's order. By tiles, with the same signature: `tiling.propaga
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from sc3d.propagation.appearance import learn_appearance, plausible, uses_appear
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
 from sc3d.propagation.potts import minimize_energy
 from sc3d.propagation.region_growing import grow_regions, reachable, vote_nearest
+from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import read_labelled, read_votes, with_labels
 from sc3d.scene.labels import LOCKED, PROPAGATED, SEED, UNLOCKED, Labels
 from sc3d.scene.scene import Scene
@@ -118,9 +119,13 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     if not (seeds.label > 0).any():
         raise no_seeds(path)
     colors = cloud.point.colors.numpy() if "colors" in cloud.point else None
-    points = LabelledPoints(cloud.point.positions.numpy().astype(np.float64), seeds, votes, colors)
+    channels = Channels.of_classes(np.unique(seeds.label).tolist()) if votes is None else votes.channels
+    seeds = replace(seeds, label=channels.from_ids(seeds.label, path))
+    values, positions = None if votes is None else votes.values, cloud.point.positions.numpy()
+    points = LabelledPoints(positions.astype(np.float64), seeds, values, colors)
     normals = cloud.point.normals.numpy()
     labels = propagate(points, normals, settings)
+    labels = replace(labels, label=channels.to_ids(labels.label))
     write_geometry(settings.output or scene.labelled, with_labels(cloud, normals, labels))
     labelled, sure = labels.label > 0, labels.confidence
     propagated = int((labels.state == PROPAGATED).sum())

@@ -16,7 +16,7 @@ from sc3d.geometry.raster import Raster, highest_points, spacing_of_all
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.json_files import read_json
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.scene import Scene
+from sc3d.scene.scene import Scene, find_masks
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -28,6 +28,7 @@ logger = logging.getLogger(__name__)
 _CELL = 2.0  # side of the cells that areas are counted in, point spacings
 _STAGES = (
     "synthesize",
+    "map_photos",
     "reconstruct",
     "train",
     "extract",
@@ -83,6 +84,16 @@ class ReportData:
         )
         folder = used.get("truth") if isinstance(used, dict) else None
         return Path(folder) if isinstance(folder, str) and Path(folder).is_dir() else self.scene.truth
+
+    @cached_property
+    def truth_files(self) -> dict[str, Path]:
+        """Truth masks by photo name."""
+        return find_masks(self.truth, self.scene.photo_names, strict=False)
+
+    @cached_property
+    def mask_files(self) -> dict[str, Path]:
+        """Given masks by photo name."""
+        return find_masks(self.scene.masks, self.scene.photo_names, strict=False)
 
     @property
     def contact_sheet_file(self) -> Path:

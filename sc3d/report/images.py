@@ -5,14 +5,13 @@ from __future__ import annotations
 import logging
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View
-from sc3d.io.images import data_uri, read_image, read_index_image
+from sc3d.io.images import data_uri
 from sc3d.report.data import ReportData
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.view.colors import COLORINGS, color_points
@@ -61,7 +60,7 @@ def comparison(data: ReportData, view: View, labelled: LabelledSurface | None) -
     """Captions and data URIs of one photo: the photo, the given mask, the fused labels and the truth, as far
     as they exist.
     """
-    scene, stem = data.scene, Path(view.name).stem
+    scene = data.scene
     scale = min(1.0, _PHOTO_SIZE / max(view.width, view.height))
     size = max(1, round(view.width * scale)), max(1, round(view.height * scale))
     panels = []
@@ -69,21 +68,21 @@ def comparison(data: ReportData, view: View, labelled: LabelledSurface | None) -
         panels.append(
             (
                 "photo",
-                data_uri(cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA)),
+                data_uri(cv2.resize(scene.read_photo(view.name), size, interpolation=cv2.INTER_AREA)),
             )
         )
     if data.class_table is None:
         return panels
     palette = data.class_table.palette
     for caption, file in (
-        ("given mask", scene.masks / f"{stem}.png"),
+        ("given mask", data.mask_files.get(view.name)),
         ("fused labels", None),
-        ("truth", data.truth / f"{stem}.png"),
+        ("truth", data.truth_files.get(view.name)),
     ):
-        if file is None and labelled is not None:
+        if caption == "fused labels" and labelled is not None:
             labels, _ = labelled.see(view, size)
-        elif file is not None and file.exists():
-            labels = cv2.resize(read_index_image(file), size, interpolation=cv2.INTER_NEAREST)
+        elif file is not None:
+            labels = cv2.resize(scene.read_mask(file, view.name), size, interpolation=cv2.INTER_NEAREST)
         else:
             continue
         panels.append((caption, data_uri(palette[labels], ".png")))

@@ -197,10 +197,10 @@ def training_section(data: ReportData) -> str:
 def _choose_views(data: ReportData) -> list:
     """Photos spread evenly over the flight; those with truth first, then those with a mask."""
 
-    def with_file(folder: Path) -> list:
-        return [view for view in data.views if (folder / f"{Path(view.name).stem}.png").exists()]
+    def with_file(files: dict[str, Path]) -> list:
+        return [view for view in data.views if view.name in files]
 
-    views = with_file(data.truth) or with_file(data.scene.masks) or data.views
+    views = with_file(data.truth_files) or with_file(data.mask_files) or data.views
     if not views:
         return []
     spread = np.linspace(0, len(views) - 1, min(_NUM_PHOTOS, len(views))).round().astype(int)

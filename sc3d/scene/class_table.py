@@ -12,6 +12,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.json_files import read_json
+from sc3d.scene.channels import Channels
 
 # in names: they would act on terminals, or cannot be written
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
@@ -47,6 +48,11 @@ class ClassTable:
     def num_ids(self) -> int:
         """Largest id + 1: the length of arrays indexed by id."""
         return self.classes[-1].id + 1
+
+    @property
+    def channels(self) -> Channels:
+        """Of votes for these classes."""
+        return Channels.of_classes([entry.id for entry in self.classes])
 
     @property
     def palette(self) -> np.ndarray:

@@ -31,7 +31,7 @@ class DepthMap:
 
 def depth_file(folder: Path, photo: str) -> Path:
     """Where the depth of a photo lies; photo: its name below `images/`."""
-    return folder / Path(photo).with_suffix(".npz")
+    return folder / f"{photo}.npz"
 
 
 def write_depth_map(path: Path, depth_map: DepthMap) -> None:

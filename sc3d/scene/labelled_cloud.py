@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,7 +17,11 @@ from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, orient_norm
 from sc3d.geometry.raycast import FirstSurface, RayTarget, Surface, first_surface, nearest_points
 from sc3d.geometry.voxel_traversal import VoxelSurface
 from sc3d.io.clouds import read_cloud, read_mesh
+from sc3d.scene.channels import Channels
+from sc3d.scene.frame_check import check_together
 from sc3d.scene.labels import STATE_NAMES, Labels
+
+logger = logging.getLogger(__name__)
 
 NORMAL_NEIGHBORS = 30
 SPACING_SAMPLE, SPACING_NEIGHBORS = 100_000, 8
@@ -45,14 +51,24 @@ def unit_normals(
         `NeighborIndex`
     """
     if given is not None:
-        normals = given.astype(np.float32)
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        if np.isfinite(lengths).all() and (lengths > 0).all():
-            return normals / lengths
+        normals, usable = given.astype(np.float32), usable_normals(given)
+        if usable.all():
+            return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        logger.warning(
+            "%d of %d normals have no length or are not finite: all are estimated",
+            (~usable).sum(),
+            len(normals),
+        )
     neighbors, _ = NeighborIndex(points, origin).nearest(points, NORMAL_NEIGHBORS)
     if neighbors.shape[1] < 3:
         raise InputError(f"the cloud has {len(points)} points: normals need at least 3")
     return orient_normals(points, estimate_normals(points, neighbors), centers)
+
+
+def usable_normals(normals: np.ndarray) -> np.ndarray:
+    """(N,) bool normals (N, 3) that have a direction."""
+    lengths = np.linalg.norm(normals.astype(np.float32), axis=1)
+    return np.isfinite(lengths) & (lengths > 0)
 
 
 def read_surface(
@@ -70,20 +86,18 @@ def read_surface(
     """
     if kind == "auto" and mesh.exists():
         read = read_mesh(mesh)
-        return Surface.from_mesh(
-            read.vertex.positions.numpy().astype(np.float64), read.triangle.indices.numpy(), origin
-        )
+        vertices = read.vertex.positions.numpy().astype(np.float64)
+        check_together(mesh, vertices, points)
+        return Surface.from_mesh(vertices, read.triangle.indices.numpy(), origin)
     if kind == "surfels":
         return Surface.from_cloud(points, normals, origin)
     return VoxelSurface.from_cloud(points, normals, SURFACE_VOXEL * spacing_of(points))
 
 
 def with_labels(
-    cloud: o3d.t.geometry.PointCloud, normals: np.ndarray, labels: Labels, votes: np.ndarray | None = None
+    cloud: o3d.t.geometry.PointCloud, normals: np.ndarray, labels: Labels, votes: Votes | None = None
 ) -> o3d.t.geometry.PointCloud:
-    """The same points, in order, with attributes label, confidence, state, num_views (and votes per class:
-    (N, num_ids) float32).
-    """
+    """The same points, in order, with attributes label, confidence, state, num_views (and votes per class)."""
     result = cloud.clone()
     attributes = {
         "normals": normals.astype(np.float32),
@@ -96,7 +110,8 @@ def with_labels(
         del result.point[name]
     if votes is not None:
         attributes |= {
-            f"{VOTES}{label}": votes[:, label, None].astype(np.float32) for label in range(votes.shape[1])
+            f"{VOTES}{label}": votes.values[:, channel, None].astype(np.float32)
+            for channel, label in enumerate(votes.channels.ids)
         }
     for name, values in attributes.items():
         result.point[name] = o3d.core.Tensor(np.ascontiguousarray(values))
@@ -141,29 +156,40 @@ def _in_range(path: Path, name: str, values: np.ndarray, largest: int, dtype: ty
     return values.astype(dtype)
 
 
-def read_votes(cloud: o3d.t.geometry.PointCloud) -> np.ndarray | None:
-    """(N, num_ids) float32 votes that `label` left in a cloud; None if there are none. InputError if they are
-    none.
+@dataclass(frozen=True)
+class Votes:
+    """values: (N, C + 1) float32, in views of full weight, of which column 0 counts views; channels: the class of
+    each column.
     """
-    ids = sorted(
-        int(name[len(VOTES) :])
-        for name in cloud.point
-        if name.startswith(VOTES) and name[len(VOTES) :].isdigit()
-    )
-    if not ids or ids != list(range(len(ids))):
+
+    values: np.ndarray
+    channels: Channels
+
+
+def vote_channels(names: Iterable[str]) -> Channels | None:
+    """The classes of which a cloud has votes, by the names of its attributes; None if there are none."""
+    numbers = [name[len(VOTES) :] for name in names if name.startswith(VOTES)]
+    ids = [int(number) for number in numbers if number.isdecimal() and len(number) < 4 and number.isascii()]
+    return None if 0 not in ids or len(ids) < 2 or max(ids) > 255 else Channels.of_classes(ids)
+
+
+def read_votes(cloud: o3d.t.geometry.PointCloud) -> Votes | None:
+    """The votes that `label` left in a cloud; None if there are none. InputError if they are none."""
+    channels = vote_channels(cloud.point)
+    if channels is None:
         return None
     votes = np.concatenate(
-        [cloud.point[f"{VOTES}{label}"].numpy().astype(np.float32) for label in ids], axis=1
+        [cloud.point[f"{VOTES}{label}"].numpy().astype(np.float32) for label in channels.ids], axis=1
     )
-    if len(ids) > 256 or not (np.isfinite(votes) & (votes >= 0)).all():
-        raise InputError(
-            "the votes of the cloud are not finite numbers of up to 255 classes: run `sc3d label` again"
-        )
-    return votes
+    if not (np.isfinite(votes) & (votes >= 0)).all():
+        raise InputError("the votes of the cloud are not finite numbers: run `sc3d label` again")
+    return Votes(votes, channels)
 
 
 def spacing_of(points: np.ndarray) -> float:
-    """Sampling distance of the (N, 3) points, world units, from at most 100 000 of them; 1 if they coincide."""
+    """Sampling distance of the (N, 3) points, world units, from at most 100 000 of them; 1 if they
+    coincide.
+    """
     sample = points[:: max(1, len(points) // SPACING_SAMPLE)]
     return (
         point_spacing(NeighborIndex(points, points.min(axis=0)).nearest(sample, SPACING_NEIGHBORS + 1)[1])

@@ -2,16 +2,38 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sc3d.errors import InputError
-from sc3d.io.images import check_photo, find_photos, image_size, read_index_image, require_within
+from sc3d.errors import InputError, examples
+from sc3d.io.images import (
+    broken_link,
+    check_photo,
+    find_photos,
+    image_size,
+    index_image_size,
+    list_photos,
+    mask_orientation,
+    read_image,
+    read_opaque,
+    require_within,
+    turned_onto,
+)
 from sc3d.io.limits import FARTHEST, MAX_MASK_PIXELS
+from sc3d.io.orientation import turned_size
 from sc3d.scene.class_table import CONTROL, ClassTable, read_classes
+from sc3d.scene.mask_values import Meanings, meanings_of, read_confidence, read_labels
+from sc3d.scene.photo_names import PhotoNames, files_of_photos, photo_name
+
+if TYPE_CHECKING:
+    from sc3d.geometry.cameras import View
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -27,6 +49,11 @@ class Scene:
     @property
     def sparse(self) -> Path:
         return self.path / "sparse" / "0"
+
+    @property
+    def mapped(self) -> Path:
+        """The model before it is brought to its place."""
+        return self.path / "mapped"
 
     @property
     def depth(self) -> Path:
@@ -114,6 +141,8 @@ class Scene:
         if not self.path.is_dir():
             raise InputError(f"the scene folder {self.path} does not exist")
         for path in paths:
+            if path.is_symlink() and not path.exists():
+                raise InputError(broken_link(path))
             if not path.exists():
                 raise InputError(f"{path} is missing: {hint}")
 
@@ -127,18 +156,115 @@ class Scene:
         return read_sparse_model(self.sparse)
 
     def photo(self, name: str) -> Path:
-        """Path of the photo that a view is named after."""
-        return self.images / name
+        """Path of the photo that a view is named after; its file may be spelled otherwise (see `_spellings`)."""
+        path = self.images / name
+        return path if path.exists() else self.images / self._spellings.get(name, name)
+
+    def read_photo(self, name: str) -> np.ndarray:
+        """(H, W, 3) uint8 RGB pixels of a photo as stored."""
+        return read_image(self.photo(name), self.images)
+
+    def read_mask(self, file: Path, name: str) -> np.ndarray:
+        """(H, W) uint8 class ids of a mask or truth mask of a photo, in the photo's frame as stored, 0 where
+        the photo is transparent.
+        """
+        return self._onto_photo(read_labels(file, self._meanings), file, name)
+
+    def read_confidence(self, file: Path, name: str) -> np.ndarray:
+        """(H, W) uint8 of a confidence map, as `read_mask`."""
+        return self._onto_photo(read_confidence(file), file, name)
+
+    @cached_property
+    def _meanings(self) -> Meanings:
+        return meanings_of(self.class_table())
+
+    def _onto_photo(self, pixels: np.ndarray, file: Path, name: str) -> np.ndarray:
+        mask, opaque = turned_onto(pixels, file, self.photo(name)), self._opaque(name)
+        if opaque is None:
+            return mask
+        rows, columns = (
+            (np.arange(size) * whole) // size for size, whole in zip(mask.shape, opaque.shape, strict=True)
+        )
+        return np.where(opaque[np.ix_(rows, columns)], mask, 0).astype(np.uint8)
+
+    def mask_size(self, file: Path, name: str) -> tuple[int, int]:
+        """(width, height) of what `read_mask` gives, from the header."""
+        return index_image_size(file, self.photo(name))
+
+    def opaque_pixels(self, view: View, target: View) -> np.ndarray | None:
+        """(H, W) bool pixels of `target`, a view of the same pose, that lie in the photo of `view` and are
+        opaque there; None if the photo has no transparent pixels.
+        """
+        from sc3d.geometry.cameras import resample
+
+        opaque = self._opaque(view.name)
+        return None if opaque is None else resample(opaque.astype(np.uint8), view, target, labels=True) > 0
+
+    def _opaque(self, name: str) -> np.ndarray | None:
+        photo = self.photo(name)
+        return read_opaque(photo) if photo.is_file() else None
+
+    @cached_property
+    def photo_names(self) -> PhotoNames:
+        """All photos: those in `images/`, and those that cameras are named after."""
+        spelled = set(self._spellings.values())
+        return PhotoNames([name for name in self._listed if name not in spelled] + self._named)
+
+    @cached_property
+    def _listed(self) -> list[str]:
+        photos = list_photos(self.images) if self.images.is_dir() else []
+        return [photo_name(photo, self.images) for photo in photos]
+
+    @cached_property
+    def _named(self) -> list[str]:
+        return [view.name for view in self.model.views] if self.sparse.is_dir() else []
+
+    @cached_property
+    def _spellings(self) -> dict[str, str]:
+        """Photos in `images/` by the names of views that differ from theirs in letter case or Unicode form,
+        which Windows and macOS do not tell apart.
+        """
+        others = PhotoNames(set(self._listed) - set(self._named))
+        missing = set(self._named) - set(self._listed)
+        found = {name: others.same_letters(name) for name in missing}
+        return {name: photos[0] for name, photos in found.items() if len(photos) == 1}
 
     def mask_files(self, folder: Path, class_table: ClassTable | None = None) -> dict[str, Path]:
-        """Masks (or truth masks, or confidence maps) of the views, by view name; all checked.
+        """Masks (or truth masks, or confidence maps) of the views, by view name; all checked. Those of photos
+        without a camera are left out; `warn_of_unplaced` says so.
 
-        Raises InputError for an empty folder, a mask without a view, another aspect than the photo, or ids
-        outside the class table.
+        Raises InputError for an empty folder, a mask without a photo, one that fits several photos, another
+        aspect than the photo, or ids outside the class table.
         """
-        return match_masks(
-            folder, {view.name: (view.width, view.height) for view in self.model.views}, class_table
+        sizes = {view.name: (view.width, view.height) for view in self.model.views}
+        return match_masks(folder, sizes, class_table, self.photo_names, self.images)
+
+    def mask_file(self, folder: Path, name: str) -> Path | None:
+        """The mask of one photo in a folder, not looked into; None if there is none."""
+        return self.photo_names.find(folder, name) or find_masks(folder, self.photo_names, strict=False).get(
+            name
         )
+
+    def warn_of_unplaced(self, *folders: Path) -> None:
+        """Say in one line how many masks, or other images, in `folders` are of photos without a camera, if
+        there is a model.
+        """
+        if not self.sparse.is_dir():
+            return
+        placed, unplaced = {view.name for view in self.model.views}, set()
+        counts = []
+        for folder in filter(Path.is_dir, folders):
+            names = set(find_masks(folder, self.photo_names, strict=False)) - placed
+            unplaced |= names
+            counts += [f"{folder.name} {len(names)}"] if names else []
+        if unplaced:
+            logger.warning(
+                "%d photos have no camera, as they did not register: "
+                "what belongs to them is left out (%s), such as %s",
+                len(unplaced),
+                ", ".join(counts),
+                examples(sorted(unplaced)),
+            )
 
 
 @dataclass(frozen=True)
@@ -163,6 +289,7 @@ def read_sparse_model(path: Path) -> SparseModel:
     from sc3d.geometry.cameras import View
     from sc3d.io import colmap
 
+    colmap.warn_of_larger(path)
     model = colmap.load_model(path)
     cameras = colmap.copy_cameras(model)
     point_ids, xyz, colors = colmap.point_arrays(model)
@@ -172,11 +299,8 @@ def read_sparse_model(path: Path) -> SparseModel:
         views.append(View(image.name, cameras[image.camera_id], colmap.cam_from_world(image)))
         rows = colmap.observed_rows(image, point_ids)
         tracks.append(np.unique(rows[rows >= 0]))
-    stems = [Path(view.name).stem for view in views]
-    if len(set(stems)) < len(stems):
-        raise InputError(
-            f"{path}: two photos share a name up to the suffix, by which masks are found; rename one"
-        )
+    if len({view.name for view in views}) < len(views):
+        raise InputError(f"{path}: two photos share a name")
     if not (np.abs(xyz) < FARTHEST).all():
         raise InputError(
             f"{path} holds positions that are not finite numbers, or more than {FARTHEST:g} from the origin"
@@ -184,43 +308,89 @@ def read_sparse_model(path: Path) -> SparseModel:
     return SparseModel(views, xyz, colors, tracks)
 
 
-def match_masks(
-    folder: Path, photo_sizes: dict[str, tuple[int, int]], class_table: ClassTable | None
-) -> dict[str, Path]:
-    """Match `<photo stem>.png` files of a folder to photos and check them.
+def find_masks(folder: Path, names: PhotoNames, strict: bool = True) -> dict[str, Path]:
+    """Files of a folder of masks by photo name, none looked into yet: each at its photo's path with the
+    suffix .png, or named so that it can mean one photo alone (see `sc3d.scene.photo_names`).
 
-    photo_sizes: (width, height) px by photo name
+    Raises InputError for a file that belongs to no photo or to several, and for two of one photo; without
+    `strict`, they are passed over.
+    """
+    found: dict[str, Path] = {}
+    for file in files_of_photos(folder, names, (".png",)):
+        photos = names.match_file(photo_name(file, folder), folder)
+        if len(photos) == 1 and photos[0] not in found:
+            found[photos[0]] = file
+        elif strict:
+            raise InputError(_misfit(file, folder, names, photos, found))
+    return found
+
+
+def _misfit(
+    file: Path, folder: Path, names: PhotoNames, photos: tuple[str, ...], found: dict[str, Path]
+) -> str:
+    """Why a mask cannot be given to a photo; photos: those that it may mean; found: what they have already."""
+    if not photos:
+        advice = names.advice(photo_name(file, folder))
+        example = next(iter(names.names), "none")
+        return f"{file} belongs to no photo: {len(names)} photos are known, such as {example}{advice}"
+    if len(photos) > 1:
+        return f"{file} may belong to {names.choices(photos)}: rename it"
+    return f"{found[photos[0]]} and {file} both belong to {photos[0]}: remove one"
+
+
+def match_masks(
+    folder: Path,
+    photo_sizes: dict[str, tuple[int, int]],
+    class_table: ClassTable | None,
+    names: PhotoNames | None = None,
+    photos: Path | None = None,
+) -> dict[str, Path]:
+    """Match the files of a folder of masks to photos and check them.
+
+    photo_sizes: (width, height) px as stored by photo name; photos: their folder, for their EXIF orientation
+    names: all photos, of which those without a size are not checked and not returned; None = no others
     returns: path of the mask by photo name, for photos that have one
     """
-    files = (
-        sorted(
-            file
-            for file in folder.iterdir()
-            if file.suffix.lower() == ".png" and not file.name.startswith(".")
-        )
-        if folder.is_dir()
-        else []
-    )
-    if not files:
+    found = find_masks(folder, PhotoNames(photo_sizes) if names is None else names)
+    if not found:
         raise InputError(f"no masks in {folder}: PNG files named like the photos are expected")
-    names = {Path(name).stem: name for name in photo_sizes}
-    matched: dict[str, Path] = {}
-    for file in files:
-        name = names.get(file.stem)
-        if name is None:
-            raise InputError(
-                f"{file} belongs to no photo: {len(names)} photos are known, such as {next(iter(photo_sizes))}"
-            )
+    matched = {name: file for name, file in found.items() if name in photo_sizes}
+    if not matched:
+        raise InputError(
+            f"none of the {len(found)} masks in {folder} is of a photo with a camera: "
+            f"the model has {len(photo_sizes)}, such as {next(iter(photo_sizes), 'none')}"
+        )
+    meanings, turns = None if class_table is None else meanings_of(class_table), list[str]()
+    for name, file in matched.items():
         require_within(file, folder)
-        check_mask_aspect(file, image_size(file), photo_sizes[name])
-        if class_table is not None:
-            unknown = class_table.unknown(read_index_image(file))
+        turn, assumed = mask_orientation(file, None if photos is None else photos / name)
+        if assumed:
+            turns.append(name)
+        check_mask_aspect(file, turned_size(image_size(file), turn), photo_sizes[name])
+        if class_table is not None and meanings is not None:
+            unknown = class_table.unknown(read_labels(file, meanings))
             if unknown:
                 raise InputError(
                     f"{file} has class id {unknown[0]}, which is not in the class table (ids {[entry.id for entry in class_table]})"
                 )
-        matched[name] = file
+    if class_table is not None:
+        tell_of_turned(folder, len(turns), *turns[:1])
     return matched
+
+
+@cache  # tiles look at the same masks again and again
+def tell_of_turned(source: Path, count: int, example: str = "") -> None:
+    """Warn of masks that lie as their photos are shown by a rule alone (`sc3d.io.orientation`), and name one
+    of the photos.
+    """
+    if count:
+        logger.warning(
+            "%s: %d masks (such as that of %s) are of photos that EXIF turns, and are read as drawn on the photo as it is shown; "
+            "if they lie on the pixels as stored, give them the EXIF orientation of their photo",
+            source,
+            count,
+            example,
+        )
 
 
 def check_mask_aspect(file: Path | str, mask_size: tuple[int, int], photo_size: tuple[int, int]) -> None:
@@ -237,6 +407,36 @@ def check_mask_aspect(file: Path | str, mask_size: tuple[int, int], photo_size: 
         )
 
 
+def require_views(scene: Scene) -> None:
+    """InputError unless two photos at least have a camera, and, where the model tells what they see, two see the
+    same: no surface comes from less. What sees nothing that others see is told.
+    """
+    model = scene.model
+    if len(model.views) < 2:
+        raise InputError(
+            f"{scene.sparse} has {len(model.views)} photos with a camera: a surface needs at least 2 that overlap; take more photos, or run `sc3d reconstruct` again"
+        )
+    if not any(len(track) for track in model.tracks):
+        return
+    times = np.bincount(np.concatenate(model.tracks), minlength=len(model.points))
+    alone = [
+        view.name
+        for view, track in zip(model.views, model.tracks, strict=True)
+        if not (times[track] > 1).any()
+    ]
+    if len(alone) == len(model.views):
+        raise InputError(
+            f"no two photos of {scene.sparse} see the same sparse point: a surface needs at least 2 that overlap"
+        )
+    if alone:
+        logger.warning(
+            "%d of %d photos share no sparse point with another, so that nothing checks their depth: %s",
+            len(alone),
+            len(model.views),
+            examples(alone),
+        )
+
+
 def check_photos(scene: Scene, names: list[str]) -> None:
     """Raise InputError if a photo of the model is not in `images/`, cannot be read, is cut off, or is a link
     that leads elsewhere.
@@ -248,7 +448,7 @@ def check_photos(scene: Scene, names: list[str]) -> None:
 
 def photo_sizes(folder: Path) -> dict[str, tuple[int, int]]:
     """(width, height) of all photos of a folder, by name relative to it."""
-    return {str(photo.relative_to(folder)): image_size(photo) for photo in find_photos(folder)}
+    return {photo_name(photo, folder): image_size(photo) for photo in find_photos(folder)}
 
 
 def _check_name(name: str, origin: Path) -> None:

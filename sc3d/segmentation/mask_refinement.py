@@ -7,7 +7,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
@@ -16,7 +15,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.io.atomic import atomic_path, discard
-from sc3d.io.images import write_image
+from sc3d.io.images import read_orientation, write_image
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.fusion import fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size, read_given_cloud
@@ -41,19 +40,19 @@ ReadMask = Callable[[View], Mask]
 class RefinementInputs:
     """A cloud with its surface, and the settings by which masks become labels.
 
-    colors: (N, 3) uint8 or None; seen: the surface, whatever labels it has; num_ids: largest class id + 1
+    colors: (N, 3) uint8 or None; seen: the surface, whatever labels it has; num_channels: classes + 1, as labels and masks here are channels
     """
 
     cloud: Cloud
     colors: np.ndarray | None
     seen: LabelledSurface
-    num_ids: int
+    num_channels: int
     label: Label
     propagate: Propagate = Propagate()
 
     def labels(self, views: list[View], read: ReadMask) -> Labels:
         """Labels of all points from the masks of some views."""
-        fusion = fuse(self.cloud, views, read, self.seen.surface, self.num_ids, self.label)
+        fusion = fuse(self.cloud, views, read, self.seen.surface, self.num_channels, self.label)
         return propagate(
             LabelledPoints(self.cloud.points, fusion.labels, fusion.votes, self.colors),
             self.cloud.normals,
@@ -86,7 +85,7 @@ def load_refinement_inputs(scene: Scene, masks: Masks) -> RefinementInputs:
         Cloud(points, normals),
         colors,
         seen,
-        scene.class_table().num_ids,
+        masks.channels.count,
         Label(voxel_size=default_voxel_size(points, masks)),
     )
 
@@ -128,12 +127,16 @@ def refine_scene(scene: Scene, settings: Segment) -> Refinement:
             "--refine works on the masks that are in the scene: make them first, then run `sc3d segment SCENE --refine`"
         )
     masks = Masks.load(scene, scene.confidence)
+    scene.warn_of_unplaced(scene.masks, scene.confidence)
     refinement = refine(load_refinement_inputs(scene, masks), masks.views, masks.read)
     if refinement.helps:
         with atomic_path(scene.confidence_refined) as folder:
             folder.mkdir()
             for view in tqdm(masks.views, desc="writing confidence", unit="photo", disable=None):
-                write_image(folder / f"{Path(view.name).stem}.png", refinement.confidence(view, masks.read))
+                file = scene.photo_names.path(folder, view.name)
+                write_image(
+                    file, refinement.confidence(view, masks.read), read_orientation(scene.photo(view.name))
+                )
     else:
         discard(scene.confidence_refined)
     return refinement
@@ -180,6 +183,6 @@ def _agreement(inputs: RefinementInputs, labels: Labels, views: list[View], read
     for view in tqdm(views, desc="photos left out", unit="photo", disable=None):
         mask = read(view)[0]
         parts.append(
-            Confusion.from_labels(mask, inputs.render(labels, view, mask.shape[::-1])[0], inputs.num_ids)
+            Confusion.from_labels(mask, inputs.render(labels, view, mask.shape[::-1])[0], inputs.num_channels)
         )
-    return total(parts, inputs.num_ids).mean_iou
+    return total(parts, inputs.num_channels).mean_iou

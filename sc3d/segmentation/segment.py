@@ -5,18 +5,29 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from sc3d.errors import InputError
-from sc3d.io.atomic import discard, remove_leftovers
-from sc3d.io.images import find_photos, image_size, read_image, write_image
+from sc3d.io.atomic import claim, discard, remove_leftovers
+from sc3d.io.images import (
+    find_photos,
+    image_size,
+    index_image_size,
+    read_image,
+    read_opaque,
+    read_orientation,
+    require_within,
+    write_image,
+)
 from sc3d.io.json_files import read_json, write_json
+from sc3d.io.orientation import inverse, turned
 from sc3d.io.provenance import digest
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.photo_names import PhotoNames, photo_name
 from sc3d.scene.scene import Scene, check_mask_aspect
 from sc3d.segmentation.instances import Instance, write_instances
 from sc3d.settings.labels import Segment
@@ -38,7 +49,7 @@ class Segmenter(Protocol):
     """What a backend offers."""
 
     def segment(self, image: np.ndarray) -> Segmentation:
-        """Segment an (H, W, 3) uint8 RGB photo."""
+        """Segment an (H, W, 3) uint8 RGB photo as shown, the right way up."""
         ...
 
 
@@ -71,7 +82,7 @@ class SegmentSummary:
 
 
 class Folders(NamedTuple):
-    """Where the results of each photo go, as `<photo stem>.png`, `.png` and `.json`."""
+    """Where the results of each photo go, named like it (see `sc3d.scene.photo_names`)."""
 
     masks: Path
     confidence: Path
@@ -83,18 +94,20 @@ def segment_scene(
 ) -> SegmentSummary:
     """Write masks, confidence maps and instances of a scene's photos.
 
-    Those of an interrupted run are gone on with if they were made with the same settings; others are set aside.
+    Those of an interrupted run are gone on with if they were made with the same settings; others are set
+    aside.
     """
     folders = Folders(scene.masks, scene.confidence, scene.instances)
     marker, state = scene.path / "segment.unfinished.json", _state(scene, settings, class_table)
-    unfinished = marker.exists()
+    unfinished = claim(marker).exists()
     if unfinished and read_json(marker) == state:
         for folder in folders:
-            remove_leftovers(folder)
+            for place in [folder, *folder.rglob("*")]:
+                remove_leftovers(place)
     else:
         _set_aside(folders, "unfinished" if unfinished else "before")
     write_json(marker, state)
-    summary = segment_photos(find_photos(scene.images), folders, segmenter, class_table)
+    summary = segment_photos(find_photos(scene.images), folders, segmenter, class_table, images=scene.images)
     marker.unlink()
     return summary
 
@@ -103,10 +116,10 @@ def _state(scene: Scene, settings: Segment, class_table: ClassTable) -> object:
     """What decides the masks, as JSON: everything but where the models lie and run. Photos are told by size
     and time, as they are read often.
     """
-    decisive = replace(settings, device="auto", download=False, model_dir=None)
+    decisive = replace(settings, device="auto", download=False, model_dir=None, strokes=None)
     strokes = digest(settings.strokes or scene.strokes) if settings.backend == "strokes" else ""
     photos = [
-        (str(photo.relative_to(scene.images)), photo.stat().st_size, photo.stat().st_mtime_ns)
+        (photo_name(photo, scene.images), photo.stat().st_size, photo.stat().st_mtime_ns)
         for photo in find_photos(scene.images)
     ]
     seen = hashlib.blake2b(repr(photos).encode(), digest_size=16).hexdigest()
@@ -131,63 +144,92 @@ def segment_photos(
     segmenter: Segmenter,
     class_table: ClassTable,
     overwrite: bool = False,
+    images: Path | None = None,
 ) -> SegmentSummary:
     """Write a mask and a confidence map for every photo, and its instances if the segmenter tells objects
     apart.
 
+    images: folder below which the photos are named; None = the one that they have in common
     Photos that have a mask are skipped unless `overwrite`, so an interrupted run goes on where it stopped,
     whatever stopped it.
-    Raises InputError before the work starts if a photo cannot be opened, two share a stem, or an old mask
-    does not fit its photo.
+    Raises InputError before the work starts if a photo cannot be opened, or an old mask does not fit its
+    photo.
     """
     from tqdm import tqdm
 
-    todo = _check_photos(photos, folders.masks, overwrite)
+    images = images or Path(os.path.commonpath([photo.parent for photo in photos]))
+    names = PhotoNames(photo_name(photo, images) for photo in photos)
+    todo = _check_photos(images, names, folders.masks, overwrite)
     pending, num_pixels, num_instances = set(todo), np.zeros(256, np.int64), 0
     for photo in tqdm(todo, desc="segment", unit="photo", disable=None):
-        image = read_image(photo)
+        image = read_image(images / photo, images, shown=True)
         result = Segmentation(*segmenter.segment(image))
         for array in (result.labels, result.confidence):
             if array.shape != image.shape[:2] or array.dtype != np.uint8:
                 raise ValueError(
                     f"the segmenter returned {array.shape} {array.dtype} for a photo of {image.shape[:2]}"
                 )
-        _write(photo, folders, result, class_table)
+        _write(
+            photo,
+            names,
+            folders,
+            _as_stored(images / photo, result),
+            read_orientation(images / photo),
+            class_table,
+        )
         num_pixels += np.bincount(result.labels.ravel(), minlength=256)
         num_instances += len(result.instances or ())
     return SegmentSummary(
-        [photo.name for photo in todo],
-        [photo.name for photo in photos if photo not in pending],
+        todo,
+        [photo for photo in names.names if photo not in pending],
         num_pixels,
         num_instances,
     )
 
 
-def _write(photo: Path, folders: Folders, result: Segmentation, class_table: ClassTable) -> None:
+def _as_stored(photo: Path, result: Segmentation) -> Segmentation:
+    """Labels and confidence turned from the photo as shown to that as stored, nothing where it is
+    transparent; instances stay as shown.
+    """
+    back, opaque = inverse(read_orientation(photo)), read_opaque(photo)
+    labels, confidence = (
+        np.ascontiguousarray(turned(values, back)) for values in (result.labels, result.confidence)
+    )
+    if opaque is not None:
+        labels, confidence = np.where(opaque, labels, np.uint8(0)), np.where(opaque, confidence, np.uint8(0))
+    return Segmentation(labels, confidence, result.instances)
+
+
+def _write(
+    photo: str,
+    names: PhotoNames,
+    folders: Folders,
+    result: Segmentation,
+    orientation: int,
+    class_table: ClassTable,
+) -> None:
     """The mask comes last: that it exists says that the photo is finished."""
-    objects = folders.instances / f"{photo.stem}.json"
+    for folder in folders:
+        require_within(names.path(folder, photo).parent, folder)
+    objects = names.path(folders.instances, photo, ".json")
     if result.instances is not None:
-        write_instances(objects, photo.name, result.labels.shape, result.instances, class_table)
+        write_instances(
+            objects, photo, turned(result.labels, orientation).shape, result.instances, class_table
+        )
     else:
         objects.unlink(missing_ok=True)  # of masks that are replaced
-    write_image(folders.confidence / f"{photo.stem}.png", result.confidence)
-    write_image(folders.masks / f"{photo.stem}.png", result.labels)
+    write_image(names.path(folders.confidence, photo), result.confidence, orientation)
+    write_image(names.path(folders.masks, photo), result.labels, orientation)
 
 
-def _check_photos(photos: list[Path], out_masks: Path, overwrite: bool) -> list[Path]:
+def _check_photos(images: Path, names: PhotoNames, out_masks: Path, overwrite: bool) -> list[str]:
     """Photos that have no mask yet, after a look at the header of all of them."""
-    by_stem: dict[str, Path] = {}
     todo = []
-    for photo in photos:
-        size = image_size(photo)
-        other = by_stem.setdefault(photo.stem, photo)
-        if other is not photo:
-            raise InputError(
-                f"{other} and {photo} share the name {photo.stem!r}, by which masks are found: rename one"
-            )
-        mask = out_masks / f"{photo.stem}.png"
-        if overwrite or not mask.exists():
+    for photo in names.names:
+        size = image_size(images / photo)
+        mask = names.find(out_masks, photo)
+        if overwrite or mask is None:
             todo.append(photo)
         else:
-            check_mask_aspect(mask, image_size(mask), size)
+            check_mask_aspect(mask, index_image_size(mask, images / photo), size)
     return todo

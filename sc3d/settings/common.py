@@ -10,9 +10,9 @@ class Workers:
     """Where a stage may work; results do not depend on it."""
 
     workers: int = 0
-    """Dask workers to start on this machine; without them all work is done in this process."""
+    """Processes to start on this machine for the work; without them all of it is done in this one."""
     cluster: str = ""
-    """Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers see the same files."""
+    """Address of a Dask scheduler, such as tls://10.0.0.1:8786, whose workers see the same files."""
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,13 @@ class Segment:
     prompts with Grounding DINO and SAM 2 or with SAM 3.
     """
     masks: Path | None = None
-    """Masks made elsewhere: a folder of PNGs <photo stem>.png, a folder of LabelMe JSONs, a COCO JSON, or a
-    CVAT XML (files).
+    """Masks made elsewhere: a folder of PNGs named like the photos, a folder of LabelMe JSONs, a COCO JSON,
+    or a CVAT XML (files).
+    """
+    name_pattern: str | None = None
+    """How --masks are named where that is not clear: {photo} stands for the name of the photo and * for
+    anything, such as '{photo}_gtFine_labelIds.png' or '*-{photo}'; files that do not fit are left out
+    (files).
     """
     format: Literal["auto", "index", "color", "labelme", "coco", "cvat"] = "auto"
     """Format of --masks (files): index = PNG with one id per pixel, color = PNG in the colors of the class
@@ -32,7 +37,7 @@ class Segment:
     {"wall": "building", "7": "road"} (files).
     """
     confidence: Path | None = None
-    """Folder of confidence maps <photo stem>.png (files); optional."""
+    """Folder of confidence maps, PNGs named like the photos (files); optional."""
     strokes: Path | None = None
     """Folder of strokes and polygons per class, LabelMe JSON or PNG in the colors of the class table;
     SCENE/strokes otherwise (strokes).
@@ -72,7 +77,9 @@ class Segment:
 
 @dataclass(frozen=True)
 class PaperMechanisms:
-    """Mechanisms of the paper, one by one. `--method paper` switches all on; elsewhere they change next to nothing."""
+    """Mechanisms of the paper, one by one. `--method paper` switches all on; elsewhere they change next to
+    nothing.
+    """
 
     depth_excess: bool = True
     """Weigh votes less, the farther a point lies behind the first surface (within the tolerance)."""
@@ -81,11 +88,12 @@ class PaperMechanisms:
     range: bool = True
     """Weigh votes by the inverse distance, so that near photos count more."""
     density: bool = False
-    """Inside a voxel, weigh points by the density of the Gaussians around them (gaussians.ply), or by their distance
-    to the points' mean without it.
+    """Inside a voxel, weigh points by the density of the Gaussians around them (gaussians.ply), or by their
+    distance to the points' mean without it.
     """
     reproject: bool = False
-    """Vote once more on locked voxels with half the depth tolerance and without mask edges and grazing views."""
+    """Vote once more on locked voxels with half the depth tolerance and without mask edges and grazing views.
+    """
 
 
 @dataclass(frozen=True)
@@ -93,32 +101,34 @@ class Label(Resources):
     """Fuse masks into the voxel label field and the cloud."""
 
     method: Literal["direct", "majority", "conflict-lock", "paper"] = "conflict-lock"
-    """direct: last photo wins; majority: most votes win; conflict-lock: disagreeing voxels are reset and locked; paper:
-    the same with any disagreement, and every mechanism and weight of the paper, whatever the other options say.
+    """direct: last photo wins; majority: most votes win; conflict-lock: disagreeing voxels are reset and
+    locked; paper:
+    the same with any disagreement, and every mechanism and weight of the paper, whatever the other options
+    say.
     """
     depth_filter: bool = True
     """Only the first surface along each ray is labelled; --no-depth-filter lets labels penetrate."""
     surface: Literal["auto", "surfels", "voxels"] = "auto"
-    """What hides the points behind it. auto: mesh.ply if there is one, else as voxels; voxels: a grid of the cloud's
-    own points, traversed coarse to fine; surfels: a square around every point (more memory), which clouds in tiles
-    have instead of voxels.
+    """What hides the points behind it. auto: mesh.ply if there is one, else as voxels; voxels: a grid of the
+    cloud's own points, traversed coarse to fine; surfels: a square around every point (more memory), which
+    clouds in tiles have instead of voxels.
     """
     consensus: float = 0.66
     """Share of the votes that the winning class needs, else the voxel is locked (conflict-lock)."""
     voxel_size: float = 0.0
-    """Label voxel, world units; 0 = 2 times the median point spacing, at least 1.5 times the median mask pixel on the
-    ground.
+    """Label voxel, world units; 0 = 2 times the median point spacing, at least 1.5 times the median mask
+    pixel on the ground.
     """
     use_confidence: bool = True
     """Weigh mask pixels by the confidence maps, where there are any."""
     edge_width: float = 3.0
     """Mask pixels closer than this to a label boundary count less, px; 0 = off."""
     verify: Literal["no", "lock", "weigh"] = "weigh"
-    """Hold the fused labels against each view's masks, place by place. lock: labels that rest on views which contradict
-    them nearby are locked; weigh: such views count less as well.
+    """Hold the fused labels against each view's masks, place by place. lock: labels that rest on views which
+    contradict them nearby are locked; weigh: such views count less as well.
     """
     cloud: Path | None = None
-    """Cloud to label; SCENE/cloud.ply otherwise."""
+    """Cloud to label, also of another program, as `sc3d import` reads it; SCENE/cloud.ply otherwise."""
     output: Path | None = None
     """Labelled cloud to write; SCENE/seeds.ply otherwise."""
     mechanisms: PaperMechanisms = PaperMechanisms()

@@ -72,7 +72,7 @@ class ViewCommand:
     file: Path | None = None
     """Cloud or mesh to show; the labelled cloud, or else cloud.ply, otherwise."""
     photo: str | None = None
-    """Look through the camera of this photo."""
+    """Look through the camera of this photo; its suffix and folders may be missing where that is clear."""
     splats: bool = False
     """Show the Gaussians instead of the cloud (with --web, --html, --screenshot); with --photo and
     --screenshot, beside the photo.

@@ -13,8 +13,8 @@ from sc3d.settings.common import Workers
 
 
 @dataclass(frozen=True)
-class Reconstruct:
-    """Photos to cameras and sparse points (pycolmap)."""
+class Mapping:
+    """Photos to cameras and sparse points, before these are brought to their place (pycolmap)."""
 
     matching: Literal["exhaustive", "sequential", "spatial"] = "exhaustive"
     """Which photo pairs to match: all, neighbors in name order, or neighbors by GPS (hundreds of photos and
@@ -22,26 +22,38 @@ class Reconstruct:
     """
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP camera model, shared by all photos of one size and EXIF camera."""
-    focal: Literal["auto", "refine", "exif"] = "auto"
-    """Estimate the focal length, or keep that of EXIF. auto: estimate, unless all photos look the same way
-    from one height (straight down), where focal length and flight height cannot be told apart.
-    """
     max_size: int = 1600
     """Longest photo side for feature extraction, px."""
     max_features: int = 8192
     """SIFT features per photo."""
     gps: bool = True
-    """Use GPS positions (EXIF; RTK accuracies in DJI's XMP) for scale, orientation and position."""
+    """Use GPS positions (EXIF, or XMP where it says more; RTK accuracies) for scale, orientation and
+    position.
+    """
+    seed: int = 0
+    """Seed of RANSAC."""
+
+
+@dataclass(frozen=True)
+class Reconstruct(Mapping):
+    """Photos to cameras and sparse points (pycolmap)."""
+
+    focal: Literal["auto", "refine", "exif"] = "auto"
+    """Estimate the focal length, or keep that of EXIF. auto: estimate, unless all photos look the same way
+    from one height (straight down), where focal length and flight height cannot be told apart.
+    """
     gcp: Path | None = None
     """Ground control points in ODM's gcp_list.txt format; they replace GPS as the frame."""
+    gcp_accuracy: tuple[float, float] | None = None
+    """Standard deviations of the ground control points, m: horizontal, vertical. None = estimated from how
+    they fit.
+    """
     epsg: int | None = None
     """Projected CRS of exports; the UTM zone (or the CRS of --gcp) otherwise. `sc3d georeference` changes it
     afterwards.
     """
     altitude_offset: float = 0.0
     """Added to all heights in exports, m: drones differ in what they measure altitude from."""
-    seed: int = 0
-    """Seed of RANSAC."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +72,14 @@ class GeoreferenceOptions:
     """
     from_gps: bool = False
     """Replace the present georeference by one from GPS."""
+    gcp: Path | None = None
+    """Replace it by one from ground control points, in ODM's gcp_list.txt format; cameras and all that was made
+    from them stay as they are.
+    """
+    gcp_accuracy: tuple[float, float] | None = None
+    """Standard deviations of the ground control points, m: horizontal, vertical. None = estimated from how
+    they fit.
+    """
 
 
 @dataclass(frozen=True)
@@ -132,8 +152,10 @@ class Import:
     """
     epsg: int | None = None
     """CRS of coordinates whose file does not state one."""
-    tolerance: float = 0.01
-    """Largest error, px, from lens parameters that no COLMAP model has; a project that needs more is refused.
+    tolerance: float = 1.0
+    """Largest error, px, from lens parameters that no COLMAP model has (skew, Metashape's additional
+    corrections, high radial terms); below it they are left out with a warning, a project that needs more is
+    refused.
     """
     project: Annotated[Path, Suppress] = Path()
     """Set by the command."""

@@ -6,7 +6,7 @@ coarse Gaussians that are dropped afterwards: such a context costs the memory an
 save, and what it gets wrong the block's own Gaussians would make up for. What a pixel shows is told by the
 nearest sparse points that its photo sees, so a roof before the block counts as what it is: outside.
 
-Each block is one task, here or on Dask workers. Beside the checkpoint of block 3, `3.checkpoint`, lie its
+Each block is one task, here or on workers. Beside the checkpoint of block 3, `3.checkpoint`, lie its
 Gaussians, `3.ply`, and, written last, `3.json` with the rest: with that it is finished and not begun again.
 """
 
@@ -28,6 +28,7 @@ from scipy.spatial import cKDTree
 from sc3d.errors import InputError
 from sc3d.geometry.blocks import MIN_POINTS, Block
 from sc3d.geometry.cameras import View, in_image, project
+from sc3d.io.atomic import claim
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.provenance import peak_memory_mb
 from sc3d.io.splats import read_splat_ply, write_splat_ply
@@ -81,7 +82,7 @@ def train_blocks(job: BlockJob, data: TrainingData, tasks: Executor) -> tuple[Tr
             raise InputError(
                 f"block {index} of {len(indices)} is seen by fewer than 2 photos: lower --blocks"
             )
-    job.folder.mkdir(exist_ok=True)
+    claim(job.folder).mkdir(exist_ok=True)
     tasks.run("blocks", partial(train_block, job), indices, GPU if job.settings.device == "cuda" else None)
     parts = [Gaussians.from_arrays(read_splat_ply(job.file(index, "ply"))[0]) for index in indices]
     records = [cast(dict[str, Any], read_json(job.file(index, "json"))) for index in indices]

@@ -12,7 +12,6 @@ import torch
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, local_origin, project, resample, undistorted
-from sc3d.io.images import read_image
 from sc3d.scene.scene import Scene
 from sc3d.scene.splats import read_scene_splats
 from sc3d.settings.train import TrainSettings
@@ -106,12 +105,18 @@ def scene_data(scene: Scene, settings: TrainSettings) -> tuple[TrainingData, np.
     local = [view.shifted(origin) for view in model.views]
     views = [undistorted(view, settings.size(max(view.width, view.height))) for view in local]
 
-    @lru_cache(maxsize=max(2, CACHED_PIXELS // max(view.width * view.height for view in views)))
-    def image(index: int) -> np.ndarray:
-        photo = read_image(scene.photo(model.views[index].name))
-        return resample(photo, local[index], views[index])
+    cached = lru_cache(maxsize=max(2, CACHED_PIXELS // max(view.width * view.height for view in views)))
 
-    return TrainingData(views, image, model.points - origin, model.colors, model.tracks), origin
+    @cached
+    def image(index: int) -> np.ndarray:
+        return resample(scene.read_photo(model.views[index].name), local[index], views[index])
+
+    @cached
+    def opaque(index: int) -> np.ndarray | None:
+        return scene.opaque_pixels(local[index], views[index])
+
+    data = TrainingData(views, image, model.points - origin, model.colors, model.tracks, opaque)
+    return data, origin
 
 
 def load_gaussians(scene: Scene) -> tuple[Gaussians, np.ndarray]:

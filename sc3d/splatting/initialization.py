@@ -6,6 +6,8 @@ little per step, so a tree crown that starts on the ground stays there: starting
 
 from __future__ import annotations
 
+import logging
+
 import cv2
 import numpy as np
 import torch
@@ -32,6 +34,8 @@ SWEEP_SIZE = 250  # px, longest side of the images compared: 7x7 patches must ho
 MAX_COST = 0.5  # mean 1 - NCC of the two best neighbors
 AROUND = 5  # grid points whose costs are averaged
 
+logger = logging.getLogger(__name__)
+
 
 def initial_gaussians(
     data: TrainingData, neighbors: list[np.ndarray], settings: TrainSettings, generator: torch.Generator
@@ -42,6 +46,12 @@ def initial_gaussians(
         more, more_colors = plane_sweep_points(data, neighbors, settings.max_gaussians // 4)
         points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
     if len(points) > settings.max_gaussians:
+        logger.info(
+            "%d of %d points to start from are left out, by chance: --max-gaussians is %d",
+            len(points) - settings.max_gaussians,
+            len(points),
+            settings.max_gaussians,
+        )
         order = torch.randperm(len(points), generator=generator)
         chosen = order[: settings.max_gaussians].sort().values.numpy()
         points, colors = points[chosen], colors[chosen]

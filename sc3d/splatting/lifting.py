@@ -23,20 +23,20 @@ from sc3d.splatting.rendering import render
 
 SCALE = 1 << 30  # evidence of one whole pixel, in fixed point: 2^63 of it are 8 thousand million pixels
 ReadMask = Callable[[View], tuple[np.ndarray, np.ndarray | None]]
-"""Class ids (H, W) uint8 of a view, 0 = unlabelled, and the confidence (H, W) uint8, 255 = sure, or None =
+"""Channels of the classes (H, W) uint8 of a view, 0 = unlabelled, and the confidence (H, W) uint8, 255 = sure, or None =
 all sure; of the view's size.
 """
 
 
-def lift(gaussians: Gaussians, views: Iterable[View], read: ReadMask, num_ids: int) -> np.ndarray:
+def lift(gaussians: Gaussians, views: Iterable[View], read: ReadMask, num_channels: int) -> np.ndarray:
     """Evidence of every class for every Gaussian, from labelled views. It depends neither on the order of the
     views nor on threads.
 
-    views: pinhole, in the local frame of the Gaussians; num_ids: largest class id + 1
-    returns: (N, num_ids) float64, pixels times confidence; column 0 stays 0
+    views: pinhole, in the local frame of the Gaussians; num_channels: classes + 1, as in `sc3d.scene.channels`
+    returns: (N, num_channels) float64, pixels times confidence; column 0 stays 0
     raises ValueError for a view with distortion or a mask of another size than the view
     """
-    evidence = np.zeros((len(gaussians), num_ids), np.int64)
+    evidence = np.zeros((len(gaussians), num_channels), np.int64)
     for view in tqdm(views, desc="lifting labels", unit="photo", disable=None):
         mask, confidence = read(view)
         if not view.camera.is_undistorted() or mask.shape != (view.height, view.width):
@@ -48,38 +48,38 @@ def lift(gaussians: Gaussians, views: Iterable[View], read: ReadMask, num_ids: i
         if device.has_kernels(gaussians.means):
             add_evidence(gaussians, view, mask, weights, float(SCALE), evidence)
         else:
-            part = evidence_by_gradient(gaussians, view, mask, weights, num_ids)
+            part = evidence_by_gradient(gaussians, view, mask, weights, num_channels)
             evidence += np.rint(part * SCALE).astype(np.int64)
     return evidence / SCALE
 
 
 def evidence_by_gradient(
-    gaussians: Gaussians, view: View, mask: np.ndarray, weights: np.ndarray, num_ids: int
+    gaussians: Gaussians, view: View, mask: np.ndarray, weights: np.ndarray, num_channels: int
 ) -> np.ndarray:
     """The same for one view by the renderer's backward pass, three classes at a time: the twin of the kernel,
     and the way on a GPU.
 
-    returns: (N, num_ids) float64
+    returns: (N, num_channels) float64
     """
-    evidence = np.zeros((len(gaussians), num_ids))
+    evidence = np.zeros((len(gaussians), num_channels))
     # away from 0, where colors are cut
     gray = gaussians.detached().painted(np.full((len(gaussians), 3), 0.5))
     target, weight = torch.from_numpy(mask.astype(np.int64)), torch.from_numpy(weights)
-    for first in range(1, num_ids, 3):
+    for first in range(1, num_channels, 3):
         dc = gray.sh_dc.clone().requires_grad_()
         image = render(replace(gray, sh_dc=dc), view, 0, geometry=False).color
         shown = torch.stack([(target == label) * weight for label in range(first, first + 3)], dim=2)
         (gradient,) = torch.autograd.grad((image * shown.to(image)).sum(), dc)
         part = gradient.cpu().numpy().astype(np.float64) / SH_C0
-        evidence[:, first : first + 3] = part[:, : num_ids - first]
+        evidence[:, first : first + 3] = part[:, : num_channels - first]
     return evidence
 
 
 def winners(evidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The class of most evidence and its share.
 
-    evidence: (N, num_ids), column 0 unused
-    returns: (N,) uint8 ids, 0 = no evidence; (N,) float32 confidence, 0 to 1
+    evidence: (N, num_channels), column 0 unused
+    returns: (N,) uint8 channels, 0 = no evidence; (N,) float32 confidence, 0 to 1
     """
     label = evidence[:, 1:].argmax(axis=1) + 1 if evidence.shape[1] > 1 else np.zeros(len(evidence), int)
     total, best = evidence[:, 1:].sum(axis=1), np.take_along_axis(evidence, label[:, None], axis=1)[:, 0]

@@ -59,7 +59,7 @@ def _job(scene: Scene, settings: Depth, work: WorkFolder) -> tuple[StereoJob, li
     photo_views = [model.views[row] for row in kept]
     used = [seed for seed in seeds if seed is not None]
     job = StereoJob(
-        scene.images.absolute(),
+        scene.path.absolute(),
         photo_views,
         [undistorted(view, settings.max_size) for view in photo_views],
         neighbor_views(

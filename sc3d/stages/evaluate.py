@@ -22,5 +22,6 @@ def outputs(scene: Scene, settings: Evaluate) -> list[Path]:
 
 def run(scene: Scene, settings: Evaluate) -> dict[str, object]:
     """Judge the labels, in memory or, where the cloud does not fit, by tiles."""
+    scene.warn_of_unplaced(settings.truth or scene.truth, scene.masks)
     evaluate = evaluate_scene if evaluate_fits(scene, settings) else evaluate_scene_by_tiles
     return evaluate(scene, settings).figures()

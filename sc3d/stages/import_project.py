@@ -1,23 +1,30 @@
-"""Projects, clouds and meshes of other programs -> sparse/0, images, georeference.json, cloud.ply, mesh.ply."""
+"""Projects, clouds and meshes of other programs -> sparse/0, images, georeference.json, cloud.ply,
+mesh.ply.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
 
-from sc3d.errors import InputError
+import numpy as np
+
+from sc3d.errors import InputError, examples
 from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
-from sc3d.importers.clouds import CLOUDS, MESHES, is_mesh, read_geometry, to_open3d
+from sc3d.importers.clouds import CLOUDS, MESHES, UNREAD, is_mesh, read_geometry, to_open3d
 from sc3d.importers.frames import frame_of_scene, near_origin, place_geometries
 from sc3d.importers.model import write_project
 from sc3d.importers.photos import locate_photos
-from sc3d.importers.project import project_files, read_project
+from sc3d.importers.project import Project, project_files, read_project, warn_of_left_out
 from sc3d.io.atomic import require_writable
 from sc3d.io.clouds import write_geometry
-from sc3d.io.images import require_place
+from sc3d.io.images import find_photos, require_place
 from sc3d.runner import execute
+from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import, ImportCommand
+
+NO_POINTS = np.zeros((0, 3))
 
 
 def main(command: ImportCommand) -> None:
@@ -37,7 +44,7 @@ def is_geometry(path: Path, settings: Import) -> bool:
     return settings.source == "cloud" or (
         settings.source == "auto"
         and path.is_file()
-        and path.suffix.lower() in CLOUDS | MESHES
+        and path.suffix.lower() in CLOUDS | MESHES | UNREAD
         and not path.name.endswith("calibrated_camera_parameters.txt")
     )
 
@@ -51,6 +58,15 @@ def inputs(scene: Scene, settings: Import) -> list[Path]:
 def outputs(scene: Scene, settings: Import) -> list[Path]:
     geometry = [scene.mesh if is_mesh(path) else scene.cloud for path in settings.cloud]
     return ([] if settings.project in settings.cloud else [scene.sparse]) + list(dict.fromkeys(geometry))
+
+
+def _without_camera(project: Project, photos: Path | None) -> dict[str, object]:
+    """How many photos of the folder have no camera, and the first of them."""
+    if photos is None:
+        return {}
+    used = {view.name for view in project.views}
+    names = [name for photo in find_photos(photos) if (name := photo_name(photo, photos)) not in used]
+    return {"photos_without_camera": f"{len(names)} ({examples(names)})"} if names else {}
 
 
 def run(scene: Scene, settings: Import) -> dict[str, object]:
@@ -67,12 +83,15 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
         project, photos = locate_photos(
             near_origin(read_project(settings.project, settings), settings.epsg), settings.images
         )
+        warn_of_left_out(project, settings.project)
         views, georeference = project.views, project.georeference
         if photos is not None:
             require_place(photos, scene.images)
-    placed = place_geometries(geometries, georeference, views, settings.epsg)
+    sparse_points = project.points if project is not None else scene.model.points if views else NO_POINTS
+    placed = place_geometries(geometries, georeference, views, sparse_points, settings.epsg)
     if project is not None:
         figures = write_project(scene, project, photos, [geometry for geometry, _ in placed.values()])
+        figures |= _without_camera(project, photos)
         georeference_path(scene).unlink(missing_ok=True)
     if georeference is not None:
         write_georeference(scene, georeference)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+from sc3d.importers.given_cloud import cloud_in_world
 from sc3d.labelling.inputs import best_confidence
 from sc3d.labelling.label import label_scene
 from sc3d.scene.scene import Scene
@@ -23,6 +25,16 @@ def outputs(scene: Scene, settings: Label) -> list[Path]:
 
 
 def run(scene: Scene, settings: Label) -> dict[str, object]:
-    """Fuse the masks, in memory or, where the cloud does not fit, by tiles."""
+    """Fuse the masks, in memory or, where the cloud does not fit, by tiles; a cloud of another program is
+    brought into the world of the scene before.
+    """
+    scene.warn_of_unplaced(scene.masks, *([best_confidence(scene)] if settings.use_confidence else []))
+    if settings.cloud is None:
+        return _label(scene, settings)
+    with cloud_in_world(scene, settings.cloud, settings, settings.output or scene.seeds) as cloud:
+        return _label(scene, replace(settings, cloud=cloud))
+
+
+def _label(scene: Scene, settings: Label) -> dict[str, object]:
     label = label_scene if label_fits(scene, settings) else label_scene_by_tiles
     return label(scene, settings).figures()

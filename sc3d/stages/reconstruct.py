@@ -1,39 +1,107 @@
-"""Photos -> sparse/0, and georeference.json where GPS or ground control points say where the scene is."""
+"""Photos -> sparse/0, and georeference.json where GPS or ground control points say where the scene is.
+
+Two steps: `map_photos` takes hours and is kept; what is here brings its cameras to their place.
+"""
 
 from __future__ import annotations
 
+import logging
+from dataclasses import fields
 from pathlib import Path
 
 from sc3d.errors import InputError
-from sc3d.georeferencing.control_points import read_control_points
-from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
+from sc3d.georeferencing.control_points import (
+    ControlPoints,
+    check_accuracy,
+    check_control_points,
+    read_control_points,
+)
+from sc3d.georeferencing.georeference import (
+    from_origin,
+    georeference_path,
+    projected_crs,
+    write_georeference,
+)
+from sc3d.georeferencing.gps import read_flight
+from sc3d.georeferencing.placement import make_level, place_model
 from sc3d.io.atomic import require_writable
-from sc3d.io.images import find_photos, image_size, link_photos
+from sc3d.io.colmap import load_model, registered_images, write_model
+from sc3d.io.images import check_photo, find_photos, left_out, link_photos, num_pages
 from sc3d.runner import execute
+from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
-from sc3d.settings.reconstruction import Reconstruct, ReconstructCommand
-from sc3d.sfm import reconstruct
+from sc3d.settings.reconstruction import Mapping, Reconstruct, ReconstructCommand
+
+logger = logging.getLogger(__name__)
+
+MIN_SIDE = 16  # px of a photo; nothing can be matched in less
 
 
 def main(command: ReconstructCommand) -> None:
     scene = Scene(command.scene)
-    prepare(command.photos, scene)
-    execute("reconstruct", scene, command.reconstruct, command.overwrite)
+    prepare(command.photos, scene, command.reconstruct)
+    reconstruct(scene, command.reconstruct, command.overwrite)
 
 
-def prepare(photos: Path, scene: Scene) -> None:
-    """Check all photos, then make SCENE/images a link to their folder."""
+def reconstruct(scene: Scene, settings: Reconstruct, overwrite: bool) -> None:
+    """Both steps, of which the first is repeated only if its own settings or the photos have changed."""
+    mapping = Mapping(**{field.name: getattr(settings, field.name) for field in fields(Mapping)})
+    execute("map_photos", scene, mapping, overwrite)
+    execute("reconstruct", scene, settings, overwrite)
+
+
+def prepare(photos: Path, scene: Scene, settings: Reconstruct) -> None:
+    """Check all photos and control points, then make SCENE/images a link to the folder of photos."""
     files = find_photos(photos)
-    for file in files:
-        image_size(file)
+    sizes = {photo_name(file, photos): check_photo(file) for file in files}
+    small = [name for name, size in sizes.items() if min(size) < MIN_SIDE]
+    if small:
+        raise InputError(
+            f"the photo {photos / small[0]} is smaller than {MIN_SIDE} px: take it out of the folder"
+        )
+    _tell(photos, files)
     if len(files) < 2:
         raise InputError(f"{photos} holds one photo: at least two that overlap are needed")
+    _check_place(photos, sizes, settings)
     require_writable(scene.path)
     link_photos(photos, scene.images)
 
 
+def _tell(photos: Path, files: list[Path]) -> None:
+    """Say what of the folder is not used."""
+    others, several = left_out(photos), [file.name for file in files if num_pages(file) > 1]
+    if others:
+        logger.warning("%s: left out %s", photos, others)
+    if several:
+        logger.warning(
+            "%d TIFF files have several pages, of which the first is used: %s",
+            len(several),
+            ", ".join(several[:3]),
+        )
+
+
+def _check_place(photos: Path, sizes: dict[str, tuple[int, int]], settings: Reconstruct) -> None:
+    """What would be refused after hours of work otherwise: control points and --epsg."""
+    check_accuracy(settings.gcp, settings.gcp_accuracy)
+    points = _control_points(settings, list(sizes))
+    if settings.epsg is not None:
+        projected_crs(settings.epsg)
+    if points is None and settings.epsg is None:
+        return
+    flight = read_flight(photos, list(sizes), quiet=True) if settings.gps else None
+    if points is not None:
+        check_control_points(points, sizes, flight.origin if flight else None)
+    origin = points.origin if points else flight.origin if flight else None
+    if origin is not None:
+        from_origin(origin, settings.epsg, quiet=True)
+
+
+def _control_points(settings: Reconstruct, names: list[str]) -> ControlPoints | None:
+    return read_control_points(settings.gcp, names) if settings.gcp else None
+
+
 def inputs(scene: Scene, settings: Reconstruct) -> list[Path]:
-    return [scene.images] + ([settings.gcp] if settings.gcp else [])
+    return [scene.images, scene.mapped] + ([settings.gcp] if settings.gcp else [])
 
 
 def outputs(scene: Scene, settings: Reconstruct) -> list[Path]:
@@ -41,12 +109,34 @@ def outputs(scene: Scene, settings: Reconstruct) -> list[Path]:
 
 
 def run(scene: Scene, settings: Reconstruct) -> dict[str, object]:
-    names = [str(photo.relative_to(scene.images)) for photo in find_photos(scene.images)]
-    if settings.epsg is not None:
-        projected_crs(settings.epsg)
-    control_points = read_control_points(settings.gcp, names) if settings.gcp else None
-    found = reconstruct(scene.images, names, scene.sparse, settings, control_points)
+    names = [photo_name(photo, scene.images) for photo in find_photos(scene.images)]
+    control_points = _control_points(settings, names)
+    flight = read_flight(scene.images, names, quiet=True) if settings.gps else None
+    model = load_model(scene.mapped)
+    try:
+        placed = place_model(model, scene.images, flight, control_points, settings)
+    except InputError as error:
+        raise InputError(_keep(scene, error)) from None
+    write_model(scene.sparse, model)
     georeference_path(scene).unlink(missing_ok=True)  # of an earlier model
-    if found.georeference is not None:
-        write_georeference(scene, found.georeference)
-    return found.summary
+    if placed.georeference is not None:
+        write_georeference(scene, placed.georeference)
+    registered = {image.name for image in registered_images(model)}
+    return {
+        "photos": len(names),
+        "registered": len(registered),
+        "left_out": [name for name in names if name not in registered],
+    } | placed.figures
+
+
+def _keep(scene: Scene, error: InputError) -> str:
+    """The message of a refused alignment, whose cameras are kept without a place unless there are others."""
+    if scene.sparse.exists():
+        return f"{error}. The cameras that were there stay as they are"
+    model = load_model(scene.mapped)
+    make_level(model)
+    write_model(scene.sparse, model)
+    return (
+        f"{error}. The cameras are kept in {scene.sparse}, without scale and place: "
+        "the same command with a better file goes on from them"
+    )

@@ -33,6 +33,10 @@ def outputs(scene: Scene, settings: Segment) -> list[Path]:
     return [scene.confidence_refined if settings.refine else scene.masks]
 
 
+def besides(scene: Scene, settings: Segment) -> list[Path]:
+    return [] if settings.refine else [scene.confidence, scene.instances]
+
+
 def run(scene: Scene, settings: Segment) -> dict[str, object]:
     """Make masks with a backend, import them, or (`--refine`) lower the confidence of those that are there."""
     class_table = scene.class_table()

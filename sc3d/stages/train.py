@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import logging
 from pathlib import Path
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, left_out
 from sc3d.geometry.blocks import split_blocks
-from sc3d.io.atomic import atomic_path, remove
+from sc3d.io.atomic import atomic_path, claim, remove
+from sc3d.io.images import find_photos
 from sc3d.io.provenance import digest
 from sc3d.io.splats import origin_comment, write_splat_ply
-from sc3d.scene.scene import Scene, check_photos
+from sc3d.scene.scene import Scene, check_photos, require_views
 from sc3d.settings.train import Train
 from sc3d.splatting.blocks import BlockJob, train_blocks
 from sc3d.splatting.dataset import TrainingData, scene_data
@@ -19,6 +21,8 @@ from sc3d.splatting.device import pick_device
 from sc3d.splatting.trainer import TrainResult, train
 from sc3d.tiling.executor import open_executor
 from sc3d.view.training_sheet import write_training_sheet
+
+logger = logging.getLogger(__name__)
 
 
 def inputs(scene: Scene, settings: Train) -> list[Path]:
@@ -33,7 +37,9 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
     in_blocks = settings.blocks > 1
     if not (in_blocks and settings.cluster):  # whose workers may have the GPU that this machine lacks
         pick_device(settings.device)  # complain before the work begins
+    require_views(scene)
     check_photos(scene, [view.name for view in scene.model.views])
+    _tell_of_left_out(scene)
     if len(scene.model.points) < 10:
         raise InputError(
             f"{scene.sparse} has {len(scene.model.points)} sparse points, too few to start from: run `sc3d reconstruct` with more overlap"
@@ -58,6 +64,14 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
         **{f"held_out_{name}": round(value, 3) for name, value in result.metrics.items()},
         **summary,
     }
+
+
+def _tell_of_left_out(scene: Scene) -> None:
+    known = {view.name for view in scene.model.views}
+    names = [photo.relative_to(scene.images).as_posix() for photo in find_photos(scene.images)]
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        logger.info(left_out(unknown, len(names), "photos have no camera and are not used"))
 
 
 def write_log(rows: list[dict[str, float]], path: Path) -> None:
@@ -92,4 +106,4 @@ def _unfinished(scene: Scene, settings: Train) -> Path:
     for other in [*scene.path.glob("train.*.checkpoint"), *scene.path.glob("train.*.blocks")]:
         if other != mine:
             remove(other)
-    return mine
+    return claim(mine)

@@ -19,8 +19,9 @@ from scipy.spatial import cKDTree
 
 from sc3d.geometry.cameras import View, in_image, project, resample
 from sc3d.io.atomic import atomic_path
-from sc3d.io.images import read_image, write_image
+from sc3d.io.images import write_image
 from sc3d.scene.depth_map import DepthMap, depth_file, write_depth_map
+from sc3d.scene.scene import Scene
 from sc3d.stereo.agreement import count_agreements
 from sc3d.stereo.patch_match import Stereo, evaluate, sweep
 from sc3d.stereo.pinhole_pairs import GrayView, smaller, stacked, transfers
@@ -67,7 +68,7 @@ def passes(longest: int) -> list[Pass]:
 class StereoJob:
     """What every task needs.
 
-    images: folder of the photos; photo_views: their cameras, by whose names they are found
+    scene: folder; photo_views: cameras of its photos, by whose names they are found
     views: the same, undistorted
     sources: per view, rows of those it is compared with
     ranges: per view, farthest and nearest inverse depth; seeds: per view, (n, 3) column, row and inverse depth of
@@ -75,7 +76,7 @@ class StereoJob:
     longest: side of the maps, px; work: folder of what passes leave; output: folder of the depth maps
     """
 
-    images: Path
+    scene: Path
     photo_views: list[View]
     views: list[View]
     sources: list[np.ndarray]
@@ -135,7 +136,7 @@ def write_gray(job: StereoJob, row: int) -> None:
     """The photo as all passes need it, unless it is already there."""
     if not job.gray_file(row).exists():
         view = job.photo_views[row]
-        image = resample(read_image(job.images / view.name), view, job.views[row])
+        image = resample(Scene(job.scene).read_photo(view.name), view, job.views[row])
         save(job.gray_file(row), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
 
@@ -274,10 +275,13 @@ def finish_view(job: StereoJob, row: int) -> tuple[float, float]:
     costs = np.empty(inverse.shape, np.float32)
     evaluate(_problem(job, last, row, geometric=False), planes, costs)
     counts[costs > MAX_COST] = 0
+    opaque = Scene(job.scene).opaque_pixels(job.photo_views[row], view)
+    if opaque is not None:
+        counts[~opaque], inverse[~opaque] = 0, 0
     file = depth_file(job.output, view.name)
     depth = np.where(inverse > 0, 1 / np.maximum(inverse, 1e-30), 0).astype(np.float32)
     write_depth_map(file, DepthMap(depth, plane_normals(view, planes), counts))
-    write_image(file.with_suffix(".jpg"), preview(np.where(counts > 0, inverse, 0)))
+    write_image(file.with_suffix(".png"), preview(np.where(counts > 0, inverse, 0)))
     return float((counts >= 1).mean()), float((counts >= 2).mean())
 
 

@@ -15,7 +15,6 @@ from sc3d.geometry.cameras import View, camera_rays, local_origin, may_see
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import FirstSurface, first_surface, surface_points
 from sc3d.io.chunked_clouds import CloudFile, positions
-from sc3d.io.images import image_size, read_index_image
 from sc3d.metrics import EvaluationSummary, judge, truth_masks
 from sc3d.scene.labelled_cloud import REACH
 from sc3d.scene.labels import Labels
@@ -110,7 +109,7 @@ def find_points(
     else:
         mesh = split_surfels(store, spacing, parts, origin)
     maps = RangeMaps(folder.subfolder("ranges"), {view.name: number for number, view in enumerate(views)})
-    sizes = {view.name: image_size(truth[view.name]) for view in views}
+    sizes = {view.name: scene.mask_size(truth[view.name], view.name) for view in views}
     compute_ranges(RangeJob(scene.path, mesh, maps, sizes), executor)
     results, files = (
         Results(folder.subfolder("results"), store),
@@ -136,7 +135,7 @@ def find_points_in_tile(job: EvaluateJob, tile: int) -> None:
     for name, file in job.truth.items():
         if not may_see(views[name], low, high):
             continue
-        truth = read_index_image(file)
+        truth = Scene(job.scene).read_mask(file, name)
         view = views[name].resized(*truth.shape[::-1])
         ranges = job.maps.cast(view, camera_rays(view.camera))[0].reshape(truth.shape)
         rows, columns = np.nonzero(np.isfinite(ranges) & (truth > 0))

@@ -1,4 +1,4 @@
-"""Where the work on tiles and views runs: in this process, or on Dask workers.
+"""Where the work on tiles and views runs: in this process, in others of this machine, or on a Dask cluster.
 
 A task is a function at the top of a module and an item; both go to the workers, and what they need beside
 lies in files that all of them see. Its result is small; what is large it writes to a file of its own. A task
@@ -11,17 +11,15 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, Protocol
 
 from tqdm import tqdm
 
 from sc3d.errors import InputError, Sc3dError
 from sc3d.settings.common import Workers
+from sc3d.tiling.worker_pool import RETRIES, WorkerPool
 
 logger = logging.getLogger(__name__)
-
-RETRIES = 3  # of a task whose worker is lost; more, and the task itself is what kills it
 
 
 class Executor(Protocol):
@@ -41,6 +39,20 @@ class SerialExecutor:
         self, name: str, function: Callable, items: Sequence, needs: dict[str, float] | None = None
     ) -> list:
         return [function(item) for item in tqdm(items, desc=name, disable=None)]
+
+
+class LocalExecutor:
+    """In processes of this machine. Which of them use its GPU, and how many it can feed, is for the user to
+    say.
+    """
+
+    def __init__(self, pool: WorkerPool) -> None:
+        self._pool = pool
+
+    def run(
+        self, name: str, function: Callable, items: Sequence, needs: dict[str, float] | None = None
+    ) -> list:
+        return self._pool.run(name, function, items)
 
 
 class DaskExecutor:
@@ -80,38 +92,54 @@ def open_executor(resources: Workers) -> Iterator[Executor]:
     """Here, or the workers that the options ask for. InputError if Dask is missing or the scheduler does not
     answer.
     """
-    if not resources.cluster and resources.workers < 1:
+    if resources.cluster:
+        with _dask_client(resources.cluster) as client, client.as_current():
+            yield DaskExecutor(client)
+        return
+    if resources.workers < 1:
         yield SerialExecutor()
         return
+    pool = WorkerPool(resources.workers)
     try:
-        from distributed import Client, LocalCluster
+        with _environment(max(1, (os.cpu_count() or 1) // resources.workers)):
+            yield LocalExecutor(pool)
+    finally:
+        pool.close()
+
+
+def _dask_client(address: str) -> Any:
+    """Certificates for tls:// addresses are found by Dask's own configuration."""
+    try:
+        from distributed import Client, Security
     except ImportError:
-        raise InputError("--workers and --cluster need Dask: pip install 'sc3d[cluster]'") from None
+        raise InputError("--cluster needs Dask: pip install 'sc3d[cluster]'") from None
     logging.getLogger("distributed").setLevel(logging.WARNING)  # importing it sets INFO
-    if resources.cluster:
-        try:
-            client = Client(resources.cluster, timeout="20s", set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise InputError(f"no Dask scheduler answers at {resources.cluster}: {error}") from None
-        with client, client.as_current():
-            yield DaskExecutor(client)
-        return
-    threads = max(1, (os.cpu_count() or 1) // resources.workers)
-    environment = {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
-    cluster = partial(
-        LocalCluster,
-        n_workers=resources.workers,
-        threads_per_worker=1,
-        memory_limit=None,
-        host="127.0.0.1",
-        dashboard_address="127.0.0.1:0",
-        resources={"GPU": 1},
-    )  # how many of them a GPU can feed is for the user to say
-    before = {name: os.environ.get(name) for name in environment}
-    os.environ.update(environment)
+    if address.startswith("tls://"):
+        if not Security().get_connection_args("client").get("ssl_context"):
+            raise InputError(
+                f"{address} asks for a certificate: name yours in Dask's configuration, see the manual's page on several machines"
+            )
+    else:
+        logger.warning(
+            "%s is not encrypted: whoever reaches that port can run code on the cluster, as you; tls:// is safe",
+            address,
+        )
     try:
-        with cluster() as local, Client(local, set_as_default=False) as client, client.as_current():
-            yield DaskExecutor(client)
+        return Client(address, timeout="20s", set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"no Dask scheduler answers at {address}: {error}") from None
+
+
+@contextmanager
+def _environment(threads: int) -> Iterator[None]:
+    """Of processes that are started in the block: so many threads, and no modules from the folder in which the
+    command was called, which may be somebody else's scene.
+    """
+    given = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), str(threads)) | {"PYTHONSAFEPATH": "1"}
+    before = {name: os.environ.get(name) for name in given}
+    os.environ.update(given)
+    try:
+        yield
     finally:
         for name, value in before.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})

@@ -4,6 +4,7 @@ tile votes for itself.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,15 +14,29 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.geometry.neighbors import NeighborIndex, point_spacing
-from sc3d.geometry.voxels import BLOCK, VOXELS, sort_by_voxel, unpack_blocks, voxel_origin
-from sc3d.io.chunked_clouds import CloudFile, columns, positions
-from sc3d.io.images import image_size
+from sc3d.geometry.voxels import BLOCK, VOXELS, file_header, sort_by_voxel, unpack_blocks, voxel_origin
+from sc3d.io.chunked_clouds import CloudFile, columns, positions, rows_at_once
 from sc3d.io.ply import write_records
 from sc3d.labelling.cloud import Cloud, CloudExtent
 from sc3d.labelling.fusion import Fusion, fuse
-from sc3d.labelling.inputs import FOOTPRINT_SAMPLE, Masks, best_confidence, point_density, voxel_size_for
-from sc3d.labelling.label import LabelSummary
-from sc3d.scene.labelled_cloud import SPACING_NEIGHBORS, SPACING_SAMPLE, VOTES, unit_normals
+from sc3d.labelling.inputs import (
+    FOOTPRINT_SAMPLE,
+    Masks,
+    best_confidence,
+    point_density,
+    require_in_view,
+    voxel_size_for,
+)
+from sc3d.labelling.label import LabelSummary, summarize
+from sc3d.labelling.normal_sides import Sides, judge_sides, sample_step, with_sides
+from sc3d.scene.channels import Channels
+from sc3d.scene.labelled_cloud import (
+    SPACING_NEIGHBORS,
+    SPACING_SAMPLE,
+    VOTES,
+    unit_normals,
+    usable_normals,
+)
 from sc3d.scene.labels import STATE_NAMES
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
@@ -32,7 +47,11 @@ from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, mesh_trian
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
 from sc3d.tiling.work_folder import WorkFolder
 
-BYTES = 420  # of a point while its tile votes
+logger = logging.getLogger(__name__)
+
+NORMALS = ("nx", "ny", "nz")
+LEAST_BYTES = 420  # of a point while its tile votes
+BYTES, VOTE_BYTES = 180, 40  # the same without its votes, and of each channel of these
 VOXEL = 2.2  # of a label voxel, in point spacings, while neither is known exactly
 SAMPLE_MARGIN = 20.0  # around a tile whose spacing is measured, point spacings
 # margin of a tile: the rest of a block that its border cuts, and the block beyond, which verification looks
@@ -43,7 +62,7 @@ BLOCKS = 2
 @dataclass(frozen=True)
 class LabelJob:
     """What the task of a tile needs to know. settings: with the voxel size; maps: None = no occlusion test;
-    confidence: folder of confidence maps or None
+    confidence: folder of confidence maps or None; sides: what to do with given normals
     """
 
     scene: Path
@@ -53,6 +72,7 @@ class LabelJob:
     results: Results
     maps: RangeMaps | None
     confidence: Path | None
+    sides: Sides = Sides.KEEP
 
     @property
     def margin(self) -> float:
@@ -60,15 +80,20 @@ class LabelJob:
 
 
 def label_fits(scene: Scene, settings: Label) -> bool:
-    """Whether cloud and mesh fit into memory as a whole, and nobody asked for workers. LAS and LAZ are read in parts in
-    any case.
-    """
+    """Whether cloud and mesh fit into memory as a whole, and nobody asked for workers."""
     source = settings.cloud or scene.cloud
     count = num_points(source)
     if count is None or not source.exists():
         return True  # cannot be read in parts
-    needed = count * BYTES + mesh_triangles(scene.mesh) * TRIANGLE
-    return source.suffix.lower() == ".ply" and fits(needed, settings)
+    needed = count * bytes_per_point(scene) + mesh_triangles(scene.mesh) * TRIANGLE
+    return fits(needed, settings)
+
+
+def bytes_per_point(scene: Scene) -> int:
+    """Of memory while a tile votes: most goes to the votes, of which each class has a channel."""
+    if not scene.classes.exists():
+        return LEAST_BYTES  # which `Masks.load` refuses
+    return max(LEAST_BYTES, BYTES + VOTE_BYTES * scene.class_table().channels.count)
 
 
 def label_scene(scene: Scene, settings: Label) -> LabelSummary:
@@ -91,23 +116,29 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     ]
     folder = WorkFolder(output, "label", decisive, settings)
     statistics = CloudStatistics.from_cloud(cloud)
+    box = statistics.extent.low, statistics.extent.high
+    require_in_view(cloud.path, box, masks, scene.model.points)
+    masks.tell_of_left_out(*box)
     margin = BLOCKS * BLOCK * (settings.voxel_size or VOXEL * statistics.spacing)
-    grid = statistics.grid(max_points(settings, BYTES), margin)
+    grid = statistics.grid(max_points(settings, bytes_per_point(scene)), margin)
     store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
     spacing, sample = sample_spacing(store, statistics)
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=voxel_size_for(spacing, sample, masks))
+    sides = _judge_sides(cloud, masks)
     with open_executor(settings) as executor:
         maps = None
         if settings.depth_filter:
             maps = _ranges(scene, masks, store, spacing, settings, folder, executor)
         results = Results(folder.subfolder("results"), store)
-        job = LabelJob(scene.path, settings, statistics.extent, store, results, maps, confidence)
+        job = LabelJob(scene.path, settings, statistics.extent, store, results, maps, confidence, sides)
         executor.run("voting", partial(label_tile, job), store.tiles)
-    write_field(job.results, store.tiles, settings.voxel_size, scene.votes_of(settings.output))
-    counts = _write(output, cloud, job, scene.class_table().num_ids)
+    header = file_header(settings.voxel_size, masks.channels.ids)
+    write_field(job.results, store.tiles, header, scene.votes_of(settings.output))
+    counts = _write(output, cloud, job, masks.channels)
+    num_turned = sum(int(results.read(tile, "turned")[0]) for tile in store.tiles)
     folder.remove()
-    return LabelSummary(counts, settings.voxel_size, len(masks.views))
+    return summarize(counts, settings.voxel_size, masks.views, cloud.path, box, num_turned)
 
 
 def _ranges(
@@ -132,16 +163,39 @@ def _ranges(
         parts.subfolder("ranges"), {view.name: number for number, view in enumerate(masks.views)}
     )
     return compute_ranges(
-        RangeJob(
-            scene.path, mesh, maps, {view.name: image_size(masks.files[view.name]) for view in masks.views}
-        ),
+        RangeJob(scene.path, mesh, maps, {view.name: masks.size(view) for view in masks.views}),
         executor,
     )
 
 
+def _judge_sides(cloud: CloudFile, masks: Masks) -> Sides:
+    """What to do with the cloud's own normals, by the points that `labelling.label` looks at."""
+    if not set(NORMALS) <= set(cloud.names):
+        return Sides.ESTIMATE
+    step, found, unusable = sample_step(cloud.num_points), [], 0
+    for start, records in cloud.chunks():
+        unusable += int((~usable_normals(_normals(records))).sum())
+        found.append(records[-start % step :: step])
+    if unusable:
+        logger.warning(
+            "%s: %d of %d normals have no length or are not finite: all are estimated",
+            cloud.path,
+            unusable,
+            cloud.num_points,
+        )
+        return Sides.ESTIMATE
+    sample = np.concatenate(found)
+    return judge_sides(positions(sample), _normals(sample), masks.views, cloud.path)
+
+
+def _normals(records: np.ndarray) -> np.ndarray:
+    """(N, 3)"""
+    return np.stack([records[name] for name in NORMALS], axis=1)
+
+
 def sample_spacing(store: TileStore, statistics: CloudStatistics) -> tuple[float, np.ndarray]:
-    """Sampling distance as `labelled_cloud.spacing_of` has it, and the points (S, 3) by which `default_voxel_size`
-    measures mask pixels.
+    """Sampling distance as `labelled_cloud.spacing_of` has it, and the points (S, 3) by which
+    `default_voxel_size` measures mask pixels.
     """
     rows, distances, footprint_rows, footprints = [], [], [], []
     num_points = sum(store.counts.values())
@@ -174,11 +228,14 @@ def label_tile(job: LabelJob, tile: int) -> None:
     records = halo.gather(store.records)
     points, masks = positions(records), Masks.load(scene, job.confidence)
     normals = unit_normals(
-        columns(records, ("nx", "ny", "nz")),
+        None if job.sides is Sides.ESTIMATE else columns(records, NORMALS),
         points,
         np.array([view.center for view in masks.views]),
         job.extent.low,
     )
+    turned = with_sides(points, normals, masks.views, job.sides)
+    num_turned = (turned != normals)[halo.core].any(axis=1).sum()
+    normals = turned
     origin = voxel_origin(job.extent.low, job.settings.voxel_size)
     density = None
     if job.settings.mechanisms.density:
@@ -188,14 +245,14 @@ def label_tile(job: LabelJob, tile: int) -> None:
         masks.views,
         masks.read,
         job.maps,
-        scene.class_table().num_ids,
+        masks.channels.count,
         job.settings,
     )
     core = halo.core
     labels = fusion.labels
     job.results.write(
         tile,
-        label=labels.label[core],
+        label=masks.channels.to_ids(labels.label)[core],
         confidence=labels.confidence[core],
         state=labels.state[core],
         num_views=labels.num_views[core].astype(np.int32),
@@ -203,12 +260,12 @@ def label_tile(job: LabelJob, tile: int) -> None:
         normals=normals[core],
     )
     keys, votes = _blocks(fusion, points, core)
-    job.results.write(tile, keys=keys, field=votes)
+    job.results.write(tile, turned=np.array([num_turned]), keys=keys, field=votes)
 
 
 def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (B, 3) int32 and counts of the field's blocks whose first point, by row, lies in the tile: each block
-    belongs to one tile.
+    """Positions (B, 3) int32 and counts of the field's blocks whose first point, by row, lies in the tile:
+    each block belongs to one tile.
     """
     grid = fusion.grid
     voxels = sort_by_voxel(points, grid.voxel_size, grid.origin)
@@ -217,14 +274,14 @@ def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.nd
     return mine, grid.grid.attribute(grid.ATTRIBUTE).numpy()[grid.slots(mine)]
 
 
-def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndarray:
+def _write(path: Path, cloud: CloudFile, job: LabelJob, channels: Channels) -> np.ndarray:
     """The cloud with the labels of its tiles; returns the number of points in each state."""
     added = [
         ("label", "u1"),
         ("confidence", "f4"),
         ("state", "u1"),
         ("num_views", "i4"),
-        *((f"{VOTES}{label}", "f4") for label in range(num_ids)),
+        *((f"{VOTES}{label}", "f4") for label in channels.ids),
     ]
     names = {name for name, _ in added} | {"nx", "ny", "nz"}
     kept = [
@@ -236,15 +293,19 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, num_ids: int) -> np.ndar
     counts = np.zeros(len(STATE_NAMES), np.int64)
 
     def chunks():
-        fused = job.results.in_order(["label", "confidence", "state", "num_views", "votes", "normals"])
-        for (_, records), values in zip(cloud.chunks(), fused, strict=True):
+        names, at_once = (
+            ["label", "confidence", "state", "num_views", "votes", "normals"],
+            rows_at_once(dtype),
+        )
+        fused = job.results.in_order(names, at_once)
+        for (_, records), values in zip(cloud.chunks(at_once), fused, strict=True):
             result = np.empty(len(records), dtype)
             for name, _ in kept:
                 result[name] = records[name]
             for column, name in enumerate(("nx", "ny", "nz")):
                 result[name] = values["normals"][:, column]
-            for label in range(num_ids):
-                result[f"{VOTES}{label}"] = values["votes"][:, label]
+            for channel, label in enumerate(channels.ids):
+                result[f"{VOTES}{label}"] = values["votes"][:, channel]
             for name in ("label", "confidence", "state", "num_views"):
                 result[name] = values[name]
             counts[:] += np.bincount(values["state"], minlength=len(STATE_NAMES))

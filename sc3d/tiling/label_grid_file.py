@@ -11,16 +11,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sc3d.geometry.voxels import file_header
 from sc3d.io.atomic import atomic_path
 from sc3d.tiling.store import Results
 
-BLOCKS = 2048  # held at a time
+HELD = 64 << 20  # bytes of blocks at a time
 
 
-def write_field(results: Results, tiles: list[int], voxel_size: float, path: Path) -> None:
+def write_field(results: Results, tiles: list[int], header: dict[str, np.ndarray], path: Path) -> None:
     """The blocks of all tiles (`keys` (B, 3) and `field` of each), sorted by position, as one
-    `VoxelBlockGrid` npz.
+    `VoxelBlockGrid` npz; header: as `file_header` gives it.
     """
     keys = [results.read(tile, "keys") for tile in tiles]
     owner, row = (
@@ -39,18 +38,19 @@ def write_field(results: Results, tiles: list[int], voxel_size: float, path: Pat
             _sorted(results, tiles, owner[order], row[order], shape),
         )
         _array(archive, "key", joined.shape, np.int32, [joined[order]])
-        for name, value in file_header(voxel_size).items():
+        for name, value in header.items():
             _array(archive, name, value.shape, value.dtype, [value])
 
 
 def _sorted(
     results: Results, tiles: list[int], owner: np.ndarray, row: np.ndarray, shape: tuple[int, ...]
 ) -> Iterator[np.ndarray]:
-    """Counts of BLOCKS blocks at a time; owner: (B,) place of each block's tile in `tiles`; row: (B,) its row
+    """Counts of some blocks at a time; owner: (B,) place of each block's tile in `tiles`; row: (B,) its row
     there.
     """
-    for start in range(0, len(owner), BLOCKS):
-        part = slice(start, start + BLOCKS)
+    at_once = max(1, HELD // (4 * int(np.prod(shape))))
+    for start in range(0, len(owner), at_once):
+        part = slice(start, start + at_once)
         values = np.empty((len(owner[part]), *shape), np.int32)
         for place in np.unique(owner[part]):
             mine = owner[part] == place

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sc3d.errors import InputError
 from sc3d.io.chunked_clouds import CloudFile
-from sc3d.io.ply import write_records
+from sc3d.io.ply import read_header, write_records
 from sc3d.propagation.appearance import (
     AppearanceModel,
     AppearanceStatistics,
@@ -36,7 +36,7 @@ from sc3d.propagation.potts import STEPS, appearance_marginals, decided, sure_ex
 from sc3d.propagation.propagate import PropagateSummary, fill_from_nearest, no_seeds, spread, with_states
 from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.terrain import WINDOWS, GroundModel, NormalStatistics
-from sc3d.scene.labelled_cloud import VOTES
+from sc3d.scene.labelled_cloud import VOTES, vote_channels
 from sc3d.scene.labels import PROPAGATED
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
@@ -49,34 +49,47 @@ from sc3d.tiling.work_folder import WorkFolder
 
 logger = logging.getLogger(__name__)
 
-BYTES = 700  # of a point while its tile is worked on
+LEAST_BYTES = 700
+BYTES, VOTE_BYTES = 460, 40  # of a point while its tile is worked on, and more for each channel of its votes
 EDGE = 2.6  # an edge is hardly longer, point spacings
 HOPS = STEPS + 3  # how far a round of mean field looks, and what the edges at that distance depend on
 
 
 def propagate_fits(scene: Scene, settings: Propagate) -> bool:
     """Whether the cloud fits into memory as a whole, and nobody asked for workers."""
-    count = num_points(settings.seeds or scene.seeds)
-    return count is None or fits(count * BYTES, settings)
+    path = settings.seeds or scene.seeds
+    count = num_points(path)
+    if count is None:
+        return True
+    vertex = read_header(path).element("vertex") if path.suffix.lower() == ".ply" else None
+    channels = vote_channels(entry.name for entry in vertex.properties) if vertex else None
+    return fits(count * bytes_per_point(channels.count if channels else 1), settings)
+
+
+def bytes_per_point(num_channels: int) -> int:
+    """Of memory while a tile is worked on."""
+    return max(LEAST_BYTES, BYTES + VOTE_BYTES * num_channels)
 
 
 def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     """As `propagation.propagate.propagate_scene`, tile by tile, here or on the workers that the settings ask for."""
     cloud, output = CloudFile.open(settings.seeds or scene.seeds), settings.output or scene.labelled
-    num_ids = sum(name.startswith(VOTES) for name in cloud.names)
-    votes = [f"{VOTES}{label}" for label in range(max(num_ids, 1))]
-    for name in ("nx", "label", "confidence", "state", "num_views", *votes):
+    channels = vote_channels(cloud.names)
+    for name in ("nx", "label", "confidence", "state", "num_views", *([] if channels else [f"{VOTES}0"])):
         if name not in cloud.names:
             raise InputError(f"{cloud.path} has no attribute {name!r}: it was not written by `sc3d label`")
+    if channels is None:
+        raise InputError(f"{cloud.path} has votes of no class: it was not written by `sc3d label`")
     folder, statistics = (
         WorkFolder(output, "propagate", [cloud.path], settings),
         CloudStatistics.from_cloud(cloud),
     )
-    grid = statistics.grid(max_points(settings, BYTES), HOPS * EDGE * statistics.spacing)
+    room = max_points(settings, bytes_per_point(channels.count))
+    grid = statistics.grid(room, HOPS * EDGE * statistics.spacing)
     store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
     margin = HOPS * EDGE * sample_spacing(store, statistics)[0]
     results, shared = Results(folder.subfolder("results"), store), folder.subfolder("shared")
-    job = PropagateJob(settings, statistics.extent, store, results, margin, num_ids, shared)
+    job = PropagateJob(settings, statistics.extent, store, results, margin, channels, shared)
     with open_executor(settings) as executor:
         _solve(job, executor, cloud.path)
     summary = _write(output, cloud, job)
@@ -129,7 +142,7 @@ def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
     part = TileGraph.load(job, tile)
     core, start = part.core, part.known.seed_labels
     return TileSummary(
-        np.bincount(start[core], minlength=job.num_ids)[1 : job.num_ids],
+        np.bincount(start[core], minlength=job.channels.count)[1:],
         part.known.agreement(core),
         NormalStatistics.from_normals(part.graph.normals[core], part.graph.spacings[core]),
     )
@@ -325,8 +338,9 @@ def _state_task(
     if job.settings.fill:
         label, confidence = fill_from_nearest(part.known.points, label, confidence)
     final = with_states(part.known.seeds, _start(job, part, statistics), (label, confidence), job.settings)
+    label = job.channels.to_ids(final.label)
     job.results.write(
-        tile, label=part.own(final.label), confidence=part.own(final.confidence), state=part.own(final.state)
+        tile, label=part.own(label), confidence=part.own(final.confidence), state=part.own(final.state)
     )
 
 
@@ -335,9 +349,8 @@ def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
     counts, confidence = np.zeros(3, np.int64), [0.0]
 
     def chunks():
-        for (_, records), values in zip(
-            cloud.chunks(), job.results.in_order(["label", "confidence", "state"]), strict=True
-        ):
+        found = job.results.in_order(["label", "confidence", "state"], cloud.rows_at_once)
+        for (_, records), values in zip(cloud.chunks(), found, strict=True):
             result = np.empty(len(records), np.dtype(kept))
             for name, _ in kept:
                 result[name] = values[name] if name in values else records[name]

@@ -15,7 +15,8 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
-from sc3d.io.chunked_clouds import RECORDS_AT_ONCE, CloudFile, positions
+from sc3d.io.chunked_clouds import CloudFile, positions
+from sc3d.io.json_files import write_json
 from sc3d.labelling.cloud import STEPS, CloudExtent, histogram_median, position_histogram
 
 RASTER = 512  # cells per side in which points are counted, to choose the tiles
@@ -195,11 +196,7 @@ class TileStore:
                     _append(folder / f"{tile}.bin", records[rows])
                     _append(folder / f"{tile}.row", start + rows)
                 counts += found
-            temporary = folder / ".index.tmp"
-            temporary.write_text(
-                json.dumps({int(tile): int(counts[tile]) for tile in np.flatnonzero(counts)})
-            )
-            temporary.replace(index)
+            write_json(index, {int(tile): int(counts[tile]) for tile in np.flatnonzero(counts)})
         return cls(
             folder,
             grid,
@@ -276,11 +273,11 @@ class Results:
         """Values of the window's points."""
         return halo.gather(lambda tile: self.read(tile, name, mapped=True))
 
-    def in_order(self, names: list[str]) -> Iterator[dict[str, np.ndarray]]:
-        """The values of all points in the order of the cloud, RECORDS_AT_ONCE at a time."""
+    def in_order(self, names: list[str], at_once: int) -> Iterator[dict[str, np.ndarray]]:
+        """The values of all points in the order of the cloud, so many at a time."""
         total = sum(self.store.counts.values())
-        for start in range(0, total, RECORDS_AT_ONCE):
-            stop, chunk = min(start + RECORDS_AT_ONCE, total), dict[str, np.ndarray]()
+        for start in range(0, total, at_once):
+            stop, chunk = min(start + at_once, total), dict[str, np.ndarray]()
             for tile in self.store.tiles:
                 rows = self.store.rows(tile)
                 first, last = np.searchsorted(rows, (start, stop))

@@ -4,7 +4,7 @@ arrays of the tile's own points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from sc3d.propagation.appearance import (
 )
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
 from sc3d.propagation.terrain import NUM_FEATURES
+from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import VOTES
 from sc3d.scene.labels import Labels
 from sc3d.settings.labels import Propagate
@@ -34,7 +35,7 @@ KNOWN = ("points", "votes", *(field.name for field in fields(Labels)), "colors")
 
 @dataclass(frozen=True)
 class PropagateJob:
-    """What the task of a tile needs to know. margin: world units; num_ids: channels of the votes; shared:
+    """What the task of a tile needs to know. margin: world units; channels: of the votes; shared:
     folder for what all tiles read
     """
 
@@ -43,7 +44,7 @@ class PropagateJob:
     store: TileStore
     results: Results
     margin: float
-    num_ids: int
+    channels: Channels
     shared: Path
 
     @property
@@ -142,7 +143,8 @@ def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np
             )
         )
     )
-    votes = columns(records, [f"{VOTES}{label}" for label in range(job.num_ids)])
+    labels = replace(labels, label=job.channels.from_ids(labels.label, "the cloud"))
+    votes = columns(records, [f"{VOTES}{label}" for label in job.channels.ids])
     return LabelledPoints(
         positions(records), labels, votes, columns(records, ("red", "green", "blue"))
     ), columns(records, ("nx", "ny", "nz"))

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
-import shutil
+from contextlib import suppress
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from sc3d.io.atomic import require_room
+from sc3d.io.atomic import claim, reject, remove, require_room
+from sc3d.io.json_files import write_text
 from sc3d.settings.common import Resources
+
+MADE = "made-here"  # file that says where its folder was made
 
 
 class WorkFolder:
@@ -23,30 +27,47 @@ class WorkFolder:
             sorted(
                 (name, str(value))
                 for name, value in asdict(settings).items()
-                if name not in ignored | {"output"}
+                if name not in ignored | {"output"} and not isinstance(value, Path)  # which are inputs
             )
         ]
         state = hashlib.sha256(
             repr((stage, decisive, [_identity(path) for path in inputs])).encode()
         ).hexdigest()[:12]
         self.folder = output.absolute().parent / f".{output.name}.{state}.parts"
-        for other in self.folder.parent.glob(f".{output.name}.*.parts"):
+        for other in self.folder.parent.glob(f".{glob.escape(output.name)}.*.parts"):
             if other != self.folder:
-                shutil.rmtree(other, ignore_errors=True)
+                remove(other)
+        if claim(self.folder).is_dir() and not self._is_made_here():
+            reject(self.folder, "it was copied or unpacked")
 
     def subfolder(self, name: str) -> Path:
         folder = self.folder / name
-        folder.mkdir(parents=True, exist_ok=True)
+        if not self.folder.is_dir():
+            self.folder.mkdir(parents=True)
+            write_text(self.folder / MADE, self._place())
+        folder.mkdir(exist_ok=True)
         require_room(folder / "any")
         return folder
 
+    def _place(self) -> str:
+        """Where the folder lies on its disk, which nobody knows who made an archive of it."""
+        return str(self.folder.stat().st_ino)
+
+    def _is_made_here(self) -> bool:
+        """The arrays in it are believed as they are, so nobody else may have written them."""
+        with suppress(OSError, ValueError):
+            return (self.folder / MADE).read_text(encoding="utf-8") == self._place()
+        return False
+
     def remove(self) -> None:
-        shutil.rmtree(self.folder, ignore_errors=True)
+        remove(self.folder)
 
 
 def _identity(path: Path) -> tuple:
-    """Of a file, or of all files of a folder: names, sizes and times."""
+    """Of a file, or of all files of a folder: names from there on, sizes and times; wherever it lies."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    return str(path), tuple(
-        (str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file()
+    return path.name, tuple(
+        (file.relative_to(path).as_posix(), file.stat().st_size, file.stat().st_mtime_ns)
+        for file in files
+        if file.is_file()
     )

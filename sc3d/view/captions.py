@@ -6,6 +6,7 @@ import numpy as np
 
 from sc3d.scene.class_table import ClassTable
 from sc3d.view.colors import Coloring, ColorScale, color_scale, legend_entries
+from sc3d.view.lettering import lettering
 
 PAPER, INK = (255, 255, 255), (32, 34, 38)
 
@@ -32,10 +33,11 @@ def add_legend(
 def _swatches(entries: list[tuple[str, tuple[int, int, int]]], width: int) -> np.ndarray:
     from PIL import Image, ImageDraw
 
-    font, size = caption_font(width)
+    size = caption_font(width)[1]
+    texts = [lettering(name, size) for name, _ in entries]
     line, gap = round(1.9 * size), size
     places, x, y = [], gap, gap // 2
-    for name, _ in entries:
+    for name, font in texts:
         length = round(1.6 * size + font.getlength(name))
         if x > gap and x + length > width - gap:
             x, y = gap, y + line
@@ -43,7 +45,7 @@ def _swatches(entries: list[tuple[str, tuple[int, int, int]]], width: int) -> np
         x += length + round(1.5 * gap)
     strip = Image.new("RGB", (width, y + line + gap // 2), PAPER)
     draw = ImageDraw.Draw(strip)
-    for (name, color), (left, top) in zip(entries, places, strict=True):
+    for (name, font), (_, color), (left, top) in zip(texts, entries, places, strict=True):
         middle = top + line // 2
         draw.rectangle(
             (left, middle - size // 2, left + size, middle + size // 2),

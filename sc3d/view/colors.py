@@ -73,7 +73,7 @@ def color_points(
         votes = read_votes(cloud)
         if votes is None:  # those of some class are missing
             raise InputError(_MAKERS[by])
-        return disagreement_colors(disagreement(votes))
+        return disagreement_colors(disagreement(votes.values))
     values = _attributes(cloud)[_ATTRIBUTES[by]].cpu().numpy()
     if by == "photo":
         return as_uint8(values)
@@ -104,7 +104,7 @@ def _attributes(
 def disagreement(votes: np.ndarray) -> np.ndarray:
     """Share of the votes that the winning class did not get.
 
-    votes: (N, num_ids) as in `labelled.read_votes`; column 0 counts views and does not vote
+    votes: (N, C + 1) values as `labelled_cloud.read_votes` gives them; column 0 counts views and does not vote
     returns: (N,) float32, 0 = all agree, at most 1 - 1 / classes; NaN where nothing voted
     """
     cast = votes[:, 1:]

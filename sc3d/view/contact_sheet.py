@@ -10,9 +10,11 @@ import numpy as np
 
 from sc3d.view.captions import INK, PAPER, caption_font
 from sc3d.view.colors import confidence_colors
+from sc3d.view.lettering import lettering
 
 if TYPE_CHECKING:
     from PIL import Image, ImageDraw
+    from PIL.ImageFont import FreeTypeFont
 
     from sc3d.splatting.evaluation import Comparison
 
@@ -49,10 +51,11 @@ def contact_sheet(rows: Sequence[Comparison], title: str, width: int = 1600) -> 
     height = top + sum(line + _GAP + panel[0].shape[0] for panel in panels) + _MARGIN
     sheet = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(sheet)
+    text, letters = _shortened(title, size, width - 2 * _MARGIN)
     draw.text(
         (_MARGIN, _MARGIN + line // 2),
-        _shortened(title, font, width - 2 * _MARGIN),
-        font=font,
+        text,
+        font=letters,
         fill=INK,
         anchor="lm",
     )
@@ -106,19 +109,14 @@ def side_by_side(pictures: Sequence[np.ndarray], captions: Sequence[str]) -> np.
 
     height, width = pictures[0].shape[:2]
     total = len(pictures) * (width + _GAP) - _GAP
-    font, size = caption_font(total)
+    size = caption_font(total)[1]
     picture = Image.new("RGB", (total, height + 2 * size), PAPER)
     draw = ImageDraw.Draw(picture)
     for row, (image, caption) in enumerate(zip(pictures, captions, strict=True)):
         start = row * (width + _GAP)
         picture.paste(Image.fromarray(image), (start, 0))
-        draw.text(
-            (start + size // 2, height + size),
-            _shortened(caption, font, width - size),
-            font=font,
-            fill=INK,
-            anchor="lm",
-        )
+        text, font = _shortened(caption, size, width - size)
+        draw.text((start + size // 2, height + size), text, font=font, fill=INK, anchor="lm")
     return np.asarray(picture)
 
 
@@ -150,7 +148,8 @@ def _heads(
 
 
 def _caption(draw: ImageDraw.ImageDraw, row: Comparison, middle: int, cell: int, font) -> None:
-    draw.text((_MARGIN, middle), _shortened(row.name, font, cell), font=font, fill=INK, anchor="lm")
+    name, letters = _shortened(row.name, round(font.size), cell)
+    draw.text((_MARGIN, middle), name, font=letters, fill=INK, anchor="lm")
     left, text = _MARGIN + cell + _GAP, f"PSNR {row.psnr:.2f} dB"
     draw.text((left, middle), text, font=font, fill=INK, anchor="lm")
     if row.held_out:
@@ -159,13 +158,14 @@ def _caption(draw: ImageDraw.ImageDraw, row: Comparison, middle: int, cell: int,
         )
 
 
-def _shortened(text: str, font, width: float) -> str:
-    """Text that fits into `width` px; names differ at their end, so that is kept."""
+def _shortened(text: str, size: int, width: float) -> tuple[str, FreeTypeFont]:
+    """Text that fits into `width` px, and its font; names differ at their end, so that is kept."""
+    text, font = lettering(text, size)
     if font.getlength(text) <= width:
-        return text
+        return text, font
     while text and font.getlength("..." + text) > width:
         text = text[1:]
-    return "..." + text
+    return "..." + text, font
 
 
 def _fitted(image: np.ndarray, cell: int) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.io.ply import read_records
-from sc3d.io.splats import read_splat_ply
+from sc3d.io.splats import ORIGIN, read_splat_ply
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import Coloring, confidence_colors
@@ -84,7 +84,9 @@ class DisplaySplats:
         return self[chosen]
 
     def centers(self) -> o3d.t.geometry.PointCloud:
-        """The centers as a cloud: positions (world), colors, and label and confidence where there are labels."""
+        """The centers as a cloud: positions (world), colors, and label and confidence where there are
+        labels.
+        """
         import open3d as o3d
 
         cloud = o3d.t.geometry.PointCloud(
@@ -127,7 +129,7 @@ def read_splats(path: Path, table: ClassTable) -> DisplaySplats:
 
     arrays, comments = read_splat_ply(path)
     records, _ = read_records(path)
-    origins = [line.split()[2:] for line in comments if line.startswith("sc3d origin ")]
+    origins = [line.split()[2:] for line in comments if line.startswith(f"{ORIGIN} ")]
     if not {"label", "confidence"} <= set(records.dtype.names or ()) or not origins:
         raise InputError(f"{path} has no labels: run `sc3d export SCENE --format splats`")
     label, confidence = (np.ascontiguousarray(records[name]) for name in ("label", "confidence"))

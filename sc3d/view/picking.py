@@ -22,7 +22,7 @@ from sc3d.geometry.raycast import FirstSurface, see_points
 from sc3d.io.json_files import read_json
 from sc3d.runner import sidecar
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.labelled_cloud import NORMAL_NEIGHBORS, read_surface, read_votes, spacing_of
+from sc3d.scene.labelled_cloud import NORMAL_NEIGHBORS, Votes, read_surface, read_votes, spacing_of
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import STATES
 
@@ -138,9 +138,8 @@ class Inspector:
         votes = self._votes
         if votes is None:
             return {}
-        cast = [
-            (float(votes[row, label]), label) for label in range(1, votes.shape[1]) if votes[row, label] > 0
-        ]
+        found = zip(votes.values[row].tolist(), votes.channels.ids.tolist(), strict=True)
+        cast = [(count, label) for count, label in found if label and count > 0]
         named = self.class_table.name if self.class_table is not None else "class {}".format
         return {named(label): count for count, label in sorted(cast, key=lambda entry: (-entry[0], entry[1]))}
 
@@ -164,7 +163,7 @@ class Inspector:
         return o3d.geometry.KDTreeFlann(np.ascontiguousarray((self._points - self._points[0]).T))
 
     @cached_property
-    def _votes(self) -> np.ndarray | None:
+    def _votes(self) -> Votes | None:
         return read_votes(self.cloud)
 
     @cached_property

@@ -27,6 +27,7 @@ import numpy as np
 
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View, pinhole_view
+from sc3d.io.python_process import run_python
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -73,7 +74,7 @@ def render(
 def vulkan_works() -> bool:
     """Whether OffscreenRenderer works here, tried in another process because it may abort."""
     try:
-        probe = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, timeout=120, check=False)
+        probe = run_python(_PROBE, timeout=120)
     except (OSError, subprocess.TimeoutExpired):
         return False
     if probe.returncode:

@@ -632,8 +632,8 @@ class TestBadProjects:
             (("<f>503.25</f>", ""), "focal length"),
             (('type="frame"', 'type="spherical"'), "spherical"),
             (("</chunk>", ""), "not valid XML"),
-            (("<k1>", "<b2>0.4</b2><k1>"), "skew"),
-            (("<k1>", "<p3>0.4</p3><k1>"), "p3"),
+            (("<k1>", "<b2>4</b2><k1>"), "skew"),
+            (("<k1>", "<p3>4</p3><k1>"), "p3"),
             (("<transform>", "<transform>x "), "16 finite numbers"),
         ],
     )
@@ -653,7 +653,7 @@ class TestBadProjects:
                 "no rotation",
             ),
             (lambda content: content.update(fl_x="wide"), "fl_x"),
-            (lambda content: content.update(k4=4, k3=-3), "radial polynomial"),
+            (lambda content: content.update(k4=1, k3=-0.5), "radial polynomial"),
         ],
     )
     def test_nerfstudio(self, capsys, tmp_path, change, word):
@@ -698,7 +698,7 @@ class TestBadProjects:
     def test_photos(self, capsys, tmp_path):
         views = fly()
         (tmp_path / "cameras.xml").write_text(metashape_xml(views, metashape_lens()))
-        photos = write_photos(tmp_path / "photos", views[1:])
+        photos = write_photos(tmp_path / "photos", [replace(view, name=f"x{view.name}") for view in views])
         self.check(
             capsys, tmp_path, tmp_path / "cameras.xml", "shot_0", "--images", options=("--images", photos)
         )

@@ -137,12 +137,12 @@ def _build_photos(folder: Path) -> None:
 def _read_photos(folder: Path) -> object:
     from sc3d.georeferencing.focal import exif_focal
     from sc3d.georeferencing.geotags import read_geotag
-    from sc3d.io.images import find_photos, read_image
-    from sc3d.segmentation.mask_formats.import_masks import warn_of_turned
+    from sc3d.io.images import find_photos, read_image, read_orientation
 
-    photos = find_photos(folder)
-    warn_of_turned(photos)
-    return [(read_image(photo).shape, read_geotag(photo), exif_focal(photo)) for photo in photos]
+    return [
+        (read_image(photo).shape, read_orientation(photo), read_geotag(photo), exif_focal(photo))
+        for photo in find_photos(folder)
+    ]
 
 
 def _build_masks(folder: Path) -> None:
@@ -200,7 +200,9 @@ def _read_sidecars(folder: Path) -> object:
     from sc3d.scene.scene import Scene
 
     record = {"stage": "label", "settings": {"consensus": 0.66}, "inputs": {"cloud.ply": "00"}}
-    return _finished(record, [folder / "seeds.ply"]), load_report_data(Scene(folder)).records
+    return _finished(record, [folder / "seeds.ply"], Scene(folder), set()), load_report_data(
+        Scene(folder)
+    ).records
 
 
 def _read_weights(folder: Path) -> object:

@@ -842,5 +842,6 @@ def test_turned_photos_are_told(tmp_path, caplog):
     picture, exif = Image.new("RGB", SIZE), Image.Exif()
     exif[0x0112] = 3
     picture.save(scene.images / "DJI_0001.jpg", exif=exif)
+    caplog.set_level("INFO")
     execute("segment", scene, Segment(masks=FILES / "cvat.xml"))
-    assert "DJI_0001.jpg (and 0 more) has an EXIF orientation" in caplog.text
+    assert "1 photos (such as DJI_0001.jpg) are turned by EXIF" in caplog.text

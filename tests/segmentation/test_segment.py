@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -423,9 +422,6 @@ def test_segment_photos_checks_all_photos_first(tmp_path):
     bad.write_bytes(b"not a photo")
     with pytest.raises(InputError, match="bad.jpg"):
         segment_photos([*photos, bad], folders, segmenter, TABLE)
-    double = Path(shutil.copy(photos[0], tmp_path / "photo0.jpeg"))
-    with pytest.raises(InputError, match="share the name"):
-        segment_photos([*photos, double], folders, segmenter, TABLE)
     write_image(folders.masks / "photo1.png", np.zeros((64, 64), np.uint8))
     with pytest.raises(InputError, match="aspect"):
         segment_photos(photos, folders, segmenter, TABLE)

@@ -72,7 +72,7 @@ def test_second_run_is_up_to_date_and_previews_are_there(scene, caplog):
     with caplog.at_level("INFO"):
         execute("depth", scene, Depth(max_size=240))
     assert "up to date" in caplog.text
-    assert len(list(scene.depth.glob("*.jpg"))) == len(list(scene.depth.glob("*.npz"))) == 8
+    assert len(list(scene.depth.glob("*.png"))) == len(list(scene.depth.glob("*.npz"))) == 8
     assert not list(scene.path.glob(".depth.*.parts"))
 
 

@@ -233,7 +233,7 @@ def test_ranges_over_parts_of_a_mesh_are_those_of_the_whole(site, tmp_path):
 
 @pytest.fixture
 def command(site):
-    """Runs `label` in a process of its own with room for few points, on `workers` Dask workers."""
+    """Runs `label` in a process of its own with room for few points, on `workers` workers."""
     program = (
         f"from sc3d.tiling import label\nlabel.max_points = lambda *_: {TILES}\n"
         "from sc3d.cli import main\nif __name__ == '__main__':\n    main()\n"
@@ -259,7 +259,6 @@ def command(site):
 
 
 def test_workers_give_the_same_bytes_also_if_one_is_killed(site, command, small_tiles):
-    pytest.importorskip("distributed")
     run_label(site, "here", max_memory="2G")
     for workers, killed in ((1, False), (2, True)):
         output = site / f"workers{workers}.ply"
@@ -273,7 +272,7 @@ def test_workers_give_the_same_bytes_also_if_one_is_killed(site, command, small_
 
 
 def kill_a_worker(parent: int, site: Path, seconds: float = 120) -> bool:
-    """SIGKILL one Dask worker as soon as the first tile has its labels; whether one was killed."""
+    """SIGKILL one worker as soon as the first tile has its labels; whether one was killed."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         if any(site.glob(".workers2.ply.*.parts/results/label.*.npy")):

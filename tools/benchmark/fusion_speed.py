@@ -57,7 +57,7 @@ class FusionWorkload:
     views: list[View]
     masks: dict[str, Mask]
     surface: Surface
-    num_ids: int
+    num_channels: int
 
     def read(self, view: View) -> Mask:
         return self.masks[view.name.split("#")[0]]
@@ -119,7 +119,7 @@ def _workload(scene: Scene, masks: Masks, num_points: int) -> FusionWorkload:
         masks.views,
         pictures,
         surface,
-        scene.class_table().num_ids,
+        scene.class_table().channels.count,
     )
 
 
@@ -141,7 +141,9 @@ def _cut(workload: FusionWorkload, num_points: int | None, num_views: int) -> Fu
 
 def _label(workload: FusionWorkload) -> Fusion:
     settings = Label(voxel_size=workload.voxel_size)
-    return fuse(workload.cloud, workload.views, workload.read, workload.surface, workload.num_ids, settings)
+    return fuse(
+        workload.cloud, workload.views, workload.read, workload.surface, workload.num_channels, settings
+    )
 
 
 def _propagate(workload: FusionWorkload, fusion: Fusion) -> Labels:
@@ -161,7 +163,7 @@ def _compare(workload: FusionWorkload, repeats: int) -> dict[str, dict[str, floa
         FUSE: lambda: _label(workload),
         RAYS: lambda: rivals.cast_only(workload.surface, bundles),
         Z_BUFFER: lambda: rivals.vote_with_z_buffer(
-            workload.cloud, workload.views, workload.read, workload.num_ids
+            workload.cloud, workload.views, workload.read, workload.num_channels
         ),
         MAP: lambda: _propagate(workload, fusion),
         NEIGHBORS: lambda: rivals.find_neighbors(workload.cloud.points),

@@ -224,7 +224,8 @@ def _run_row(place: Place, given: tuple[LabelledPoints, dict[str, float]], row: 
     labels, cost = evidence.seeds, dict.fromkeys(before, 0.0)
     if row.propagate is not None:
         labels, cost = _propagated(place, evidence, row.propagate)
-    figures = judge(place, labels)
+    channels = place.scene.class_table().channels
+    figures = judge(place, replace(labels, label=channels.to_ids(labels.label)))
     seconds = {
         f"{name}_{clock}": spent[clock]
         for name, spent in (("label", before), ("propagate", cost))
@@ -267,7 +268,7 @@ def _fused(place: Place, masks: Masks, label: Label) -> Fusion:
     label = label.resolved
     cloud = with_density(place, label.voxel_size) if label.mechanisms.density else place.cloud
     surface = place.surface if label.depth_filter else None
-    return fuse(cloud, masks.views, masks.read, surface, place.num_ids, label)
+    return fuse(cloud, masks.views, masks.read, surface, masks.channels.count, label)
 
 
 def _propagated(

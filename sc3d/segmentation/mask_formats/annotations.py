@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sc3d.io.orientation import turned, turned_size
 from sc3d.segmentation.mask_formats.checks import CheckedMask, Checks
 from sc3d.segmentation.mask_formats.outlines import OutlineError, Polygons, RunLengths, rasterize
 
@@ -50,24 +51,26 @@ class PhotoAnnotations:
 
 
 def to_mask(photo: PhotoAnnotations, checks: Checks) -> tuple[str, CheckedMask] | None:
-    """The photo's name and its mask, not painted yet; None if there is nothing to paint or something is wrong,
-    which `checks` keeps.
+    """The photo's name and its mask, not painted yet; None if there is nothing to paint or something is
+    wrong, which `checks` keeps.
     """
     with_area = [annotation for annotation in photo.annotations if annotation.build is not None]
     checks.skip(annotation.kind for annotation in photo.annotations if annotation.build is None)
     if not with_area:
         return None
     name = checks.photo(photo.photos, photo.origin)
-    size = None if name is None else checks.size(name, photo.size, photo.origin)
+    found = None if name is None else checks.size(name, photo.size, photo.origin)
     regions = []
     for annotation in with_area:
         class_id = checks.class_id(annotation.keys, photo.origin)
-        outline = None if size is None else _build(annotation, size, photo, checks)
+        outline = None if found is None else _build(annotation, found[0], photo, checks)
         if class_id is not None and outline is not None:
             regions.append((class_id, outline))
-    if name is None or size is None:
+    if name is None or found is None:
         return None
-    return name, CheckedMask(photo.origin, size, partial(paint, regions, size, photo.smaller_on_top))
+    size, turn = found
+    read = partial(paint, regions, size, photo.smaller_on_top, turn)
+    return name, CheckedMask(photo.origin, turned_size(size, turn), read)
 
 
 def _build(
@@ -84,11 +87,13 @@ def _build(
     return None
 
 
-def paint(regions: list[Region], size: tuple[int, int], smaller_on_top: bool) -> np.ndarray:
+def paint(
+    regions: list[Region], size: tuple[int, int], smaller_on_top: bool, orientation: int = 1
+) -> np.ndarray:
     """(H, W) uint8 class ids, 0 where there is no region; later regions cover earlier ones, or smaller ones
     larger ones.
 
-    size: (width, height) px
+    size: (width, height) px that they were drawn on; orientation: by which that is turned then
     """
     if smaller_on_top:
         areas = [np.count_nonzero(rasterize(outline, size).mask) for _, outline in regions]
@@ -98,4 +103,4 @@ def paint(regions: list[Region], size: tuple[int, int], smaller_on_top: bool) ->
     for class_id, outline in regions:
         crop = rasterize(outline, size)
         labels[crop.window][crop.mask] = class_id
-    return labels
+    return np.ascontiguousarray(turned(labels, orientation))

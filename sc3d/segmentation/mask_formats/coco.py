@@ -46,9 +46,15 @@ def read_coco(file: Path) -> Iterator[PhotoAnnotations]:
     for image, image_id in zip(images, known, strict=True):
         photo, size = str(image.get("file_name", "")), (image.get("width"), image.get("height"))
         found = tuple(_annotation(entry, names, file) for entry in by_image[image_id])
-        yield PhotoAnnotations(
-            str(file), (photo,), None if None in size else size, found, smaller_on_top=True
-        )
+        photos = (*_original_name(image), photo)
+        yield PhotoAnnotations(str(file), photos, None if None in size else size, found, smaller_on_top=True)
+
+
+def _original_name(image: dict) -> tuple[str, ...]:
+    """Name of the photo before Roboflow renamed it."""
+    extra = image.get("extra")
+    name = extra.get("name") if isinstance(extra, dict) else None
+    return (name,) if isinstance(name, str) and name else ()
 
 
 def _entries(content: object, key: str, file: Path) -> list[dict]:

@@ -5,14 +5,16 @@ drawn into the scene.
 from __future__ import annotations
 
 import logging
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path, discard
-from sc3d.io.images import image_size, open_image, read_index_image, write_image
+from sc3d.io.images import index_image_size, read_orientation, turned_onto, write_image
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.mask_values import read_confidence
+from sc3d.scene.photo_names import PhotoNames
 from sc3d.scene.scene import Scene, match_masks, photo_sizes
 from sc3d.segmentation.mask_formats.checks import CheckedMask
 from sc3d.segmentation.mask_formats.source import MaskFiles, read_masks
@@ -24,17 +26,29 @@ logger = logging.getLogger(__name__)
 def import_scene_masks(scene: Scene, settings: Segment, class_table: ClassTable) -> dict[str, object]:
     """Masks of `--masks` into the scene, or a look at those that are there; returns figures for the summary."""
     if settings.masks is None:
-        if settings.mapping is not None or settings.format not in ("auto", "index"):
-            raise InputError("--mapping and --format say how to read --masks, which is missing")
+        told = settings.mapping, settings.name_pattern
+        if told != (None, None) or settings.format not in ("auto", "index"):
+            raise InputError(
+                "--mapping, --format and --name-pattern say how to read --masks, which is missing"
+            )
         if not scene.masks.is_dir():
             raise InputError(
                 "--masks FOLDER is needed (or --backend strokes, grounded-sam or sam3, which make masks)"
             )
-        return {"masks": len(scene.mask_files(scene.masks, class_table)), "source": "already in the scene"}
-    source, sizes = MaskFiles(settings.masks, settings.format, settings.mapping), photo_sizes(scene.images)
-    names = import_masks(source, scene.masks, sizes, class_table, settings.confidence, scene.confidence)
-    warn_of_turned([scene.photo(name) for name in names])
+        found = scene.mask_files(scene.masks, class_table)
+        scene.warn_of_unplaced(scene.masks, scene.confidence)
+        return {"masks": len(found), "source": "already in the scene"}
+    source, sizes = mask_source(settings, settings.masks), photo_sizes(scene.images)
+    names = import_masks(
+        source, scene.masks, sizes, class_table, settings.confidence, scene.confidence, scene.images
+    )
+    scene.warn_of_unplaced(scene.masks, scene.confidence)
     return {"masks": len(names), "confidence": settings.confidence is not None}
+
+
+def mask_source(settings: Segment, path: Path) -> MaskFiles:
+    """The masks in `path`, to be read as the settings say."""
+    return MaskFiles(path, settings.format, settings.mapping, settings.name_pattern)
 
 
 def import_masks(
@@ -44,14 +58,15 @@ def import_masks(
     class_table: ClassTable,
     confidence: Path | None = None,
     scene_confidence: Path | None = None,
+    photos: Path | None = None,
 ) -> list[str]:
     """Write masks, and confidence maps if given, into the scene as 8-bit gray PNGs whose values are the ids
-    of the class table.
+    of the class table, in the frame of the photos as stored.
 
     source: masks in any format; a bare path is looked at
     scene_masks, scene_confidence: folders to write; each is replaced as a whole
     photo_sizes: (width, height) px by photo name
-    confidence: folder of `<photo stem>.png`
+    confidence: folder of PNGs named like the photos; photos: that of the photos, for their EXIF orientation
     returns: names of the photos that have a mask, in order
 
     Raises InputError before anything is written if a file does not fit. With `scene_confidence` but no
@@ -62,21 +77,25 @@ def import_masks(
         raise InputError("confidence maps are given, but not where in the scene they belong")
     source = source if isinstance(source, MaskFiles) else MaskFiles(source)
     in_place = source.path.resolve() == scene_masks.resolve()
-    if in_place and (source.mapping is not None or source.format not in ("auto", "index")):
+    if in_place and (
+        source.mapping is not None
+        or source.name_pattern is not None
+        or source.format not in ("auto", "index")
+    ):
         raise InputError(
             f"{source.path} is the scene's own folder, which holds ids of the class table: masks to convert belong elsewhere"
         )
     masks, maps = check_masks(
-        replace(source, format="index") if in_place else source, photo_sizes, class_table, confidence
+        replace(source, format="index") if in_place else source, photo_sizes, class_table, confidence, photos
     )
     _check_target(source.path, scene_masks)
     if scene_confidence is not None:
         _check_target(confidence, scene_confidence)
     with ExitStack() as folders:  # all is written before anything replaces what is there
         if maps and confidence and scene_confidence and confidence.resolve() != scene_confidence.resolve():
-            _copy(maps, folders.enter_context(atomic_path(scene_confidence)))
+            _copy(maps, folders.enter_context(atomic_path(scene_confidence)), PhotoNames(photo_sizes), photos)
         if not in_place:  # in place, they are already there and checked
-            _draw(masks, folders.enter_context(atomic_path(scene_masks)))
+            _draw(masks, folders.enter_context(atomic_path(scene_masks)), PhotoNames(photo_sizes), photos)
             if not maps and scene_confidence is not None:
                 discard(scene_confidence)
     return sorted(masks)
@@ -87,47 +106,42 @@ def check_masks(
     photo_sizes: dict[str, tuple[int, int]],
     class_table: ClassTable,
     confidence: Path | None = None,
+    photos: Path | None = None,
 ) -> tuple[dict[str, CheckedMask], dict[str, Path]]:
     """Masks that are not drawn yet, and confidence maps, by photo name; InputError, in one line, for all that
     does not fit.
     """
-    masks = read_masks(source, photo_sizes, class_table)
-    return masks, {} if confidence is None else _match_confidence(confidence, photo_sizes, masks)
-
-
-def warn_of_turned(photos: list[Path]) -> None:
-    """Warn of photos with an EXIF orientation: annotation programs turn them, COLMAP and sc3d take the pixels
-    as they are stored.
-    """
-    turned = []
-    for photo in photos:
-        with suppress(InputError), open_image(photo) as image:
-            if image.getexif().get(0x0112, 1) != 1:
-                turned.append(photo)
-    if turned:
-        logger.warning(
-            "%s (and %d more) has an EXIF orientation, which annotation programs apply and sc3d does not: "
-            "see whether its mask lies right",
-            turned[0],
-            len(turned) - 1,
-        )
+    masks = read_masks(source, photo_sizes, class_table, photos)
+    return masks, {} if confidence is None else _match_confidence(confidence, photo_sizes, masks, photos)
 
 
 def _match_confidence(
-    folder: Path, photo_sizes: dict[str, tuple[int, int]], masks: dict[str, CheckedMask]
+    folder: Path,
+    photo_sizes: dict[str, tuple[int, int]],
+    masks: dict[str, CheckedMask],
+    photos: Path | None,
 ) -> dict[str, Path]:
     """Confidence maps by photo name, each readable and as large as the mask it belongs to."""
-    maps = match_masks(folder, photo_sizes, None)
+    maps = match_masks(folder, photo_sizes, None, photos=photos)
     for name, file in maps.items():
         if name not in masks:
             raise InputError(
                 f"{file} is the confidence of a mask that does not exist: remove it, or add a mask for {name}"
             )
-        if image_size(file) != masks[name].size:
-            sizes = "x".join(map(str, image_size(file))), "x".join(map(str, masks[name].size))
+        size = index_image_size(file, _photo(photos, name))
+        if size != masks[name].size:
+            sizes = "x".join(map(str, size)), "x".join(map(str, masks[name].size))
             raise InputError(f"{file} is {sizes[0]}, but its mask is {sizes[1]}: they must be equal")
-        read_index_image(file)
+        read_confidence(file)
     return maps
+
+
+def _photo(photos: Path | None, name: str) -> Path | None:
+    return None if photos is None else photos / name
+
+
+def _orientation(photos: Path | None, name: str) -> int:
+    return 1 if photos is None else read_orientation(photos / name)
 
 
 def _check_target(source: Path | None, target: Path) -> None:
@@ -140,15 +154,16 @@ def _check_target(source: Path | None, target: Path) -> None:
         raise InputError(f"{source} lies inside {target}, which would be replaced: move it elsewhere")
 
 
-def _copy(files: dict[str, Path], folder: Path) -> None:
+def _copy(files: dict[str, Path], folder: Path, names: PhotoNames, photos: Path | None) -> None:
     folder.mkdir()
-    for file in files.values():
-        write_image(folder / file.name, read_index_image(file))
+    for name, file in files.items():
+        confidence = turned_onto(read_confidence(file), file, _photo(photos, name))
+        write_image(names.path(folder, name), confidence, _orientation(photos, name))
 
 
-def _draw(masks: dict[str, CheckedMask], folder: Path) -> None:
+def _draw(masks: dict[str, CheckedMask], folder: Path, names: PhotoNames, photos: Path | None) -> None:
     from tqdm import tqdm
 
     folder.mkdir()
     for name, mask in tqdm(masks.items(), desc="import", unit="photo", disable=None):
-        write_image(folder / f"{Path(name).stem}.png", mask.read())
+        write_image(names.path(folder, name), mask.read(), _orientation(photos, name))

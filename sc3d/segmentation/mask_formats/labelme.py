@@ -44,7 +44,7 @@ def read_labelme(file: Path) -> Iterator[PhotoAnnotations]:
         raise InputError(f"{file} is not a LabelMe file: it has no list of shapes")
     size = (content.get("imageWidth"), content.get("imageHeight"))
     path = content.get("imagePath")
-    photos = (path, file.name) if isinstance(path, str) and path else (file.name,)
+    photos = (path, str(file)) if isinstance(path, str) and path else (str(file),)
     found = tuple(_annotation(shape) for shape in shapes)
     yield PhotoAnnotations(str(file), photos, None if None in size else size, found)
 

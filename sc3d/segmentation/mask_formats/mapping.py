@@ -12,9 +12,9 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.json_files import read_json
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.mask_values import UNKNOWN, Meanings, color_code, meanings_of
 
 UNLABELLED = ("ignore", "unlabelled", "unlabeled")
-UNKNOWN = -1
 
 
 @dataclass(frozen=True)
@@ -81,13 +81,27 @@ class ClassMapping:
             ]
         table, owners = np.full(1 << 24, UNKNOWN, np.int16), dict[int, int]()
         for color, class_id, owner in colors:
-            code = color[0] << 16 | color[1] << 8 | color[2]
+            code = color_code(color)
             if owners.get(code, class_id) not in (class_id, 0):
                 raise InputError(
                     f"{self.origin or 'the class table'}: {owner!r} has the color {color} of another class: colors cannot tell them apart"
                 )
             owners[code] = table[code] = class_id
         return table
+
+    @cached_property
+    def meanings(self) -> Meanings:
+        """What the values and the palettes of PNGs may stand for; without ids or colors where the mapping has
+        none.
+        """
+        if self.mapping is None:
+            return meanings_of(self.table)
+        try:
+            known = np.flatnonzero(self.by_color != UNKNOWN)
+        except InputError:  # its keys are no colors
+            return Meanings(self.by_id, {})
+        by_color = dict(zip(known.tolist(), self.by_color[known].tolist(), strict=True))
+        return Meanings(np.full(256, UNKNOWN, np.int16), by_color)
 
     def _color(self, key: str) -> tuple[int, int, int]:
         code = re.fullmatch(r"#([0-9a-fA-F]{6})", key)

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 
 from sc3d.errors import InputError, MissingPackageError
-from sc3d.io.images import read_image
+from sc3d.io.images import read_image, read_opaque, read_orientation
+from sc3d.io.orientation import turned
 from sc3d.scene.class_table import ClassTable
 from sc3d.segmentation.segment import Segmentation
 from sc3d.segmentation.strokes.features import pixel_features
@@ -98,11 +99,14 @@ class Strokes:
         _check_packages()
         from sc3d.segmentation.strokes.pixel_classifier import Samples, train
 
-        drawn = read_strokes(folder, photos_folder, class_table)
-        painted = [_paint(photo, settings.max_size) for photo in drawn]
+        strokes_of = read_strokes(folder, photos_folder, class_table)
+        marked = [(photo, _paint(photo, settings.max_size)) for photo in strokes_of]
+        marked = [(photo, paint) for photo, paint in marked if (paint[0] != NOTHING).any()]
+        drawn, painted = [photo for photo, _ in marked], [paint for _, paint in marked]
         _check_classes([labels for labels, _ in painted], class_table, folder, settings.require_all)
         training = [
-            _training_pixels(photo, *paint, settings) for photo, paint in zip(drawn, painted, strict=True)
+            _training_pixels(photo, *paint, photos_folder, settings)
+            for photo, paint in zip(drawn, painted, strict=True)
         ]
         labels = np.concatenate([part.labels for part in training])
         label_of_code, codes = np.unique(labels, return_inverse=True)
@@ -113,7 +117,7 @@ class Strokes:
         learned = cls(
             classifier, fit_novelty(samples.features, folds), label_of_code.astype(np.uint8), settings
         )
-        learned.temperature = learned._calibrate(drawn, training, codes, folds)
+        learned.temperature = learned._calibrate(drawn, training, codes, folds, photos_folder)
         logger.info(
             "learned from %d strokes on %d photos; temperature %.2f",
             sum(int(marks.max()) for _, marks in painted),
@@ -169,7 +173,12 @@ class Strokes:
         return np.clip(plane, _MIN_PROBABILITY, 1) ** np.float32(1 / self.temperature)
 
     def _calibrate(
-        self, drawn: list[PhotoStrokes], training: list[_TrainingPixels], codes: np.ndarray, folds: np.ndarray
+        self,
+        drawn: list[PhotoStrokes],
+        training: list[_TrainingPixels],
+        codes: np.ndarray,
+        folds: np.ndarray,
+        photos_folder: Path,
     ) -> float:
         """The temperature that suits strokes as members see them that did not learn from them, after the
         filter.
@@ -182,7 +191,7 @@ class Strokes:
             : self._settings.calibration_photos
         ]:
             part = slice(ends[index], ends[index + 1])
-            small = shrink(read_image(drawn[index].photo), self._settings.max_size)
+            small = shrink(read_image(drawn[index].photo, photos_folder, shown=True), self._settings.max_size)
             features, guide = pixel_features(small), small.astype(np.float32) / 255
             for member in np.unique(folds[part][folds[part] >= 0]):
                 pixels = training[index].pixels[folds[part] == member]
@@ -223,14 +232,20 @@ def assign_folds(strokes: np.ndarray, codes: np.ndarray, num_parts: int) -> np.n
 
 def _paint(photo: PhotoStrokes, max_size: int) -> tuple[np.ndarray, np.ndarray]:
     width, height = _shrunk_size(*photo.size, max_size)
-    return photo.paint(width, height)
+    labels, strokes = photo.paint(width, height)
+    opaque = read_opaque(photo.photo)
+    if opaque is not None:  # what is transparent teaches nothing
+        shown = turned(opaque, read_orientation(photo.photo)).astype(np.uint8)
+        seen = cv2.resize(shown, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+        labels, strokes = np.where(seen, labels, NOTHING).astype(np.int16), np.where(seen, strokes, 0)
+    return labels, strokes
 
 
 def _check_classes(
     painted: list[np.ndarray], class_table: ClassTable, folder: Path, require_all: bool
 ) -> None:
     """Raise InputError if too little is drawn; painted: per photo (H, W) int16 class ids."""
-    present = set(np.unique(np.concatenate([np.unique(labels) for labels in painted])).tolist()) - {NOTHING}
+    present = {int(label) for labels in painted for label in np.unique(labels)} - {NOTHING}
     missing = [entry.name for entry in class_table if entry.id not in present]
     if missing and (require_all or not present):
         raise InputError(
@@ -243,7 +258,7 @@ def _check_classes(
 
 
 def _training_pixels(
-    photo: PhotoStrokes, labels: np.ndarray, strokes: np.ndarray, settings: StrokesSettings
+    photo: PhotoStrokes, labels: np.ndarray, strokes: np.ndarray, folder: Path, settings: StrokesSettings
 ) -> _TrainingPixels:
     """Pixels under the strokes of a photo, a share of each stroke."""
     random = np.random.default_rng([settings.seed, *photo.photo.stem.encode()])
@@ -253,7 +268,7 @@ def _training_pixels(
             for label in np.unique(labels[labels != NOTHING])
         ]
     )
-    features = pixel_features(shrink(read_image(photo.photo), settings.max_size))
+    features = pixel_features(shrink(read_image(photo.photo, folder, shown=True), settings.max_size))
     return _TrainingPixels(
         features.reshape(-1, features.shape[-1])[rows], labels.ravel()[rows], _pieces(strokes, rows), rows
     )
@@ -274,8 +289,8 @@ def _pieces(strokes: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 def sample_pixels(
     strokes: np.ndarray, wanted: np.ndarray, most: int, random: np.random.Generator
 ) -> np.ndarray:
-    """Places of at most about `most` wanted pixels, of each stroke its share, but at least `_MIN_PIXELS` of small
-    ones: they correct large ones.
+    """Places of at most about `most` wanted pixels, of each stroke its share, but at least `_MIN_PIXELS` of
+    small ones: they correct large ones.
 
     strokes: (P,) int number of each pixel's stroke; wanted: (P,) bool
     returns: (N,) int places, ascending
@@ -303,7 +318,7 @@ def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
 def _check_packages() -> None:
     try:
         import sklearn  # noqa: F401
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingPackageError(
             "the backend strokes needs scikit-learn: pip install scikit-learn"
         ) from None

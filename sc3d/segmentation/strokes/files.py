@@ -2,26 +2,30 @@
 
 LabelMe JSON: shapes of type linestrip, line, point (with `"width": <px>`, which LabelMe keeps although it
 does not know it), polygon, rectangle and circle; coordinates in px from the upper left corner of the photo as
-it is stored; later shapes cover earlier ones. The label is the name of a class, or `_background_` for what
-belongs to no class. PNG: the colors of the class table; black and transparent pixels say nothing. A photo may
-have both, the PNG below.
+it is shown (`sc3d.io.orientation`); later shapes cover earlier ones. The label is the name of a class, or
+`_background_` for what belongs to no class. PNG: the colors of the class table; black and transparent pixels
+say nothing. A photo may have both, the PNG below.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-from pathlib import Path, PureWindowsPath
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import find_photos, image_size, open_image
+from sc3d.io.images import find_photos, image_size, mask_orientation, open_image, read_orientation
 from sc3d.io.json_files import read_json
+from sc3d.io.orientation import mask_turn, turned, turned_points, turned_size
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.photo_names import PhotoNames, files_of_photos, photo_name
 from sc3d.scene.scene import check_mask_aspect
+
+logger = logging.getLogger(__name__)
 
 BACKGROUND = "_background_"  # LabelMe's own name for it
 NOTHING = -1  # a pixel without a stroke; 0 is background
@@ -35,7 +39,7 @@ _MIN_SHARE = 0.25  # of a reduced pixel that a PNG must cover
 
 @dataclass(frozen=True)
 class StrokeShape:
-    """One stroke or area. label: class id, 0 = background; points: (N, 2) float64 px of the stored photo;
+    """One stroke or area. label: class id, 0 = background; points: (N, 2) float64 px of the photo as shown;
     width: of strokes, px, 0 = default.
     """
 
@@ -49,7 +53,7 @@ class StrokeShape:
 class PhotoStrokes:
     """Everything that was drawn on one photo.
 
-    size: (width, height) px of the photo
+    size: (width, height) px of the photo as shown
     shapes: from the bottom to the top
     picture: (H, W) int16 class ids of a PNG, NOTHING elsewhere; None if there is no PNG
     """
@@ -87,32 +91,67 @@ def read_strokes(folder: Path, photos_folder: Path, class_table: ClassTable) -> 
     Raises InputError for a folder without strokes, files that belong to no photo, cannot be read or name
     unknown classes or colors.
     """
-    files = (
-        sorted(
-            file
-            for file in folder.iterdir()
-            if file.suffix.lower() in (".json", ".png") and file.name[0] != "."
-        )
-        if folder.is_dir()
-        else []
-    )
+    names = PhotoNames(photo_name(photo, photos_folder) for photo in find_photos(photos_folder))
+    files = files_of_photos(folder, names, (".json", ".png"))
     if not files:
         raise InputError(
             f"no strokes in {folder}: draw some with `sc3d annotate SCENE`, or put LabelMe JSON or PNG files there"
         )
-    photos = {photo.stem: photo for photo in find_photos(photos_folder)}
     found: dict[Path, PhotoStrokes] = {}
+    outside: list[str] = []
     for file in files:
         content = read_json(file) if file.suffix.lower() == ".json" else None
-        photo = _photo_of(file, content, photos)
-        size = image_size(photo)
-        shapes = () if content is None else parse_shapes(content, file, size, class_table)
-        picture = None if content is not None else _read_picture(file, size, class_table)
+        photo = photos_folder / _photo_of(file, folder, content, names)
+        size = shown_size(photo)
+        shapes = () if content is None else read_shapes(content, file, photo, class_table)
+        outside += [f"{file.name}: shape {index + 1}" for index in _outside(shapes, size)]
+        picture = None if content is not None else _read_picture(file, photo, class_table)
         before = found.get(photo, PhotoStrokes(photo, size))
         found[photo] = PhotoStrokes(
             photo, size, before.shapes + shapes, before.picture if picture is None else picture
         )
+    if outside:
+        logger.warning(
+            "%s: %d shapes lie outside of their photos and are left out, such as %s",
+            folder,
+            len(outside),
+            "; ".join(outside[:3]),
+        )
     return [found[photo] for photo in sorted(found)]
+
+
+def shown_size(photo: Path) -> tuple[int, int]:
+    """(width, height) px of a photo as shown."""
+    return turned_size(image_size(photo), read_orientation(photo))
+
+
+def _outside(shapes: tuple[StrokeShape, ...], size: tuple[int, int]) -> list[int]:
+    """Indices of the shapes whose box does not reach into the photo; size: (width, height) px."""
+    found = []
+    for index, shape in enumerate(shapes):
+        reach = np.hypot(*(shape.points[1] - shape.points[0])) if shape.kind == "circle" else shape.width
+        points = shape.points[:1] if shape.kind == "circle" else shape.points
+        low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
+        if (high < 0).any() or (low > size).any():
+            found.append(index)
+    return found
+
+
+def read_shapes(
+    content: object, origin: Path | str, photo: Path, class_table: ClassTable
+) -> tuple[StrokeShape, ...]:
+    """`parse_shapes` for a photo as shown; shapes whose file states the size of the photo as stored, and not
+    as shown, are turned.
+    """
+    orientation, size = read_orientation(photo), image_size(photo)
+    sides = [content.get(key) for key in ("imageWidth", "imageHeight")] if isinstance(content, dict) else []
+    stated = [side for side in sides if isinstance(side, int) and 0 < side < _MAX_COORDINATE]
+    if len(stated) < 2 or mask_turn(1, (stated[0], stated[1]), orientation, size)[0] != 1:
+        return parse_shapes(content, origin, turned_size(size, orientation), class_table)
+    return tuple(
+        replace(shape, points=turned_points(shape.points, size, orientation))
+        for shape in parse_shapes(content, origin, size, class_table)
+    )
 
 
 def parse_shapes(
@@ -120,7 +159,7 @@ def parse_shapes(
 ) -> tuple[StrokeShape, ...]:
     """The shapes of a decoded LabelMe file, scaled to the photo; InputError if something is wrong.
 
-    origin: names the file in messages; size: (width, height) px of the photo
+    origin: names the file in messages; size: (width, height) px of the photo that they were drawn on
     """
     shapes = content.get("shapes") if isinstance(content, dict) else None
     if not isinstance(content, dict) or not isinstance(shapes, list):
@@ -157,38 +196,45 @@ def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) 
         raise InputError(f"{origin}: a {kind} needs at least {MIN_POINTS[kind]} points")
     if not _is_number(width) or width < 0:
         raise InputError(f"{origin}: width must be a number of px")
-    return StrokeShape(
-        ids[label], kind, np.array(points, np.float64).reshape(-1, 2) * scale, float(width) * scale
-    )
+    placed = np.array(points, np.float64).reshape(-1, 2) * scale
+    if not (np.abs(placed) < _MAX_COORDINATE).all():
+        raise InputError(f"{origin}: points must be a list of [x, y] in px")
+    return StrokeShape(ids[label], kind, placed, float(width) * scale)
 
 
 def _is_number(value: object) -> bool:
     return (
         isinstance(value, int | float)
         and not isinstance(value, bool)
-        and math.isfinite(value)
-        and abs(value) < _MAX_COORDINATE
+        and abs(value) < _MAX_COORDINATE  # false for what is not a number, too
     )
 
 
-def _photo_of(file: Path, content: object, photos: dict[str, Path]) -> Path:
-    """The photo whose stem is that of `imagePath`, or else that of the file."""
-    path = content.get("imagePath") if isinstance(content, dict) else None
-    # PureWindowsPath splits at / and \
-    stems = [*([PureWindowsPath(path).stem] if isinstance(path, str) else []), file.stem]
-    photo = next((photos[stem] for stem in stems if stem in photos), None)
-    if photo is None:
-        raise InputError(
-            f"{file} belongs to no photo: {len(photos)} photos are known, such as {next(iter(photos.values())).name}"
-        )
-    return photo
-
-
-def _read_picture(file: Path, size: tuple[int, int], class_table: ClassTable) -> np.ndarray:
-    """(H, W) int16 class ids of a PNG in the colors of the class table, NOTHING where it is black or
-    transparent.
+def _photo_of(file: Path, folder: Path, content: object, names: PhotoNames) -> str:
+    """The photo that `imagePath` names, with the folder of the file where that is not clear, or else the one
+    that the file is named after.
     """
-    check_mask_aspect(file, image_size(file), size)
+    path, place = content.get("imagePath") if isinstance(content, dict) else None, photo_name(file, folder)
+    for changed in (False, True):
+        found = names.match(path, changed) if isinstance(path, str) else ()
+        if len(found) != 1:
+            own = names.match_file(place, folder, changed)
+            found = tuple(name for name in own if name in found) or found or own
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise InputError(f"{file} may belong to {names.choices(found, file.suffix)}: rename it")
+    raise InputError(
+        f"{file} belongs to no photo: {len(names)} photos are known, such as {names.names[0]}{names.advice(place)}"
+    )
+
+
+def _read_picture(file: Path, photo: Path, class_table: ClassTable) -> np.ndarray:
+    """(H, W) int16 class ids of a PNG in the colors of the class table, on the photo as shown, NOTHING where
+    it is black or transparent.
+    """
+    onto, photo_size = mask_orientation(file, photo)[0], image_size(photo)
+    check_mask_aspect(file, turned_size(image_size(file), onto), photo_size)
     with open_image(file, "picture of strokes") as image:
         rgba = np.array(image.convert("RGBA"))
     codes = (rgba[..., :3].astype(np.int32) * [65536, 256, 1]).sum(axis=-1)
@@ -204,7 +250,8 @@ def _read_picture(file: Path, size: tuple[int, int], class_table: ClassTable) ->
         raise InputError(
             f"{file} has the color #{unknown[0]:06x}, which is not in the class table: draw without smoothing, and not as JPEG"
         )
-    return np.array([ids[int(value)] for value in values], np.int16)[places].reshape(codes.shape)
+    labels = np.array([ids[int(value)] for value in values], np.int16)[places].reshape(codes.shape)
+    return turned(turned(labels, onto), read_orientation(photo))
 
 
 def _reduce(picture: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -57,7 +57,7 @@ def cuda_functions() -> Functions:
     """
     try:
         import gsplat
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingPackageError(INSTALL) from None
     try:
         from gsplat.cuda._backend import _C as kernels

@@ -7,13 +7,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sc3d.geometry.cameras import View, undistorted
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.photo_names import PhotoNames
 from sc3d.view.colors import Coloring
 from sc3d.view.display_cloud import DisplayCloud
 from sc3d.view.display_splats import SPLAT_COLORINGS, DisplaySplats
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import viser
 
 _COVER = 0.9  # half side of a drawn point, in point spacings: neighbors overlap a little
+SLASH = "\N{DIVISION SLASH}"  # in a name of the viewer's, where a slash would make a folder
 _LINE_WIDTH = 2.0  # px
 _SPLAT_UNIT, _LARGEST_HALF = 4.0, 6e4  # of the median splat; covariance that a 16-bit float can hold
 _SEEING_COLOR = (0, 158, 115)  # of cameras that see the picked point
@@ -208,11 +209,12 @@ class CameraLayer:
         """depth: length of the pyramids, world units"""
         self._root = server.scene.add_frame("/cameras", show_axes=False)
         self._handles = {}
+        names = PhotoNames(view.name for view in views)
         for view in views:
             pinhole = undistorted(view)
             fov, aspect = field_of_view(pinhole)
             handle = server.scene.add_camera_frustum(
-                f"/cameras/{Path(view.name).stem}",
+                f"/cameras/{names.key(view.name).replace('/', SLASH)}",
                 fov,
                 aspect,
                 thickness=_LINE_WIDTH,
@@ -259,7 +261,7 @@ def _click(
 
 def node_name(table: ClassTable | None, label: int) -> str:
     """Name of a class as part of a path in the scene tree, where a slash would mean a child."""
-    return table.name(label).replace("/", "\N{DIVISION SLASH}") if table is not None else "points"
+    return table.name(label).replace("/", SLASH) if table is not None else "points"
 
 
 def half_precision(covariances: np.ndarray) -> tuple[np.ndarray, float]:

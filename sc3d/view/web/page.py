@@ -20,12 +20,14 @@ import numpy as np
 from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
+from sc3d.io.local_page import LOOPBACK, LocalPage
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import Coloring
 from sc3d.view.display_cloud import DisplayCloud
 from sc3d.view.display_splats import DisplaySplats
 from sc3d.view.picking import Inspector
 from sc3d.view.viewpoints import frustum_depth, overview, without_outliers
+from sc3d.view.web.guard import guarding
 from sc3d.view.web.layers import CameraLayer, CloudLayer, SplatLayer
 from sc3d.view.web.orbit_camera import OrbitCamera
 from sc3d.view.web.panel import Page, PhotoPanel, PointPanel, ShowPanel, legend_html
@@ -113,7 +115,7 @@ def serve(view: WebView, host: str, port: int) -> None:
     }
     try:
         with serving(view, host, port) as address:
-            if host not in (LOCAL, "localhost", "::1"):
+            if host not in LOOPBACK:
                 logger.warning("everybody who can reach this machine can see the scene: there is no password")
             logger.info("open %s in a browser; Ctrl + C ends", address)
             ended.wait()
@@ -159,17 +161,19 @@ def load_viser() -> ModuleType:
     """Import viser; MissingPackageError says how to install it."""
     try:
         import viser
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingPackageError("the viewer in the browser needs viser: pip install 'sc3d[web]'") from None
     return viser
 
 
 @contextlib.contextmanager
 def _server(host: str, port: int) -> Iterator[viser.ViserServer]:
-    """A server that talks to nobody else: its offer to share the page through the makers' server is off."""
+    """A server that talks to nobody else: other web pages are refused, and its offer to share the page
+    through the makers' server is off.
+    """
     viser = load_viser()
     logging.getLogger("websockets").setLevel(logging.WARNING)
-    with contextlib.redirect_stdout(io.StringIO()):  # it announces itself; the log does that here
+    with contextlib.redirect_stdout(io.StringIO()), guarding(LocalPage.at(host)):  # it announces itself
         server = viser.ViserServer(host=host, port=port, label=_TITLE, verbose=False)
     server.request_share_url = lambda *_, **__: None
     try:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, resample
-from sc3d.io.images import read_image, read_index_image
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.view.viewpoints import fitted
@@ -34,12 +32,12 @@ def photo_pictures(scene: Scene, view: View, table: ClassTable | None, max_size:
     photo, mask, missing = None, None, []
     size = _size(view, max_size)
     try:
-        photo = cv2.resize(read_image(scene.photo(view.name)), size, interpolation=cv2.INTER_AREA)
+        photo = cv2.resize(scene.read_photo(view.name), size, interpolation=cv2.INTER_AREA)
     except InputError:
         missing.append("photo")
-    file = scene.masks / f"{Path(view.name).stem}.png"
-    if table is not None and file.exists():
-        labels = cv2.resize(read_index_image(file), size, interpolation=cv2.INTER_NEAREST)
+    file = scene.mask_file(scene.masks, view.name)
+    if table is not None and file is not None:
+        labels = cv2.resize(scene.read_mask(file, view.name), size, interpolation=cv2.INTER_NEAREST)
         mask = overlay(photo, labels, table)
     else:
         missing.append("mask")

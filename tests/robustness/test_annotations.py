@@ -1,0 +1,492 @@
+"""Masks, strokes and annotations as other programs write them: palettes, turned photos, junk. Each is right, refused
+in one line, or told with a number.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sc3d.annotate.session import Session
+from sc3d.errors import InputError
+from sc3d.io.images import read_index_image, read_orientation
+from sc3d.io.orientation import inverse, turned, turned_points, turned_size
+from sc3d.runner import execute
+from sc3d.scene.class_table import parse_classes
+from sc3d.scene.scene import Scene
+from sc3d.segmentation.segment import Folders, Segmentation, segment_photos
+from sc3d.segmentation.strokes.files import read_strokes
+from sc3d.settings.labels import Segment
+from tests.builders import ROOT, instance_of
+
+TABLE = json.loads((ROOT / "data" / "classes.json").read_text())
+COLORS = {entry["id"]: tuple(entry["color"]) for entry in TABLE}
+NAMES = {entry["id"]: entry["name"] for entry in TABLE}
+ORIENTATIONS = range(1, 9)
+STORED = (48, 32)  # px of the photos
+
+
+def bands(width: int = 48, height: int = 32) -> np.ndarray:
+    """Ids 1 to 4 from left to right; the upper rows are 0, so that every turn is told from every other."""
+    mask = np.repeat(np.arange(width)[None] * 4 // width + 1, height, axis=0).astype(np.uint8)
+    mask[: height // 4] = 0
+    return mask
+
+
+def make_scene(path: Path, orientation: int = 1, size: tuple[int, int] = STORED) -> Scene:
+    scene = Scene(path / "scene")
+    scene.images.mkdir(parents=True)
+    scene.classes.write_text(json.dumps(TABLE))
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.new("RGB", size, (90, 120, 60)).save(scene.images / "a.jpg", exif=exif)
+    return scene
+
+
+def palette_png(path: Path, mask: np.ndarray, order: list[int], colors: dict[int, tuple]) -> None:
+    """A PNG whose index i stands for the class order[i]."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lut = np.zeros(256, np.uint8)
+    lut[order] = np.arange(len(order))
+    image = Image.frombytes("P", mask.shape[::-1], lut[mask].tobytes())
+    image.putpalette([value for label in order for value in colors[label]])
+    image.save(path)
+
+
+def imported(scene: Scene, masks: Path, **options: object) -> np.ndarray:
+    execute("segment", scene, Segment(masks=masks, **options))
+    return read_index_image(scene.masks / "a.png")
+
+
+# palettes
+
+
+def test_a_palette_of_the_class_tables_colors_counts(tmp_path, caplog):
+    caplog.set_level("INFO")
+    palette_png(tmp_path / "m" / "a.png", bands(), [0, 4, 2, 1, 3], {0: (0, 0, 0)} | COLORS)
+    np.testing.assert_array_equal(imported(make_scene(tmp_path), tmp_path / "m"), bands())
+    assert "1 masks are read by the colors of their palette" in caplog.text
+
+
+def test_ids_are_asked_for(tmp_path):
+    palette_png(tmp_path / "m" / "a.png", bands(), [0, 4, 2, 1, 3], {0: (0, 0, 0)} | COLORS)
+    found = imported(make_scene(tmp_path), tmp_path / "m", format="index")
+    assert found[-1, 0] == 3 and found[-1, -1] == 1
+
+
+def test_a_palette_to_look_at_leaves_the_ids(tmp_path):
+    other = {0: (0, 0, 0), 1: (128, 0, 0), 2: (0, 128, 0), 3: (128, 128, 0), 4: (0, 0, 128)}  # VOC
+    palette_png(tmp_path / "m" / "a.png", bands(), [0, 1, 2, 3, 4], other)
+    np.testing.assert_array_equal(imported(make_scene(tmp_path), tmp_path / "m"), bands())
+
+
+@pytest.mark.parametrize("step", [1, 60])
+def test_a_gray_palette_leaves_the_ids(tmp_path, step):
+    palette_png(
+        tmp_path / "m" / "a.png", bands(), [0, 1, 2, 3, 4], {row: (row * step,) * 3 for row in range(5)}
+    )
+    np.testing.assert_array_equal(imported(make_scene(tmp_path), tmp_path / "m"), bands())
+
+
+def test_a_palette_that_may_be_either_is_refused(tmp_path):
+    mixed = {0: (0, 0, 0), 1: COLORS[2], 2: COLORS[1], 3: (1, 2, 3), 4: (200, 0, 0)}
+    palette_png(tmp_path / "m" / "a.png", np.minimum(bands(), 2), [0, 1, 2, 3, 4], mixed)
+    with pytest.raises(InputError, match="--format index"):
+        imported(make_scene(tmp_path), tmp_path / "m")
+
+
+def test_an_optimized_gray_mask_holds_its_gray_levels(tmp_path):
+    """PNG optimizers turn few gray levels into a palette of any order."""
+    gray = {label: (label,) * 3 for label in range(5)}
+    palette_png(tmp_path / "m" / "a.png", np.where(bands() == 4, 3, 0).astype(np.uint8), [0, 3], gray)
+    with pytest.raises(InputError, match="different classes"):  # index 1 is a class, too
+        imported(make_scene(tmp_path), tmp_path / "m")
+
+
+@pytest.mark.parametrize(("bits", "top"), [(1, 1), (2, 3), (4, 4)])
+def test_few_bits_hold_ids(tmp_path, bits, top):
+    mask = np.minimum(bands(), top)
+    png = tmp_path / "m" / "a.png"
+    png.parent.mkdir()
+    png.write_bytes(gray_png(mask, bits))
+    np.testing.assert_array_equal(imported(make_scene(tmp_path), png.parent), mask)
+
+
+def gray_png(values: np.ndarray, bits: int) -> bytes:
+    """A gray PNG of 1, 2 or 4 bits, whose samples are the values."""
+    import struct
+    import zlib
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    height, width = values.shape
+    digits = np.unpackbits(values[..., None], axis=-1)[..., -bits:].reshape(height, width * bits)
+    rows = b"".join(b"\0" + np.packbits(row).tobytes() for row in digits)
+    header = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(rows))
+        + chunk(b"IEND", b"")
+    )
+
+
+def test_gray_with_alpha_holds_ids(tmp_path):
+    alpha = np.full(bands().shape, 255, np.uint8)
+    alpha[:, :6] = 0
+    (tmp_path / "m").mkdir()
+    Image.fromarray(np.dstack([bands(), alpha]), "LA").save(tmp_path / "m" / "a.png")
+    expected = bands()
+    expected[:, :6] = 0
+    np.testing.assert_array_equal(imported(make_scene(tmp_path), tmp_path / "m"), expected)
+
+
+def test_sixteen_bits_need_a_mapping(tmp_path):
+    (tmp_path / "m").mkdir()
+    Image.fromarray(bands().astype(np.uint16) * 1000).save(tmp_path / "m" / "a.png")
+    with pytest.raises(InputError, match="--mapping"):
+        imported(make_scene(tmp_path), tmp_path / "m")
+    mapping = tmp_path / "map.json"
+    mapping.write_text(json.dumps({str(1000 * label): name for label, name in NAMES.items()}))
+    np.testing.assert_array_equal(
+        imported(make_scene(tmp_path / "b"), tmp_path / "m", mapping=mapping), bands()
+    )
+
+
+def test_palettes_in_the_scene_and_in_truth(tmp_path):
+    scene = make_scene(tmp_path)
+    palette_png(scene.masks / "a.png", bands(), [0, 4, 2, 1, 3], {0: (0, 0, 0)} | COLORS)
+    np.testing.assert_array_equal(scene.read_mask(scene.masks / "a.png", "a.jpg"), bands())
+
+
+def test_a_gray_palette_of_confidence_holds_gray_levels(tmp_path):
+    scene = make_scene(tmp_path)
+    palette_png(
+        scene.confidence / "a.png", bands(), [4, 3, 2, 1, 0], {row: (row * 60,) * 3 for row in range(5)}
+    )
+    np.testing.assert_array_equal(
+        scene.read_confidence(scene.confidence / "a.png", "a.jpg"), bands() * np.uint8(60)
+    )
+
+
+# orientation
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_turning_and_back(orientation):
+    image = np.arange(6).reshape(2, 3)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    stream = io.BytesIO()
+    Image.fromarray(image.astype(np.uint8)).save(stream, "PNG", exif=exif)
+    from PIL import ImageOps
+
+    with Image.open(stream) as opened:
+        shown = np.array(ImageOps.exif_transpose(opened))
+    np.testing.assert_array_equal(turned(image, orientation), shown)
+    np.testing.assert_array_equal(turned(turned(image, orientation), inverse(orientation)), image)
+    row, column = 1, 0  # of the value 3
+    x, y = turned_points(np.array([[column + 0.5, row + 0.5]]), (3, 2), orientation)[0]
+    assert shown[int(y), int(x)] == 3
+
+
+def shown_bands(orientation: int) -> np.ndarray:
+    return bands(*turned_size(STORED, orientation))
+
+
+def as_stored(orientation: int) -> np.ndarray:
+    return turned(shown_bands(orientation), inverse(orientation))
+
+
+def boxes(orientation: int) -> list[tuple[int, float, float, float, float]]:
+    """Class and corners of the bands, px of the photo as shown."""
+    width, height = turned_size(STORED, orientation)
+    return [(label, (label - 1) * width / 4, height / 4, label * width / 4, height) for label in range(1, 5)]
+
+
+def polygon(x0: float, y0: float, x1: float, y1: float) -> list[list[float]]:
+    return [[x0, y0], [x1, y0], [x1, y1], [x0, y1]]
+
+
+def labelme(orientation: int) -> str:
+    width, height = turned_size(STORED, orientation)
+    shapes = [
+        {"label": NAMES[label], "shape_type": "polygon", "points": polygon(*box)}
+        for label, *box in boxes(orientation)
+    ]
+    return json.dumps(
+        {
+            "shapes": shapes,
+            "imagePath": "a.jpg",
+            "imageWidth": width,
+            "imageHeight": height,
+            "imageData": None,
+        }
+    )
+
+
+def coco(orientation: int) -> str:
+    width, height = turned_size(STORED, orientation)
+    annotations = [
+        {"id": label, "image_id": 1, "category_id": label, "segmentation": [np.ravel(polygon(*box)).tolist()]}
+        for label, *box in boxes(orientation)
+    ]
+    images = [{"id": 1, "file_name": "a.jpg", "width": width, "height": height}]
+    categories = [{"id": label, "name": name} for label, name in NAMES.items()]
+    return json.dumps({"images": images, "annotations": annotations, "categories": categories})
+
+
+def cvat(orientation: int) -> str:
+    width, height = turned_size(STORED, orientation)
+    found = "".join(
+        f'<box label="{NAMES[label]}" xtl="{x0}" ytl="{y0}" xbr="{x1}" ybr="{y1}" z_order="0"/>'
+        for label, x0, y0, x1, y1 in boxes(orientation)
+    )
+    return f'<annotations><image id="0" name="a.jpg" width="{width}" height="{height}">{found}</image></annotations>'
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+@pytest.mark.parametrize(("name", "write"), [("a.json", labelme), ("coco.json", coco), ("cvat.xml", cvat)])
+def test_annotations_of_the_photo_as_shown(tmp_path, orientation, name, write):
+    (tmp_path / name).write_text(write(orientation))
+    scene = make_scene(tmp_path, orientation)
+    np.testing.assert_array_equal(imported(scene, tmp_path / name), as_stored(orientation))
+    assert read_orientation(scene.masks / "a.png") == orientation  # viewers show it like the photo
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_masks_of_the_photo_as_shown(tmp_path, orientation, caplog):
+    scene = make_scene(tmp_path, orientation)
+    (tmp_path / "m").mkdir()
+    Image.fromarray(shown_bands(orientation)).save(tmp_path / "m" / "a.png")
+    np.testing.assert_array_equal(imported(scene, tmp_path / "m"), as_stored(orientation))
+    assert ("1 masks" in caplog.text) == (orientation in (2, 3, 4))
+    # what sc3d has written is read back as it lies, by hand in the scene or from elsewhere
+    np.testing.assert_array_equal(scene.read_mask(scene.masks / "a.png", "a.jpg"), as_stored(orientation))
+    again = make_scene(tmp_path / "again", orientation)
+    np.testing.assert_array_equal(imported(again, scene.masks), as_stored(orientation))
+    # truth and masks put there by hand
+    np.testing.assert_array_equal(scene.read_mask(tmp_path / "m" / "a.png", "a.jpg"), as_stored(orientation))
+    assert scene.mask_size(tmp_path / "m" / "a.png", "a.jpg") == STORED
+
+
+@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+def test_sides_tell_masks_of_the_photo_as_stored(tmp_path, orientation):
+    scene = make_scene(tmp_path, orientation)
+    (tmp_path / "m").mkdir()
+    Image.fromarray(bands()).save(tmp_path / "m" / "a.png")
+    np.testing.assert_array_equal(imported(scene, tmp_path / "m"), bands())
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_confidence_lies_as_its_mask(tmp_path, orientation):
+    scene = make_scene(tmp_path, orientation)
+    for folder, values in (("m", shown_bands(orientation)), ("c", shown_bands(orientation) * np.uint8(60))):
+        (tmp_path / folder).mkdir()
+        Image.fromarray(values).save(tmp_path / folder / "a.png")
+    imported(scene, tmp_path / "m", confidence=tmp_path / "c")
+    np.testing.assert_array_equal(
+        read_index_image(scene.confidence / "a.png"), as_stored(orientation) * np.uint8(60)
+    )
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_strokes_of_the_photo_as_shown(tmp_path, orientation):
+    scene = make_scene(tmp_path, orientation)
+    scene.strokes.mkdir()
+    (scene.strokes / "a.json").write_text(labelme(orientation))
+    (strokes,) = read_strokes(scene.strokes, scene.images, scene.class_table())
+    assert strokes.size == turned_size(STORED, orientation)
+    painted = strokes.paint(*strokes.size)[0]
+    shown = shown_bands(orientation)
+    assert (painted[shown > 0] == shown[shown > 0]).mean() > 0.9
+    Image.fromarray(scene.class_table().palette[shown] * (shown > 0)[..., None]).save(scene.strokes / "a.png")
+    (scene.strokes / "a.json").unlink()
+    (strokes,) = read_strokes(scene.strokes, scene.images, scene.class_table())
+    np.testing.assert_array_equal(strokes.paint(*strokes.size)[0], np.where(shown > 0, shown.astype(int), -1))
+
+
+def test_strokes_of_a_size_as_stored_are_turned(tmp_path):
+    scene = make_scene(tmp_path, 6)
+    scene.strokes.mkdir()
+    (scene.strokes / "a.json").write_text(labelme(1))  # drawn where EXIF is not looked at
+    (strokes,) = read_strokes(scene.strokes, scene.images, scene.class_table())
+    painted = turned(strokes.paint(*strokes.size)[0], inverse(6))
+    assert (painted[bands() > 0] == bands()[bands() > 0]).mean() > 0.9
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_annotate_shows_the_photo_as_shown(tmp_path, orientation):
+    scene = make_scene(tmp_path, orientation)
+    session = Session(scene)
+    with Image.open(io.BytesIO(session.photo("a"))) as photo:
+        assert photo.size == turned_size(STORED, orientation) == session.sizes["a"]
+    session.save("a", json.loads(labelme(orientation)))
+    saved = json.loads((scene.strokes / "a.json").read_text())
+    assert (saved["imageWidth"], saved["imageHeight"]) == turned_size(STORED, orientation)
+    np.testing.assert_allclose(saved["shapes"][0]["points"], polygon(*boxes(orientation)[0][1:]))
+
+
+class Halves:
+    """Says 1 for the left half of what it sees, and one object there."""
+
+    def segment(self, image: np.ndarray) -> Segmentation:
+        labels = np.zeros(image.shape[:2], np.uint8)
+        labels[:, : image.shape[1] // 2] = 1
+        return Segmentation(labels, labels * np.uint8(200), (instance_of(labels > 0, 1, 0.9, 0.9),))
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_backends_see_the_photo_as_shown(tmp_path, orientation):
+    scene = make_scene(tmp_path, orientation)
+    folders = Folders(scene.masks, scene.confidence, scene.instances)
+    segment_photos([scene.images / "a.jpg"], folders, Halves(), parse_classes(TABLE, "classes"))
+    width, height = turned_size(STORED, orientation)
+    shown = np.zeros((height, width), np.uint8)
+    shown[:, : width // 2] = 1
+    expected = turned(shown, inverse(orientation))
+    np.testing.assert_array_equal(read_index_image(scene.masks / "a.png"), expected)
+    again = make_scene(tmp_path / "again", orientation)
+    np.testing.assert_array_equal(imported(again, scene.instances / "a.json"), expected)
+
+
+# junk in strokes and annotations
+
+BIG = int("9" * 500)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        [[BIG, 1], [2, 2], [3, 1]],
+        [[float("nan"), 1], [2, 2], [3, 1]],
+        [[float("inf"), 1], [2, 2], [3, 1]],
+        [["a", 1], [2, 2], [3, 1]],
+        [[[1, 2], 1], [2, 2], [3, 1]],
+        [{"x": 1}, [2, 2], [3, 1]],
+        [[None, 1], [2, 2], [3, 1]],
+        [[True, 1], [2, 2], [3, 1]],
+        "points",
+        None,
+        {},
+    ],
+)
+def test_junk_points_are_refused(tmp_path, points):
+    scene = make_scene(tmp_path)
+    shape = {"label": "road", "shape_type": "polygon", "points": points}
+    content = {"shapes": [shape], "imageWidth": 48, "imageHeight": 32}
+    scene.strokes.mkdir()
+    (scene.strokes / "a.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"shape 1: points"):
+        read_strokes(scene.strokes, scene.images, scene.class_table())
+    if points != [[True, 1], [2, 2], [3, 1]]:
+        with pytest.raises(InputError):
+            imported(scene, scene.strokes / "a.json")
+
+
+@pytest.mark.parametrize("side", [BIG, -1, 0, "48", 1e400, None, [48], 1])
+def test_junk_sizes_are_refused(tmp_path, side):
+    scene = make_scene(tmp_path)
+    shape = {"label": "road", "shape_type": "polygon", "points": [[1e4, 1], [2, 2], [3, 9e4]]}
+    scene.strokes.mkdir()
+    (scene.strokes / "a.json").write_text(
+        json.dumps({"shapes": [shape], "imageWidth": side, "imageHeight": 1 if side == 1 else 32})
+    )
+    for read in (
+        lambda: read_strokes(scene.strokes, scene.images, scene.class_table()),
+        lambda: imported(scene, scene.strokes / "a.json"),
+    ):
+        with pytest.raises(InputError):
+            read()
+
+
+def test_strokes_outside_are_counted(tmp_path, caplog):
+    scene = make_scene(tmp_path)
+    shapes = json.loads(labelme(1))["shapes"]
+    far = {"label": "road", "shape_type": "linestrip", "points": [[-9999, -9999], [-9990, -9999]], "width": 5}
+    Image.new("RGB", STORED).save(scene.images / "b.jpg")
+    scene.strokes.mkdir()
+    for name, drawn in (("a", [*shapes, far]), ("b", [far])):
+        (scene.strokes / f"{name}.json").write_text(json.dumps({"shapes": drawn}))
+    execute("segment", scene, Segment(backend="strokes"))
+    assert "2 shapes lie outside of their photos" in caplog.text
+    assert "a.json: shape 5; b.json: shape 1" in caplog.text
+
+
+def test_strokes_that_all_lie_outside_are_refused(tmp_path):
+    scene = make_scene(tmp_path)
+    far = {"label": "road", "shape_type": "linestrip", "points": [[-9999, -9999], [-9990, -9999]], "width": 5}
+    scene.strokes.mkdir()
+    (scene.strokes / "a.json").write_text(json.dumps({"shapes": [far]}))
+    with pytest.raises(InputError, match="show no"):
+        execute("segment", scene, Segment(backend="strokes"))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("segmentation", [[BIG, 1, 2, 2, 3, 1]]),
+        ("segmentation", [[1, [2], 3]]),
+        ("segmentation", [["x"] * 6]),
+        ("segmentation", [[float("nan")] * 6]),
+        ("segmentation", {"size": [32, 48], "counts": [BIG]}),
+        ("segmentation", {"size": [32, 48], "counts": {"a": 1}}),
+        ("segmentation", {"counts": 5}),
+        ("image_id", [1]),
+        ("category_id", {}),
+    ],
+)
+def test_junk_in_coco_is_refused(tmp_path, key, value):
+    content = json.loads(coco(1))
+    content["annotations"][0][key] = value
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    with pytest.raises(InputError):
+        imported(make_scene(tmp_path), tmp_path / "coco.json")
+
+
+@pytest.mark.parametrize(
+    "element",
+    [
+        '<polygon label="road" points="nan,1;2,2;3,3"/>',
+        '<polygon label="road" points="1e400,1;2,2;3,3"/>',
+        f'<polygon label="road" points="{BIG},1;2,2;3,3"/>',
+        '<box label="road" xtl="1" ytl="1" xbr="9" ybr="9" rotation="inf"/>',
+        '<box label="road" xtl="1" ytl="1" xbr="9" ybr="9" rotation="nan"/>',
+        '<ellipse label="road" cx="1" cy="1" rx="nan" ry="2"/>',
+        f'<mask label="road" left="0" top="0" width="{"9" * 5000}" height="1" rle="1"/>',
+        f'<box label="road" xtl="1" ytl="1" xbr="9" ybr="9" z_order="{"9" * 5000}"/>',
+    ],
+)
+def test_junk_in_cvat_is_refused(tmp_path, element):
+    text = f'<annotations><image id="0" name="a.jpg" width="48" height="32">{element}</image></annotations>'
+    (tmp_path / "cvat.xml").write_text(text)
+    with pytest.raises(InputError):
+        imported(make_scene(tmp_path), tmp_path / "cvat.xml")
+
+
+def test_a_damaged_picture_in_labelme_is_no_traceback(tmp_path):
+    stream = io.BytesIO()
+    Image.new("L", (10, 10)).save(stream, "PNG")
+    for cut in range(8, len(stream.getvalue()), 7):
+        text = base64.b64encode(stream.getvalue()[:cut] + b"\xff" * 5).decode()
+        shape = {"label": "road", "shape_type": "mask", "points": [[0, 0], [9, 9]], "mask": text}
+        (tmp_path / "a.json").write_text(json.dumps({"shapes": [shape], "imageWidth": 48, "imageHeight": 32}))
+        with suppress(InputError):  # some cuts lose nothing
+            imported(make_scene(tmp_path / str(cut)), tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("id", BIG), ("id", 1e400), ("color", [BIG, 0, 0]), ("color", [[1], 2, 3]), ("name", [1])],
+)
+def test_junk_in_the_class_table_is_refused(key, value):
+    with pytest.raises(InputError):
+        parse_classes([TABLE[0] | {key: value}], "classes.json")
