@@ -217,6 +217,21 @@ def evaluate(stereo, planes, costs):
             costs[row, column] = _cost(stereo, flat, row, column, q, a, b, weights, values, variance)
 
 
+@numba.njit(cache=True, fastmath=True, inline="always")
+def _surest(costs, row, column, arm, reach):
+    """Row and column of the pixel of least cost along one of four arms, at odd distances: those are of the other
+    color; -1 outside of the map.
+    """
+    height, width = costs.shape
+    chosen_row, chosen_column, surest = -1, -1, np.float32(1e9)
+    for distance in range(1, reach + 1, 2):
+        r = row + (distance if arm == 0 else -distance if arm == 1 else 0)
+        c = column + (distance if arm == 2 else -distance if arm == 3 else 0)
+        if 0 <= r < height and 0 <= c < width and costs[r, c] < surest:
+            chosen_row, chosen_column, surest = r, c, costs[r, c]
+    return chosen_row, chosen_column
+
+
 @numba.njit(cache=True, parallel=True, fastmath=True)
 def sweep(stereo, planes, costs, color, round_number, spread, tilt, num_trials, reach):
     """One half of an iteration: pixels of one color of a checkerboard try the planes of pixels of the other,
@@ -235,47 +250,32 @@ def sweep(stereo, planes, costs, color, round_number, spread, tilt, num_trials, 
             variance = _patch(stereo.gray, row, column, weights, values)
             q, a, b = planes[row, column, 0], planes[row, column, 1], planes[row, column, 2]
             best = costs[row, column]
-            for arm in range(4):
-                # the surest of the arm's pixels; odd distances are of the other color
-                chosen_row, chosen_column, surest = -1, -1, np.float32(1e9)
-                for distance in range(1, reach + 1, 2):
-                    r = row + (distance if arm == 0 else -distance if arm == 1 else 0)
-                    c = column + (distance if arm == 2 else -distance if arm == 3 else 0)
-                    if 0 <= r < height and 0 <= c < width and costs[r, c] < surest:
-                        chosen_row, chosen_column, surest = r, c, costs[r, c]
-                if chosen_row < 0:
-                    continue
-                ta, tb = planes[chosen_row, chosen_column, 1], planes[chosen_row, chosen_column, 2]
-                tq = (
-                    planes[chosen_row, chosen_column, 0]
-                    + ta * np.float32(column - chosen_column)
-                    + tb * np.float32(row - chosen_row)
-                )
-                if tq < stereo.farthest or tq > stereo.nearest:
-                    continue
-                if abs(tq - q) < 1e-5 * q and ta == a and tb == b:
-                    continue
-                cost = _cost(stereo, flat, row, column, tq, ta, tb, weights, values, variance)
-                if cost < best:
-                    best, q, a, b = cost, tq, ta, tb
             state = np.uint32(row * 9781 + column * 6271 + round_number * 26699 + 1)
             amplitude = np.float32(spread)
-            for _ in range(num_trials):
-                state = _hash(state)
-                change = (_uniform(state) * 2 - 1) * amplitude * np.float32(stereo.nearest - stereo.farthest)
-                state = _hash(state)
-                slope = np.float32(tilt) * amplitude / np.float32(spread) * q
-                da = (_uniform(state) * 2 - 1) * slope
-                state = _hash(state)
-                db = (_uniform(state) * 2 - 1) * slope
-                tq, ta, tb = q + change, a + da, b + db
-                amplitude *= np.float32(0.35)
+            for trial in range(4 + num_trials):
+                if trial < 4:
+                    r, c = _surest(costs, row, column, trial, reach)
+                    if r < 0:
+                        continue
+                    ta, tb = planes[r, c, 1], planes[r, c, 2]
+                    tq = planes[r, c, 0] + ta * np.float32(column - c) + tb * np.float32(row - r)
+                    if abs(tq - q) < 1e-5 * q and ta == a and tb == b:
+                        continue
+                else:
+                    state = _hash(state)
+                    tq = q + (_uniform(state) * 2 - 1) * amplitude * np.float32(
+                        stereo.nearest - stereo.farthest
+                    )
+                    slope = np.float32(tilt) * amplitude / np.float32(spread) * q
+                    state = _hash(state)
+                    ta = a + (_uniform(state) * 2 - 1) * slope
+                    state = _hash(state)
+                    tb = b + (_uniform(state) * 2 - 1) * slope
+                    amplitude *= np.float32(0.35)
                 if tq < stereo.farthest or tq > stereo.nearest:
                     continue
                 cost = _cost(stereo, flat, row, column, tq, ta, tb, weights, values, variance)
                 if cost < best:
                     best, q, a, b = cost, tq, ta, tb
-            planes[row, column, 0] = q
-            planes[row, column, 1] = a
-            planes[row, column, 2] = b
+            planes[row, column, 0], planes[row, column, 1], planes[row, column, 2] = q, a, b
             costs[row, column] = best

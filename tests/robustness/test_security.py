@@ -243,7 +243,7 @@ def packed(tmp_path_factory) -> Path:
 
 
 STAGES = [
-    "synthesize", "map photos", "reconstruct", "georeference", "train", "train blocks", "extract", "segment", "refine", "label",
+    "synthesize", "map photos", "reconstruct", "georeference", "depth", "train", "train blocks", "extract", "segment", "refine", "label",
     "label tiled", "propagate", "propagate tiled", "evaluate", "evaluate tiled", "report", "export",
 ]  # fmt: skip
 
@@ -261,6 +261,7 @@ def stage_runs() -> dict[str, tuple[str, object]]:
         "map photos": ("map_photos", reconstruction.Mapping()),
         "reconstruct": ("reconstruct", reconstruction.Reconstruct()),
         "georeference": ("georeference", reconstruction.GeoreferenceOptions(**place)),
+        "depth": ("depth", reconstruction.Depth(max_size=32)),
         "train": ("train", train.Train(**small)),
         "train blocks": ("train", train.Train(**small, blocks=2)),
         "extract": ("extract", reconstruction.Extract(method="centers", min_opacity=0.0)),
@@ -374,7 +375,9 @@ def test_no_stage_writes_through_a_link(packed, here, tmp_path, name):
     stage, settings = stage_runs()[name]
     attack = Attack(packed, tmp_path)
     if stage == "synthesize":
-        names = {f"{folder}/" for folder in ("images", "masks", "confidence", "truth", "depth", "sparse")}
+        names = {
+            f"{folder}/" for folder in ("images", "masks", "confidence", "truth", "truth_depth", "sparse")
+        }
     else:
         attack.unpack(stage)
         with WATCH.on(attack.scene) as names:

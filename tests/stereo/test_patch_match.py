@@ -162,12 +162,22 @@ def test_dissimilarity_is_that_of_its_definition():
     for row, column in zip(random.integers(20, 100, 40), random.integers(30, 130, 40), strict=True):
         q = inverse[row, column] * random.uniform(0.97, 1.03)
         a, b = slopes[0][row, column], slopes[1][row, column]
-        weights, values = (np.empty(patch_match.SAMPLES, np.float32) for _ in range(2))
-        variance = patch_match._patch(first.gray, row, column, weights, values)
-        got = patch_match._dissimilarity(
-            second.gray, WIDTH, HEIGHT, A[0], B[0], row, column,
-            np.float32(q), np.float32(a), np.float32(b), weights, values, variance,
-        )  # fmt: skip
+        stereo = patch_match.Stereo(
+            first.gray,
+            second.gray[None],
+            np.array([[WIDTH, HEIGHT]]),
+            A,
+            B,
+            np.float32(0),
+            np.float32(1),
+            np.zeros((1, 0, 0), np.float32),
+            A,
+            B,
+        )
+        cost, planes = np.empty((HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH, 3), np.float32)
+        planes[row, column] = q, a, b
+        patch_match.evaluate(stereo, planes, cost)
+        got = cost[row, column]
         assert abs(got - slow_dissimilarity(first.gray, second.gray, A[0], B[0], row, column, q, a, b)) < 0.02
 
 

@@ -95,7 +95,7 @@ class BenchmarkSurface:
 
     scene: Annotated[Positional[Path], arg(help="Reconstructed scene folder, with the true cameras.")]
     truth: Annotated[
-        Positional[Path], arg(help="Synthetic scene folder: depth/, truth/, truth.ply, truth_mesh.ply.")
+        Positional[Path], arg(help="Synthetic scene folder: truth_depth/, truth/, truth.ply, truth_mesh.ply.")
     ]
     voxel_size: float = 0.0
     """Voxel of the mesh, world units; 0 = as in mesh.ply.json."""

@@ -46,7 +46,7 @@ class SurfaceFigures:
 
 
 def surface_figures(scene: Scene, truth: Scene, voxel_size: float) -> SurfaceFigures:
-    """Compare gaussians.ply and mesh.ply of `scene` with depth/, truth/, truth.ply and truth_mesh.ply of
+    """Compare gaussians.ply and mesh.ply of `scene` with truth_depth/, truth/, truth.ply and truth_mesh.ply of
     `truth`, whose cameras it must have.
     """
     origin = local_origin(scene.model.views)
