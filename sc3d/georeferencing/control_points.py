@@ -49,8 +49,10 @@ class ControlPoints:
 
     @property
     def origin(self) -> tuple[float, float, float]:
-        """Middle of the points, rounded: latitude, longitude, height of the local ENU frame."""
-        latitude, longitude, height = self.geodetic.mean(axis=0)
+        """Median of the points, rounded, which a wrong one does not move away: latitude, longitude, height of
+        the local ENU frame.
+        """
+        latitude, longitude, height = np.median(self.geodetic, axis=0)
         return round(float(latitude), 6), round(float(longitude), 6), round(float(height), 0)
 
 

@@ -12,10 +12,12 @@ import numpy as np
 from sc3d.errors import InputError, examples
 from sc3d.georeferencing.alignment import (
     Similarity,
+    fit_similarity,
     fit_similarity_robust,
     flight_shape,
     main_plane,
     roll_upright,
+    upside_down,
 )
 from sc3d.georeferencing.georeference import (
     Georeference,
@@ -250,7 +252,7 @@ def place(flight: Flight, centers: dict[str, np.ndarray], points: np.ndarray) ->
 
     centers: camera center (3,) by photo name, photos without GPS included; points: (P, 3) of the model, for
         the level of a flight along a line
-    returns: None if fewer than three cameras have GPS or fit it
+    returns: None if fewer than three cameras have GPS
     """
     names = [name for name in flight.tags if name in centers]
     if len(names) < MIN_GPS:
@@ -259,10 +261,8 @@ def place(flight: Flight, centers: dict[str, np.ndarray], points: np.ndarray) ->
         np.array([centers[name] for name in names]),
         np.array([flight.positions[name] for name in names]),
     )
-    fit, kept = fit_similarity_robust(source, target, _tolerance(flight, names))
-    if kept.sum() < MIN_GPS:
-        return None
-    return _rolled(fit, target[kept], points) if flight.shape == "line" else fit
+    fit = fit_similarity(source, target)
+    return _rolled(fit, target, points) if flight.shape == "line" else fit
 
 
 def _rolled(fit: Similarity, positions: np.ndarray, points: np.ndarray) -> Similarity:
@@ -305,6 +305,12 @@ def georeference_photos(scene: Scene, epsg: int | None) -> Georeference:
     flight = read_flight(scene.images, [view.name for view in views])
     centers = {view.name: view.center for view in views}
     found = find_georeference(flight, centers, scene.model.points, epsg) if flight else None
+    rotations = np.array([view.cam_from_world[:3, :3] for view in views])
+    turn = np.array(found.local_from_world)[:3, :3] if found else np.eye(3)
+    if found is not None and upside_down(rotations, Similarity(1.0, turn, np.zeros(3))):
+        raise InputError(
+            f"the GPS of the photos in {scene.images} would turn the cameras upside down, as where latitude and longitude are exchanged or of the wrong sign: correct it, or pass --epsg and --offset"
+        )
     if found is None:
         raise InputError(
             f"the photos in {scene.images} have no GPS that fits the cameras: pass --epsg and --offset if the scene is in a CRS"

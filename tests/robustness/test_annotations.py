@@ -490,3 +490,19 @@ def test_a_damaged_picture_in_labelme_is_no_traceback(tmp_path):
 def test_junk_in_the_class_table_is_refused(key, value):
     with pytest.raises(InputError):
         parse_classes([TABLE[0] | {key: value}], "classes.json")
+
+
+def test_strokes_never_go_to_another_photo_without_a_word(tmp_path):
+    scene = make_scene(tmp_path)
+    photo = next(scene.images.iterdir())
+    (scene.images / f"other{photo.suffix}").write_bytes(photo.read_bytes())
+    shape = {"label": "road", "shape_type": "linestrip", "points": [[2, 2], [9, 9]]}
+    content = {"shapes": [shape], "imageWidth": 48, "imageHeight": 32, "imagePath": photo.name}
+    scene.strokes.mkdir()
+    (scene.strokes / "other.json").write_text(json.dumps(content))  # a copy of a file for the first photo
+    with pytest.raises(InputError, match="named after the photo other"):
+        read_strokes(scene.strokes, scene.images, scene.class_table())
+    (scene.strokes / "other.json").rename(scene.strokes / "anything.json")
+    (scene.strokes / f"{photo.stem}.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="another file has some too"):
+        read_strokes(scene.strokes, scene.images, scene.class_table())

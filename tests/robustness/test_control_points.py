@@ -98,6 +98,17 @@ class TestHandheldGps:
         assert 8 < np.linalg.norm(figures["residuals_left_out"]["gcp04"]["east_north_up_m"][:2]) < 13
         assert all(row["leave_one_out_m"] > 0 for row in figures["residuals"].values())
 
+    def test_a_point_in_another_country_does_not_move_the_origin(self):
+        measured = SURVEYED.copy()
+        measured[0] += [0, -400_000.0, 5000.0]
+        views = fly(6)
+        points = control(measured, views)
+        assert np.abs(geodetic_to_enu(np.array([points.origin]), ORIGIN)).max() < 30
+        model = moved_model(views)
+        figures = align_to_control_points(model, points)
+        assert list(figures["residuals_left_out"]) == ["gcp00"]
+        np.testing.assert_allclose(centers_crs(model, points.origin), true_crs(views), atol=0.05)
+
     def test_given_accuracy_decides_what_is_wrong(self, caplog):
         views = fly(6)
         measured = SURVEYED + 0.5 * self.NOISE

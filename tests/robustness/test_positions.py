@@ -23,6 +23,7 @@ from sc3d.georeferencing.georeference import (
     from_origin,
     geodetic_to_enu,
     projected_crs,
+    triple,
 )
 from sc3d.georeferencing.geotags import Geotag, read_geotag
 from sc3d.georeferencing.gps import Flight, agree, find_georeference, place, read_flight
@@ -109,6 +110,17 @@ class TestWrongPositions:
             assert f"GPS of {len(wrong)} of 12 photos is wrong" in caplog.text
         else:
             assert agreed is flight
+
+    def test_all_that_agreed_count(self):
+        """No triple of them decides: the fit is that of least squares over all."""
+        random, centers = np.random.default_rng(0), some_frame(grid())
+        geodetic = enu_to_geodetic(grid() + random.normal(0, 2.0, (12, 3)), MELBOURNE)
+        tags = {name: Geotag(triple(row)) for name, row in zip(centers, geodetic, strict=True)}
+        flight = Flight(tags, "area", MELBOURNE)
+        fit = place(flight, centers, np.zeros((5, 3)))
+        positions = np.array(list(flight.positions.values()))
+        best = fit_similarity(np.array(list(centers.values())), positions)
+        np.testing.assert_allclose(fit.matrix, best.matrix, atol=1e-6)
 
     def test_an_imported_model_is_placed_by_the_others(self, tmp_path):
         write_flight(tmp_path, grid(), {0: STALE, 5: (0.003, 0, 0)})

@@ -107,6 +107,10 @@ def read_strokes(folder: Path, photos_folder: Path, class_table: ClassTable) -> 
         outside += [f"{file.name}: shape {index + 1}" for index in _outside(shapes, size)]
         picture = None if content is not None else _read_picture(file, photo, class_table)
         before = found.get(photo, PhotoStrokes(photo, size))
+        if shapes and before.shapes:
+            raise InputError(
+                f"{file} holds strokes of {photo.name}, of which another file has some too: join them"
+            )
         found[photo] = PhotoStrokes(
             photo, size, before.shapes + shapes, before.picture if picture is None else picture
         )
@@ -221,6 +225,11 @@ def _photo_of(file: Path, folder: Path, content: object, names: PhotoNames) -> s
             own = names.match_file(place, folder, changed)
             found = tuple(name for name in own if name in found) or found or own
         if len(found) == 1:
+            own = names.match_file(place, folder, False)
+            if own and found[0] not in own:
+                raise InputError(
+                    f"{file} is named after the photo {own[0]}, but its imagePath says {found[0]}: correct one of them"
+                )
             return found[0]
         if found:
             raise InputError(f"{file} may belong to {names.choices(found, file.suffix)}: rename it")
