@@ -8,7 +8,6 @@ that is run twice writes the same, so a lost worker costs time only.
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -101,8 +100,7 @@ def open_executor(resources: Workers) -> Iterator[Executor]:
         return
     pool = WorkerPool(resources.workers)
     try:
-        with _environment(max(1, (os.cpu_count() or 1) // resources.workers)):
-            yield LocalExecutor(pool)
+        yield LocalExecutor(pool)
     finally:
         pool.close()
 
@@ -128,18 +126,3 @@ def _dask_client(address: str) -> Any:
         return Client(address, timeout="20s", set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(f"no Dask scheduler answers at {address}: {error}") from None
-
-
-@contextmanager
-def _environment(threads: int) -> Iterator[None]:
-    """Of processes that are started in the block: so many threads, and no modules from the folder in which the
-    command was called, which may be somebody else's scene.
-    """
-    given = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), str(threads)) | {"PYTHONSAFEPATH": "1"}
-    before = {name: os.environ.get(name) for name in given}
-    os.environ.update(given)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})

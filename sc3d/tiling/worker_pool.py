@@ -10,8 +10,8 @@ import signal
 import threading
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any, cast
 
@@ -32,14 +32,30 @@ class LostTaskError(Sc3dError):
         )
 
 
+@contextmanager
+def _environment(threads: int) -> Iterator[None]:
+    """Of a process that is started in the block: so many threads, and no modules from the folder in which the
+    command was called, which may be somebody else's scene. Not longer than that: numba here looks at it too.
+    """
+    given = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), str(threads)) | {"PYTHONSAFEPATH": "1"}
+    before = {name: os.environ.get(name) for name in given}
+    os.environ.update(given)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
 class _Worker:
     """One process; `index`: of the item that it works on, None = idle."""
 
-    def __init__(self) -> None:
+    def __init__(self, threads: int) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self._process = context.Process(target=_work, args=(theirs,), daemon=True)
-        self._process.start()
+        with _environment(threads):
+            self._process.start()
         theirs.close()  # so that the pipe ends with the process
         self._function: Callable | None = None
         self.index: int | None = None
@@ -103,7 +119,9 @@ class WorkerPool:
     def _hand_out(self, function: Callable, items: Sequence, todo: deque[int]) -> None:
         idle = [worker for worker in self._workers if worker.index is None]
         new = min(self._size - len(self._workers), len(todo) - len(idle))
-        started = [_Worker() for _ in range(new)]  # all of them, before the first is waited for
+        started = [
+            _Worker(max(1, (os.cpu_count() or 1) // self._size)) for _ in range(new)
+        ]  # all of them, before the first is waited for
         self._workers += started
         for worker in idle + started:
             if todo:
