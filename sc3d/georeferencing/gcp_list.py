@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sc3d.errors import InputError
+from sc3d.io.json_files import read_text
 from sc3d.scene.photo_names import PhotoNames
 
 if TYPE_CHECKING:
@@ -34,11 +35,7 @@ class Mark:
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
     """Lines that say something, with their numbers; the first is the CRS."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the ground control points {path}: {error}") from None
-    numbered = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
+    numbered = [(number, line.strip()) for number, line in enumerate(read_text(path).splitlines(), start=1)]
     lines = [(number, line) for number, line in numbered if line and not line.startswith("#")]
     if not lines:
         raise InputError(

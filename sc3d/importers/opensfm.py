@@ -22,7 +22,7 @@ from sc3d.geometry.distortion import DistortionModel, Lenses, NoModelError
 from sc3d.georeferencing.gcp_list import parse_crs
 from sc3d.georeferencing.georeference import Georeference, from_origin, triple
 from sc3d.importers.project import Project, require_found, rigid
-from sc3d.io.json_files import read_json
+from sc3d.io.json_files import read_json, read_text
 from sc3d.settings.reconstruction import Import
 
 logger = logging.getLogger(__name__)
@@ -310,7 +310,7 @@ def _is_topocentric(part: dict, views: list[View]) -> bool:
 
 
 def _utm(coords: Path) -> Georeference:
-    lines = coords.read_text(encoding="utf-8-sig").splitlines()
+    lines = read_text(coords).splitlines()
     try:
         crs, offset = parse_crs(lines[0], coords), [float(word) for word in lines[1].split()[:2]]
     except (IndexError, ValueError):

@@ -8,7 +8,6 @@ offset; (0, 0) is the corner of the first pixel.
 from __future__ import annotations
 
 import logging
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from sc3d.georeferencing.georeference import Georeference, triple
 from sc3d.importers.frames import LARGE, near_origin
 from sc3d.importers.project import Project, require_found, rigid
 from sc3d.io.crs import split_crs
+from sc3d.io.json_files import read_text
 from sc3d.settings.reconstruction import Import
 
 logger = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ def files(path: Path) -> list[Path]:
 def read(path: Path, settings: Import) -> Project:
     file = require_found(_file(path), path, EXPECTED)
     _warn_of_others(path, file)
-    lines = [(number, line.strip()) for number, line in enumerate(_read_text(file).splitlines(), start=1)]
+    lines = [(number, line.strip()) for number, line in enumerate(read_text(file).splitlines(), start=1)]
     header = [line.lower() for _, line in lines[:8]]
     if any("fisheye" in line for line in header):
         raise InputError(f"{file}: Pix4D's fisheye polynomial has no COLMAP model: export undistorted photos")
@@ -88,15 +88,6 @@ def _warn_of_others(path: Path, file: Path) -> None:
     others = [other.name for other in _files(path) if other != file]
     if others:
         logger.warning("%s: only %s is read, left out: %s", path, file.name, examples(others))
-
-
-def _read_text(file: Path) -> str:
-    """Text as UTF-8, or else as Windows writes it in Western Europe."""
-    content = file.read_bytes()
-    for encoding in ("utf-8-sig", "cp1252"):
-        with suppress(UnicodeDecodeError):
-            return content.decode(encoding)
-    raise InputError(f"{file} is no text file")
 
 
 def _header_length(lines: list[tuple[int, str]], file: Path) -> int:
@@ -161,9 +152,9 @@ def _georeference(file: Path) -> Georeference | None:
     if not projection.is_file():
         return None
     try:
-        crs = pyproj.CRS.from_wkt(_read_text(projection).strip())
+        crs = pyproj.CRS.from_wkt(read_text(projection).strip())
         offset = (
-            np.array(_read_text(offset_file).replace(",", " ").split(), np.float64)[:3]
+            np.array(read_text(offset_file).replace(",", " ").split(), np.float64)[:3]
             if offset_file.is_file()
             else np.zeros(3)
         )

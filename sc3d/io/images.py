@@ -412,16 +412,22 @@ class IndexImage(NamedTuple):
 
     samples: (H, W) uint8 values, those of 1, 2 and 4 bits not scaled
     bits: per value; palette: (K, 3) uint8 RGB, None if it is gray
+    clear: values whose palette entry has alpha 0
     """
 
     samples: np.ndarray
     bits: int
     palette: np.ndarray | None
+    clear: tuple[int, ...] = ()
 
     @property
     def scale(self) -> int:
         """Gray level of the value 1."""
         return 255 // ((1 << self.bits) - 1)
+
+    def without_clear(self, table: np.ndarray) -> np.ndarray:
+        """A table by value in which those that are clear mean 0."""
+        return np.where(np.isin(np.arange(len(table)), self.clear), table.dtype.type(0), table)
 
 
 def read_samples(path: Path) -> IndexImage:
@@ -438,13 +444,23 @@ def read_samples(path: Path) -> IndexImage:
         if image.mode == "LA":
             gray, alpha = np.moveaxis(np.array(image), -1, 0)
             return IndexImage(np.where(alpha > 0, gray, 0).astype(np.uint8), 8, None)
+        clear = _clear_values(image.info.get("transparency"))
+        if image.mode == "1":  # Pillow says 255 for 1
+            clear = tuple(min(value, 1) for value in clear)
         colors = image.getpalette("RGB") if image.mode == "P" else None
         samples = np.array(image, np.uint8)  # Pillow scales 2 and 4 bits to 255, and makes 1 bit 0 and 1
     if colors is not None:
-        return IndexImage(samples, 8, np.array(colors, np.uint8).reshape(-1, 3))
-    return IndexImage(
-        samples // np.uint8(255 // ((1 << bits) - 1)) if bits in (2, 4) else samples, bits, None
-    )
+        return IndexImage(samples, 8, np.array(colors, np.uint8).reshape(-1, 3), clear)
+    if bits in (2, 4):
+        samples //= np.uint8(255 // ((1 << bits) - 1))
+    return IndexImage(np.where(np.isin(samples, clear), np.uint8(0), samples), bits, None)
+
+
+def _clear_values(transparency: int | bytes | None) -> tuple[int, ...]:
+    """Values that a tRNS chunk makes transparent: one gray level or entry, or the alpha of every entry."""
+    if isinstance(transparency, bytes):
+        return tuple(value for value, alpha in enumerate(transparency) if alpha == 0)
+    return () if transparency is None else (transparency,)
 
 
 def read_index_image(path: Path) -> np.ndarray:

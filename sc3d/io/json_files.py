@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import errno
 import json
+from contextlib import suppress
 from pathlib import Path
 
 from sc3d.errors import InputError
@@ -14,6 +16,21 @@ def write_text(path: Path, content: str) -> None:
     """Write UTF-8 text, atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(content, encoding="utf-8")
+
+
+def read_text(path: Path) -> str:
+    """Text of another program: UTF-8 or 16 with a byte order mark, UTF-8, or else as Windows writes it in Western
+    Europe. InputError if it is missing or no text.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    for encoding in ("utf-16",) if marked else ("utf-8-sig", "cp1252"):
+        with suppress(UnicodeDecodeError):
+            return content.decode(encoding)
+    raise InputError(f"{path} is no text file")
 
 
 def write_json(path: Path, content: object) -> None:

@@ -94,7 +94,7 @@ def _readings(image: IndexImage, meanings: Meanings) -> dict[str, np.ndarray]:
     elif meanings.by_color:
         codes = [meanings.by_color.get(color_code(color), UNKNOWN) for color in colors]
         readings["colors"] = np.array(codes, np.int16)
-    return readings
+    return {name: image.without_clear(found) for name, found in readings.items()}
 
 
 def _is_table(image: IndexImage, meanings: Meanings) -> bool:
@@ -114,5 +114,5 @@ def read_confidence(path: Path) -> np.ndarray:
     if (image.palette == image.palette[:, :1]).all():
         levels = np.zeros(256, np.uint8)
         levels[: len(image.palette)] = image.palette[:, 0]
-        return levels[image.samples]
+        return image.without_clear(levels)[image.samples]
     return image.samples

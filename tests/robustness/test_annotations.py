@@ -506,3 +506,34 @@ def test_strokes_never_go_to_another_photo_without_a_word(tmp_path):
     (scene.strokes / f"{photo.stem}.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="another file has some too"):
         read_strokes(scene.strokes, scene.images, scene.class_table())
+
+
+@pytest.mark.parametrize("transparency", [5, bytes([255] * 5 + [0] + [255] * 250)])
+@pytest.mark.parametrize("kind", ["colors", "ids"])
+def test_transparent_entries_of_a_palette_are_no_class(tmp_path, transparency, kind):
+    """As transparent pixels of RGB and RGBA masks are none."""
+    scene, mask = make_scene(tmp_path), bands()
+    hidden = mask.copy()
+    hidden[:, :9] = 5  # drawn in the color of a class, but not seen
+    order = [0, 4, 2, 1, 3, 1] if kind == "colors" else [0, 1, 2, 3, 4, 1]
+    file = tmp_path / "m" / "a.png"
+    palette_png(file, mask, order[:5], {0: (0, 0, 0)} | COLORS)
+    with Image.open(file) as image:
+        samples, colors = np.array(image), image.getpalette()
+    samples[:, :9] = 5
+    colors[15:18] = COLORS[1]
+    drawn = Image.fromarray(samples)
+    drawn.putpalette(colors)
+    drawn.save(file, transparency=transparency)
+    expected = np.where(hidden == 5, 0, mask)
+    np.testing.assert_array_equal(imported(scene, tmp_path / "m"), expected)
+
+
+@pytest.mark.parametrize("mode, clear", [("L", 2), ("1", 1)])
+def test_a_transparent_gray_level_is_no_class(tmp_path, mode, clear):
+    scene, file = make_scene(tmp_path), tmp_path / "m" / "a.png"
+    file.parent.mkdir()
+    values = np.where(bands() == 2, clear, 0 if mode == "1" else 1).astype(np.uint8)
+    image = Image.fromarray(values * 255).convert("1") if mode == "1" else Image.fromarray(values)
+    image.save(file, transparency=255 if mode == "1" else clear)
+    np.testing.assert_array_equal(imported(scene, tmp_path / "m"), np.where(values == clear, 0, values))

@@ -86,7 +86,8 @@ def _read_codes(
                 )
             return np.array(image).astype(np.uint16), classes.by_id
     if format == "index":
-        return read_samples(file).samples, classes.by_id
+        index = read_samples(file)
+        return index.samples, index.without_clear(classes.by_id)
     return read_values(file, classes.meanings)
 
 
