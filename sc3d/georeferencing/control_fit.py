@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +34,23 @@ Fitter = Callable[[np.ndarray, np.ndarray], Similarity]
 
 
 @dataclass(frozen=True)
+class Correspondences:
+    """Points by the model and by the survey.
+
+    source: (U, 3) model frame; target: (U, 3) ENU, m; up: (3,) of the cameras, model frame
+    tolerance: m, what points as good as the cameras may miss; accuracy: of the survey, None = not stated
+    level: all heights are the same, so they were not measured
+    """
+
+    source: np.ndarray
+    target: np.ndarray
+    up: np.ndarray
+    tolerance: float
+    accuracy: Accuracy | None
+    level: bool
+
+
+@dataclass(frozen=True)
 class ControlFit:
     """A similarity from model to ENU and what it rests on.
 
@@ -52,29 +69,18 @@ class ControlFit:
     leave_one_out: np.ndarray | None
 
 
-def fit_control_points(
-    source: np.ndarray,
-    target: np.ndarray,
-    up: np.ndarray,
-    tolerance: float,
-    accuracy: Accuracy | None,
-    level: bool,
-    names: list[str],
-) -> ControlFit:
-    """Robust similarity from (U, 3) model positions to (U, 3) ENU, m.
-
-    up: (3,) of the cameras, model frame; tolerance: m, what points as good as the cameras may miss
-    level: all heights are the same; names: of the points, for messages
-    errors: InputError if nothing fits, or the points lie on one line
+def fit_control_points(points: Correspondences, names: list[str]) -> ControlFit:
+    """Robust similarity from model to ENU. names: of the points, for messages; InputError if nothing fits, or the
+    points lie on one line
     """
-    found = _exact(source, target, up, tolerance, accuracy, level)
+    found = _exact(points)
     if found is None or (~found.kept).mean() > FEW_BLUNDERS:
-        loose = _loose(source, target, up, tolerance, accuracy, level)
+        loose = _loose(points)
         if loose is not None and (found is None or loose.kept.sum() > found.kept.sum()):
             found = loose
     if found is None:
-        raise InputError(_refusal(source, target, up, tolerance, accuracy, level, names))
-    kept = target[found.kept]
+        raise InputError(_refusal(points, names))
+    kept = points.target[found.kept]
     spread = np.linalg.svd(kept - kept.mean(axis=0), compute_uv=False)
     if spread[1] < LINE * spread[0]:
         raise InputError(
@@ -83,42 +89,29 @@ def fit_control_points(
     return found
 
 
-def _exact(
-    source: np.ndarray,
-    target: np.ndarray,
-    up: np.ndarray,
-    tolerance: float,
-    accuracy: Accuracy | None,
-    level: bool,
-) -> ControlFit | None:
+def _exact(points: Correspondences) -> ControlFit | None:
     """The fit of points that are as good as the cameras; None if they are not."""
-    if accuracy is not None and NORMAL_LIMIT[3] * max(accuracy) > tolerance:
+    if points.accuracy is not None and NORMAL_LIMIT[3] * max(points.accuracy) > points.tolerance:
         return None
-    fit, kept = fit_similarity_robust(source, target, tolerance)
+    fit, kept = fit_similarity_robust(points.source, points.target, points.tolerance)
     if kept.sum() < MIN_POINTS or 2 * kept.sum() <= len(kept):
         return None
-    if level and np.arccos(np.clip(fit.rotation[2] @ up, -1, 1)) > TILT:
+    if points.level and np.arccos(np.clip(fit.rotation[2] @ points.up, -1, 1)) > TILT:
         return None
-    return _result(fit_similarity, source, target, kept, accuracy, True, False)
+    return _result(fit_similarity, points, kept, exact=True, upright=False)
 
 
-def _loose(
-    source: np.ndarray,
-    target: np.ndarray,
-    up: np.ndarray,
-    tolerance: float,
-    accuracy: Accuracy | None,
-    level: bool,
-) -> ControlFit | None:
+def _loose(points: Correspondences) -> ControlFit | None:
     """The fit of points that are worse than the cameras; None if they do not fit at all."""
+    source, target, accuracy = points.source, points.target, points.accuracy
     extent = float(np.sqrt(((target - target.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    upright = level or (accuracy is not None and accuracy[1] > extent)
+    upright = points.level or (accuracy is not None and accuracy[1] > extent)
 
     def fit(some: np.ndarray, their: np.ndarray) -> Similarity:
-        return fit_upright(some, their, up) if upright else fit_similarity(some, their)
+        return fit_upright(some, their, points.up) if upright else fit_similarity(some, their)
 
     axes = 2 if upright else 3
-    kept = _agreed(fit, source, target, axes, tolerance, accuracy)
+    kept = _agreed(fit, points, axes)
     if kept.sum() < min(len(kept), MIN_POINTS + 1) or kept.sum() < MIN_SHARE * len(kept):
         return None
     offsets = (fit(source[kept], target[kept]).apply(source[kept]) - target[kept])[:, :axes]
@@ -128,20 +121,14 @@ def _loose(
     def weighted(some: np.ndarray, their: np.ndarray) -> Similarity:
         return fit(some, their) if upright else fit_weighted(some, their, accuracy)
 
-    return _result(weighted, source, target, kept, accuracy, False, upright)
+    return _result(weighted, points, kept, exact=False, upright=upright)
 
 
-def _agreed(
-    fit: Fitter,
-    source: np.ndarray,
-    target: np.ndarray,
-    axes: int,
-    tolerance: float,
-    accuracy: Accuracy | None,
-) -> np.ndarray:
+def _agreed(fit: Fitter, points: Correspondences, axes: int) -> np.ndarray:
     """(U,) bool: the points that lie within what their accuracy allows of a fit that most agree on. Only the
     first `axes` coordinates count.
     """
+    source, target, accuracy = points.source, points.target, points.accuracy
 
     def distances(similarity: Similarity) -> np.ndarray:
         return np.linalg.norm((similarity.apply(source) - target)[:, :axes], axis=1)
@@ -153,14 +140,14 @@ def _agreed(
     )
     given = None if accuracy is None else max(accuracy[:1] if axes == 2 else accuracy)
     sigma = np.median(best) / NORMAL_MEDIAN[axes] * (1 + 5 / max(count - size, 1))
-    kept = best <= max(tolerance, NORMAL_LIMIT[axes] * (given or sigma))
+    kept = best <= max(points.tolerance, NORMAL_LIMIT[axes] * (given or sigma))
     for _ in range(10):
         if kept.sum() <= MIN_POINTS:
             break
         found = distances(fit(source[kept], target[kept]))
         freedom = max(axes * kept.sum() - NUM_PARAMETERS[axes], 1)
         sigma = np.sqrt((found[kept] ** 2).sum() / freedom)
-        agreed = found <= max(tolerance, NORMAL_LIMIT[axes] * (given or sigma))
+        agreed = found <= max(points.tolerance, NORMAL_LIMIT[axes] * (given or sigma))
         if (agreed == kept).all():
             break
         kept = agreed
@@ -181,16 +168,8 @@ def _is_significant(offsets: np.ndarray, target: np.ndarray, count: int) -> bool
     return bool(share < LARGEST_RMS**2 and chance * math.comb(count, kept) < LARGEST_CHANCE)
 
 
-def _result(
-    fit: Fitter,
-    source: np.ndarray,
-    target: np.ndarray,
-    kept: np.ndarray,
-    accuracy: Accuracy | None,
-    exact: bool,
-    upright: bool,
-) -> ControlFit:
-    source, target, count = source[kept], target[kept], int(kept.sum())
+def _result(fit: Fitter, points: Correspondences, kept: np.ndarray, exact: bool, upright: bool) -> ControlFit:
+    source, target, count = points.source[kept], points.target[kept], int(kept.sum())
     similarity = fit(source, target)
     apart = None
     if count > MIN_POINTS:
@@ -200,7 +179,7 @@ def _result(
             for row, keep in enumerate(rest)
         ]
         apart = np.linalg.norm(np.array(offsets)[:, : 2 if upright else 3], axis=1)
-    found = accuracy or estimate_accuracy(similarity.apply(source) - target)
+    found = points.accuracy or estimate_accuracy(similarity.apply(source) - target)
     return ControlFit(similarity, kept, found, exact, upright, apart)
 
 
@@ -275,22 +254,15 @@ def _moved(fit: Similarity, step: np.ndarray, middle: np.ndarray) -> Similarity:
     )
 
 
-def _refusal(
-    source: np.ndarray,
-    target: np.ndarray,
-    up: np.ndarray,
-    tolerance: float,
-    accuracy: Accuracy | None,
-    level: bool,
-    names: list[str],
-) -> str:
+def _refusal(points: Correspondences, names: list[str]) -> str:
     """Why nothing fits, as far as it can be told."""
-    exchanged = target[:, [1, 0, 2]]
+    exchanged = replace(points, target=points.target[:, [1, 0, 2]])
     for try_fit in (_exact, _loose):
-        found = try_fit(source, exchanged, up, tolerance, accuracy, level)
-        if found is not None and found.similarity.rotation[2] @ up > 0:
+        found = try_fit(exchanged)
+        if found is not None and found.similarity.rotation[2] @ points.up > 0:
             return "the ground control points do not fit the model, but would with x and y exchanged: the order is x y (east, north)"
-    offsets = np.linalg.norm(fit_similarity(source, target).apply(source) - target, axis=1)
+    missed = fit_similarity(points.source, points.target).apply(points.source) - points.target
+    offsets = np.linalg.norm(missed, axis=1)
     worst = ", ".join(f"{names[row]} {offsets[row]:.1f} m" for row in np.argsort(-offsets)[:5])
     return (
         f"the ground control points do not fit the model: all {len(names)} together miss it by {worst}; check the CRS, "

@@ -13,7 +13,13 @@ import pycolmap
 
 from sc3d.errors import InputError, examples
 from sc3d.georeferencing.alignment import Similarity, camera_up, upside_down
-from sc3d.georeferencing.control_fit import MIN_POINTS, Accuracy, ControlFit, fit_control_points
+from sc3d.georeferencing.control_fit import (
+    MIN_POINTS,
+    Accuracy,
+    ControlFit,
+    Correspondences,
+    fit_control_points,
+)
 from sc3d.georeferencing.gcp_list import is_title, parse_crs, parse_mark, read_lines
 from sc3d.georeferencing.georeference import crs_to_geodetic, geodetic_to_enu
 from sc3d.io.colmap import cam_from_world, registered_images
@@ -301,12 +307,14 @@ def match_control_points(
     rotations = np.array([cam_from_world(image)[:3, :3] for image in registered_images(model)])
     heights = points.geodetic[rows, 2]
     fit = fit_control_points(
-        source,
-        target[rows],
-        camera_up(rotations),
-        MAX_ERROR * _distance(model, source, target[rows]),
-        accuracy,
-        bool(np.ptp(heights) < SAME_HEIGHT),
+        Correspondences(
+            source,
+            target[rows],
+            camera_up(rotations),
+            MAX_ERROR * _distance(model, source, target[rows]),
+            accuracy,
+            bool(np.ptp(heights) < SAME_HEIGHT),
+        ),
         [points.names[row] for row in rows],
     )
     if upside_down(rotations, fit.similarity):

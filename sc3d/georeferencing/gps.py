@@ -200,14 +200,13 @@ def agree(flight: Flight, centers: dict[str, np.ndarray]) -> Flight | None:
     source = np.array([centers[name] for name in names])
     target = np.array([flight.positions[name] for name in names])
     fit, kept = fit_similarity_robust(source, target, _tolerance(flight, names))
-    if kept.sum() < max(MIN_GPS, len(names) / 2):
+    exchanged = 0.0 if kept.all() else _share_exchanged(flight, names, source)
+    if kept.sum() < max(MIN_GPS, len(names) / 2) or exchanged > kept.mean():
         logger.warning(
             "GPS of %d of %d registered photos does not fit the cameras, it is not used%s",
             len(names) - kept.sum(),
             len(names),
-            ": with latitude and longitude exchanged it would fit"
-            if _exchanged(flight, names, source)
-            else "",
+            ": with latitude and longitude exchanged it would fit" if exchanged > 0.5 else "",
         )
         return None
     if kept.all() and not flight.astray:
@@ -237,13 +236,13 @@ def _tolerance(flight: Flight, names: list[str]) -> float:
     return float(max(OUTLIER * np.median([flight.tags[name].sigma for name in names]), OUTLIER_METERS))
 
 
-def _exchanged(flight: Flight, names: list[str], source: np.ndarray) -> bool:
-    """Whether latitudes and longitudes, exchanged, fit camera centers (N, 3)."""
+def _share_exchanged(flight: Flight, names: list[str], source: np.ndarray) -> float:
+    """Share of the photos whose latitude and longitude, exchanged, fit camera centers (N, 3)."""
     geodetic = np.array([flight.tags[name].geodetic for name in names])[:, [1, 0, 2]]
     if np.abs(geodetic[:, 0]).max() > 90:
-        return False
+        return 0.0
     target = geodetic_to_enu(geodetic, triple(geodetic[0]))
-    return bool(fit_similarity_robust(source, target, _tolerance(flight, names))[1].mean() > 0.5)
+    return float(fit_similarity_robust(source, target, _tolerance(flight, names))[1].mean())
 
 
 def place(flight: Flight, centers: dict[str, np.ndarray], points: np.ndarray) -> Similarity | None:

@@ -276,6 +276,12 @@ class TestLists:
         np.testing.assert_allclose(np.ptp(placed[:, :2], axis=0), 10, atol=0.35)
         np.testing.assert_allclose(points.geodetic[:, 2], 300.125)
 
+    @pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "cp1252"])
+    def test_encodings(self, tmp_path, encoding):
+        path = self.write(tmp_path / "gcp_list.txt", LINES["tabs"])
+        path.write_bytes(("EPSG:32615\n# Höhe\n" + path.read_text().partition("\n")[2]).encode(encoding))
+        assert len(read_control_points(path, self.PHOTOS).names) == 4
+
     def test_photos_in_other_case(self, tmp_path):
         path = self.write(tmp_path / "gcp_list.txt", LINES["tabs"], change="upper")
         assert list(read_control_points(path, self.PHOTOS).observations[0]) == self.PHOTOS
