@@ -131,7 +131,8 @@ def usage() -> str:
     """The list of commands."""
     lines = ["usage: sc3d COMMAND ...   (sc3d COMMAND --help shows the options)", ""]
     records = {"reconstruct": COMMANDS["reconstruct"]} | STAGES | COMMANDS
-    lines += [f"  {name:12s}{_describe(record).splitlines()[0]}" for name, record in records.items()]
+    width = max(map(len, records)) + 2
+    lines += [f"  {name:{width}s}{_describe(record).splitlines()[0]}" for name, record in records.items()]
     return "\n".join(lines) + "\n"
 
 

@@ -105,11 +105,11 @@ def surface_from_depth(
     depth: index to (H, W) float32 depth that others confirm, 0 = none, of the view's size
     points: (N, 3) sparse points, for the size of the scene; voxel_size: world units, 0 = as for `extract_surface`
     """
-    footprints = [
-        float(np.median(known)) / view.focal
-        for row, view in enumerate(data.views)
-        if len(known := depth(row)[depth(row) > 0])
-    ]
+    footprints = []
+    for row, view in enumerate(data.views):
+        found = depth(row)
+        if (found > 0).any():
+            footprints.append(float(np.median(found[found > 0])) / view.focal)
     if not footprints:
         raise Sc3dError("no depth is confirmed by other photos: more overlap is needed, or lower --min-views")
     voxel_size = voxel_size or _default_voxel_size(points, float(np.median(footprints)))

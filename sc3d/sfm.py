@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from tqdm import tqdm
 
-from sc3d.errors import InputError, Sc3dError
+from sc3d.errors import InputError, Sc3dError, left_out
 from sc3d.georeferencing.gps import Flight, read_flight
 from sc3d.io.atomic import require_room, telling_of_full_disk, temporary_name
 from sc3d.io.colmap import registered_images, write_model
@@ -55,13 +55,8 @@ def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) 
             reasons = _reasons(database, names, model, parts)
         write_model(output, model)
     if reasons:
-        logger.warning(
-            "%d of %d photos could not be registered: %s",
-            len(reasons),
-            len(names),
-            "; ".join(f"{name} ({why})" for name, why in list(reasons.items())[:3])
-            + (f" and {len(reasons) - 3} more" if len(reasons) > 3 else ""),
-        )
+        unregistered = [f"{name} ({why})" for name, why in reasons.items()]
+        logger.warning(left_out(unregistered, len(names), "photos could not be registered"))
     return {"photos": len(names), "registered": model.num_reg_images(), "left_out": reasons}
 
 

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import sc3d.stages.label  # noqa: F401 - loaded before a test gives up its rights
-from sc3d.cli import main, parse
+from sc3d.cli import main, parse, usage
 from sc3d.commands import COMMANDS, STAGES
 from sc3d.commands.renamed import current
 from tests.builders import write_bare_scene
@@ -57,6 +57,12 @@ def test_help_answers_in_under_a_second(name):
         if spent[-1] < 1:
             break
     assert min(spent) < 1
+
+
+def test_names_of_commands_stand_apart_from_what_they_do():
+    for line in usage().splitlines()[2:]:
+        name = line.split()[0]
+        assert name in STAGES | COMMANDS and line[2 + len(name)] == " "
 
 
 def test_usage_and_unknown_command(capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -40,16 +41,25 @@ def write_depth_map(path: Path, depth_map: DepthMap) -> None:
         np.savez(file, depth=depth_map.depth, normals=depth_map.normals, num_views=depth_map.num_views)
 
 
+def depth_map_size(path: Path) -> int:
+    """Longest side, px, which `cameras.undistorted` takes; errors as in `read_depth_map`."""
+    return max(_read(path, "num_views")[0].shape)
+
+
 def read_depth_map(path: Path) -> DepthMap:
     """InputError if the file is missing, damaged or not what `sc3d depth` writes."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            found = DepthMap(*(file[name] for name in ("depth", "normals", "num_views")))
-    except FileNotFoundError:
-        raise InputError(f"{path} is missing: run `sc3d depth` first") from None
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise InputError(f"{path} is damaged ({error}): run `sc3d depth --overwrite`") from None
+    found = DepthMap(*_read(path, "depth", "normals", "num_views"))
     shape = found.depth.shape
     if len(shape) != 2 or found.normals.shape != (*shape, 3) or found.num_views.shape != shape:
         raise InputError(f"{path} is no depth map of `sc3d depth`: run it with --overwrite")
     return found
+
+
+def _read(path: Path, *names: str) -> list[np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return [file[name] for name in names]
+    except FileNotFoundError:
+        raise InputError(f"{path} is missing: run `sc3d depth` first") from None
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise InputError(f"{path} is damaged ({error}): run `sc3d depth --overwrite`") from None

@@ -10,10 +10,10 @@ import open3d as o3d
 
 from sc3d.errors import InputError, left_out
 from sc3d.extraction import DepthViews, Surfaces, center_cloud, extract_surface, surface_from_depth
-from sc3d.geometry.cameras import View, in_image, local_origin, project, resample, undistorted
+from sc3d.geometry.cameras import in_image, local_origin, project, resample, undistorted
 from sc3d.geometry.view_selection import neighbor_views
 from sc3d.io.clouds import write_geometry
-from sc3d.scene.depth_map import depth_file, read_depth_map
+from sc3d.scene.depth_map import depth_file, depth_map_size, read_depth_map
 from sc3d.scene.scene import Scene, SparseModel, check_photos, require_views
 from sc3d.settings.reconstruction import Extract
 from sc3d.splatting.dataset import load_gaussians
@@ -66,7 +66,10 @@ def _from_depth(scene: Scene, settings: Extract) -> dict[str, object]:
         missing = sorted({view.name for view in model.views} - {view.name for view in photo_views})
         logger.warning(left_out(missing, len(model.views), "photos have no depth map"))
     check_photos(scene, [view.name for view in photo_views])
-    views = [undistorted(view.shifted(origin), _size(scene, view)) for view in photo_views]
+    views = [
+        undistorted(view.shifted(origin), depth_map_size(depth_file(scene.depth, view.name)))
+        for view in photo_views
+    ]
 
     def image(row: int) -> np.ndarray:
         view = photo_views[row]
@@ -78,10 +81,6 @@ def _from_depth(scene: Scene, settings: Extract) -> dict[str, object]:
     data = DepthViews(views, image, [], _depth_range(model, model.points), lambda row: None)
     surfaces = surface_from_depth(data, depth, model.points - origin, settings.voxel_size)
     return _written(scene, surfaces, origin)
-
-
-def _size(scene: Scene, view: View) -> int:
-    return max(read_depth_map(depth_file(scene.depth, view.name)).depth.shape)
 
 
 def _written(scene: Scene, surfaces: Surfaces, origin: np.ndarray) -> dict[str, object]:

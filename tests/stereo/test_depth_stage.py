@@ -13,7 +13,7 @@ import pytest
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import resample, undistorted
 from sc3d.runner import execute
-from sc3d.scene.depth_map import depth_file, read_depth_map
+from sc3d.scene.depth_map import DepthMap, depth_file, depth_map_size, read_depth_map, write_depth_map
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Depth, Extract
 from sc3d.settings.synthesize import Synthesize
@@ -115,8 +115,12 @@ def test_what_is_missing_or_damaged_is_said(site, tmp_path):
     with pytest.raises(InputError, match="sc3d depth"):
         execute("extract", scene, Extract(method="depth"))
     file = tmp_path / "a.npz"
-    file.write_bytes(b"nothing")
-    with pytest.raises(InputError, match="damaged"):
-        read_depth_map(file)
+    write_depth_map(file, DepthMap(*(np.ones(shape, np.uint8) for shape in ((9, 9), (9, 9, 3), (9, 9)))))
+    whole = file.read_bytes()
+    for content in (b"nothing", whole[:200], whole[:-50], b""):
+        file.write_bytes(content)
+        for read in (read_depth_map, depth_map_size):
+            with pytest.raises(InputError, match="damaged"):
+                read(file)
     with pytest.raises(InputError, match="at least 32"):
         Depth(max_size=3)
