@@ -111,10 +111,13 @@ def _patch(gray, row, column, weights, values):
 
 
 @numba.njit(cache=True, fastmath=True, inline="always")
-def _dissimilarity(flat, start, stride, width, height, A, B, s, x, y, q, a, b, weights, values, variance):
+def _dissimilarity(stereo, flat, s, x, y, q, a, b, weights, values, variance):
     """1 - NCC of a reference patch and its image in source s; WORST where it lies outside. x, y: the pixel's
-    center; flat: all sources; start, stride: of source s in it
+    center; flat: all sources, one after another
     """
+    A, B, width, height = stereo.A, stereo.B, stereo.sizes[s, 0], stereo.sizes[s, 1]
+    stride = np.int32(stereo.sources.shape[2])
+    start = np.int32(s * stereo.sources.shape[1] * stereo.sources.shape[2])
     w = A[s, 2, 0] * x + A[s, 2, 1] * y + A[s, 2, 2] + B[s, 2] * q
     if w <= np.float32(1e-6):
         return np.float32(WORST)
@@ -158,18 +161,18 @@ def _dissimilarity(flat, start, stride, width, height, A, B, s, x, y, q, a, b, w
 
 
 @numba.njit(cache=True, fastmath=True, inline="always")
-def _contradiction(others, width, height, A, B, back_A, back_B, s, x, y, q):
+def _contradiction(stereo, s, x, y, q):
     """Cost of a depth that the own map of source s contradicts: by how far the pixel lands from itself, there and
     back.
     """
     worst = np.float32(AGREEMENT * CONTRADICTION)
-    u, v, w = moved(A, B, s, x, y, q)
-    if not (u >= 0 and v >= 0 and u < width and v < height):
+    u, v, w = moved(stereo.A, stereo.B, s, x, y, q)
+    if not (u >= 0 and v >= 0 and u < stereo.sizes[s, 0] and v < stereo.sizes[s, 1]):
         return worst
-    found = others[s, np.uintp(v), np.uintp(u)]
+    found = stereo.others[s, np.uintp(v), np.uintp(u)]
     if found <= 0:
         return worst
-    u, v, w = moved(back_A, back_B, s, u, v, found)
+    u, v, w = moved(stereo.back_A, stereo.back_B, s, u, v, found)
     if w <= np.float32(1e-6):
         return worst
     gap = np.sqrt((u - x) * (u - x) + (v - y) * (v - y))
@@ -181,19 +184,12 @@ def _cost(stereo, flat, row, column, q, a, b, weights, values, variance):
     """Mean cost of the BEST sources for one plane; WORST counts for sources that do not see it."""
     best, next_best = np.float32(WORST), np.float32(WORST)
     x, y = np.float32(column + 0.5), np.float32(row + 0.5)
-    stride, size = stereo.sources.shape[2], stereo.sources.shape[1] * stereo.sources.shape[2]
     for s in range(len(stereo.sizes)):
-        width, height = stereo.sizes[s, 0], stereo.sizes[s, 1]
         cost = np.float32(0)
         if stereo.others.shape[1]:
-            cost = _contradiction(
-                stereo.others, width, height, stereo.A, stereo.B, stereo.back_A, stereo.back_B, s, x, y, q
-            )
+            cost = _contradiction(stereo, s, x, y, q)
         if cost < next_best:
-            cost += _dissimilarity(
-                flat, np.int32(s * size), np.int32(stride), width, height, stereo.A, stereo.B, s,
-                x, y, q, a, b, weights, values, variance,
-            )  # fmt: skip
+            cost += _dissimilarity(stereo, flat, s, x, y, q, a, b, weights, values, variance)
         if cost < best:
             next_best = best
             best = cost
