@@ -64,6 +64,17 @@ class Surface:
         vertices, triangles = surfels(points - origin, normals)
         return cls(cls.from_mesh(vertices, triangles, np.zeros(3)).scene, np.asarray(origin, np.float64))
 
+    def triangles(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W) int64 triangle that each pixel hits first, -1 = none, and (H, W, 2) float32 barycentric u, v."""
+        directions = camera_rays(view.camera)
+        bundle = np.empty((len(directions), 6), np.float32)
+        _aim(directions, view.cam_from_world, (view.center - self.origin).astype(np.float32), bundle)
+        hit = self.scene.cast_rays(o3d.core.Tensor.from_numpy(bundle))
+        numbers = hit["primitive_ids"].numpy()
+        rows = np.where(numbers == self.scene.INVALID_ID, -1, numbers.astype(np.int64))
+        shape = view.height, view.width
+        return rows.reshape(shape), hit["primitive_uvs"].numpy().reshape(*shape, 2)
+
     def cast(self, view: View, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `RayTarget.cast`."""
         count = len(directions)

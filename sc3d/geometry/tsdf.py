@@ -7,10 +7,11 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 
-from sc3d.geometry.cameras import View, rays
+from sc3d.geometry.cameras import View
 
 BLOCK = 8
 TRUNCATION = 4.0  # voxels
+SLANTED = 1.5  # largest ratio of depths within the quadrilateral of a pixel
 CPU = o3d.core.Device("CPU:0")
 
 Part = tuple[o3d.t.geometry.TriangleMesh, o3d.t.geometry.PointCloud]  # a surface, as mesh and as cloud
@@ -112,35 +113,49 @@ def mesh_in_order(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleM
     return sorted_mesh
 
 
-def pixel_squares(view: View, depth: np.ndarray, color: np.ndarray, wanted: np.ndarray) -> Part:
-    """The surface that a single depth map shows, where nothing better is known: a square as large as the
-    pixel, facing the camera.
+def pixel_squares(
+    view: View, depth: np.ndarray, color: np.ndarray, wanted: np.ndarray, normals: np.ndarray | None = None
+) -> Part:
+    """The surface that a single depth map shows, where nothing better is known: a quadrilateral over each pixel.
 
-    Squares, not a connected sheet: between leaves, a sheet would hang in the air along the view's rays and
-    hide things from other views.
+    Quadrilaterals, not a connected sheet: between leaves, a sheet would hang in the air along the view's rays and
+    hide things from other views. They overlap a little, so that other views do not look between them.
 
     view: pinhole; depth: (H, W) z, world units, 0 = none; color: (H, W, 3) uint8; wanted: (H, W) bool
-    returns: mesh with vertex colors and normals, and cloud of the squares' centers with colors uint8 and
-        normals; both may be empty
+    normals: (H, W, 3) any numbers, of any length, camera frame, of the surface in which each lies; 0 or None: it
+        faces the camera
+    returns: mesh with vertex colors and normals, and cloud of the middles with colors uint8 and normals; both may
+        be empty
     """
     rows, columns = np.nonzero(wanted & (depth > 0))
-    z = depth[rows, columns].astype(np.float64)
-    right, down, forward = view.cam_from_world[:3, :3]
-    directions, ray_z = rays(view, np.stack([columns + 0.5, rows + 0.5], axis=1))
-    points = view.center + directions * (z / ray_z)[:, None]
-    # more than half a pixel: neighbors overlap, seen from elsewhere too
-    half = (0.75 * z / view.focal)[:, None]
-    corners = [points + half * (u * right + v * down) for u, v in ((-1, -1), (-1, 1), (1, 1), (1, -1))]
+    z, rotation = depth[rows, columns].astype(np.float64)[:, None], view.cam_from_world[:3, :3]
+    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1)
+    corners = pixels[:, None] + 0.75 * np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]])
+    inverse = np.linalg.inv(view.matrix).T
+    rays_cam, corners_cam = pixels @ inverse, corners @ inverse
+    facing = np.array([0.0, 0.0, -1.0])
+    n = np.tile(facing, (len(rows), 1)) if normals is None else normals[rows, columns].astype(np.float64)
+    length = np.linalg.norm(n, axis=1, keepdims=True)
+    n = np.where(length > 0, n / np.maximum(length, 1e-12), facing)
+    across = np.einsum("pk,pck->pc", n, corners_cam)
+    ratio = (n * rays_cam).sum(axis=1, keepdims=True) / np.where(across < -1e-9, across, -1e-9)
+    ratio = np.clip(ratio, 1 / SLANTED, SLANTED)
+    start = view.cam_from_world[:3, 3]
+    points = (rays_cam * z - start) @ rotation
+    vertices = (corners_cam * (ratio * z)[..., None] - start) @ rotation
     base = 4 * np.arange(len(points))[:, None]
     triangles = np.concatenate([base + [[0, 1, 2]], base + [[0, 2, 3]]], axis=1).reshape(-1, 3)
-    vertices = np.stack(corners, axis=1).reshape(-1, 3).astype(np.float32)
-    mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles.astype(np.int32)))
-    mesh.vertex.normals = o3d.core.Tensor(np.tile(-forward.astype(np.float32), (len(vertices), 1)))
+    normal = (n @ rotation).astype(np.float32)
+    mesh = o3d.t.geometry.TriangleMesh(
+        o3d.core.Tensor(vertices.reshape(-1, 3).astype(np.float32)),
+        o3d.core.Tensor(triangles.astype(np.int32)),
+    )
+    mesh.vertex.normals = o3d.core.Tensor(np.repeat(normal, 4, axis=0))
     mesh.vertex.colors = o3d.core.Tensor(
         np.repeat(color[rows, columns].astype(np.float32) / np.float32(255), 4, axis=0)
     )
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points.astype(np.float32)))
-    cloud.point.normals = o3d.core.Tensor(np.tile(-forward.astype(np.float32), (len(points), 1)))
+    cloud.point.normals = o3d.core.Tensor(normal)
     cloud.point.colors = o3d.core.Tensor(color[rows, columns])
     return mesh, cloud
 

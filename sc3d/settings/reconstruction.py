@@ -11,6 +11,8 @@ from tyro.conf import Positional, Suppress, arg
 from sc3d.errors import InputError
 from sc3d.settings.common import Workers
 
+Fill = Literal["nothing", "continued", "occluders"]
+
 
 @dataclass(frozen=True)
 class Mapping:
@@ -111,10 +113,10 @@ class Extract:
     """TSDF voxel, world units; 0 = 1.5 times the median ground sampling distance, at least box / 2048."""
     min_views: int = 1
     """Neighbor views that must confirm a depth (within 1 px)."""
-    coverage: float | None = None
-    """Holes of the confirmed surface are filled with the depth of single views, the surer first, until this
-    share of all pixels hits a surface: labels need one. 0 = leave holes; None = 1 where all photos look the
-    same way (straight down), 0.97 otherwise, as oblique photos see the floaters that it costs.
+    fill: Fill = "occluders"
+    """What is added to the confirmed surface, which labels need: nothing; continued: what only one photo shows, where
+    it continues confirmed surface; occluders: also what stands before it, or before the sky of others, seen by one
+    photo (leaves before the camera), at the farthest depth that no other photo looks through.
     """
     min_opacity: float = 0.3
     """Smallest opacity of a Gaussian whose center becomes a point (centers)."""

@@ -110,12 +110,14 @@ def depth_map(gaussians: Gaussians, view: View) -> tuple[np.ndarray, np.ndarray,
     return torch.where(present, depth, 0).cpu().numpy(), rendering.alpha.cpu().numpy(), normals.cpu().numpy()
 
 
-def facing_depth(gaussians: Gaussians, view: View, max_angle: float) -> np.ndarray:
-    """(H, W) float32 depth of `depth_map`, 0 where ray and normal are more than `max_angle` degrees apart."""
+def facing_depth(gaussians: Gaussians, view: View, max_angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) float32 depth of `depth_map`, 0 where ray and normal are more than `max_angle` degrees apart, and
+    (H, W, 3) its normals.
+    """
     depth, _, normals_cam = depth_map(gaussians, view)
     rays_cam = torch.nn.functional.normalize(pixel_rays(view), dim=2).numpy()
     facing = -(normals_cam * rays_cam).sum(axis=2) > np.cos(np.deg2rad(max_angle))
-    return np.where(facing, depth, 0).astype(np.float32)
+    return np.where(facing, depth, 0).astype(np.float32), normals_cam
 
 
 def _as_uint8(image: torch.Tensor) -> np.ndarray:

@@ -35,13 +35,25 @@ def run(scene: Scene, settings: Depth) -> dict[str, object]:
         folder.mkdir()
         shares = estimate_depths(replace(job, output=folder), tasks)
     work.remove()
-    one, two = np.mean(shares, axis=0)
+    one, two, known, sky = np.mean(shares, axis=0)
     return {
         "photos": len(job.views),
         **({"left_out": left_out} if left_out else {}),
         "size": f"{job.views[0].width}x{job.views[0].height}",
         "confirmed": f"{one:.1%} of the pixels by another view, {two:.1%} by two",
+        "continued": f"{known - one:.1%} of the pixels",
+        "sky": f"{sky:.1%} of the pixels",
     }
+
+
+def level_up(views):
+    rows = np.array([view.cam_from_world[0, :3] for view in views])
+    _, size, axes = np.linalg.svd(rows)
+    up = -np.mean([view.cam_from_world[1, :3] for view in views], axis=0)
+    if size[1] < 0.2 * size[0] or np.linalg.norm(up) < 0.5:
+        up = -np.mean([view.cam_from_world[2, :3] for view in views], axis=0)
+        return up / np.linalg.norm(up)
+    return axes[2] * np.sign(axes[2] @ up)
 
 
 def _job(scene: Scene, settings: Depth, work: WorkFolder) -> tuple[StereoJob, list[str]]:
@@ -58,19 +70,21 @@ def _job(scene: Scene, settings: Depth, work: WorkFolder) -> tuple[StereoJob, li
         )
     photo_views = [model.views[row] for row in kept]
     used = [seed for seed in seeds if seed is not None]
+    centers = np.array([view.center for view in photo_views])
+    sources = neighbor_views([model.tracks[row] for row in kept], model.points, centers, settings.num_sources)
+    baselines = [
+        float(np.median(np.linalg.norm(centers[others] - center, axis=1)))
+        for center, others in zip(centers, sources, strict=True)
+    ]
     job = StereoJob(
         scene.path.absolute(),
         photo_views,
         [undistorted(view, settings.max_size) for view in photo_views],
-        neighbor_views(
-            [model.tracks[row] for row in kept],
-            model.points,
-            np.array([view.center for view in photo_views]),
-            settings.num_sources,
-        ),
-        [inverse_range(seed) for seed in used],
+        sources,
+        [inverse_range(seed, baseline) for seed, baseline in zip(used, baselines, strict=True)],
         used,
         settings.max_size,
+        level_up(photo_views),
         work.subfolder("passes"),
         scene.depth,
     )

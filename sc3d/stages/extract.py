@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import logging
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError, left_out
-from sc3d.extraction import DepthViews, Surfaces, center_cloud, extract_surface, surface_from_depth
-from sc3d.geometry.cameras import in_image, local_origin, project, resample, undistorted
+from sc3d.extraction.centers import center_cloud
+from sc3d.extraction.evidence import DepthViews, EvidenceStore, ViewEvidence
+from sc3d.extraction.fusion import NUM_OTHERS, Surfaces, default_voxel_size, fuse_views
+from sc3d.extraction.rendered import write_rendered
+from sc3d.geometry.cameras import View, in_image, local_origin, project, resample, undistorted
 from sc3d.geometry.view_selection import neighbor_views
+from sc3d.io.atomic import require_room, temporary_name
 from sc3d.io.clouds import write_geometry
-from sc3d.scene.depth_map import depth_file, depth_map_size, read_depth_map
+from sc3d.scene.depth_map import DepthMap, depth_file, depth_map_size, read_depth_map
 from sc3d.scene.scene import Scene, SparseModel, check_photos, require_views
 from sc3d.settings.reconstruction import Extract
 from sc3d.splatting.dataset import load_gaussians
@@ -22,7 +27,10 @@ logger = logging.getLogger(__name__)
 
 
 def inputs(scene: Scene, settings: Extract) -> list[Path]:
-    return [scene.depth if settings.method == "depth" else scene.gaussians, scene.sparse, scene.images]
+    if settings.method == "depth":
+        return [scene.depth, scene.sparse, scene.images]
+    stereo = [scene.depth] if settings.method == "tsdf" and scene.depth.exists() else []
+    return [scene.gaussians, scene.sparse, scene.images, *stereo]
 
 
 def outputs(scene: Scene, settings: Extract) -> list[Path]:
@@ -30,33 +38,43 @@ def outputs(scene: Scene, settings: Extract) -> list[Path]:
 
 
 def run(scene: Scene, settings: Extract) -> dict[str, object]:
-    if settings.method == "depth":
-        return _from_depth(scene, settings)
-    gaussians, origin = load_gaussians(scene)
-    model = scene.model
-    centers = np.array([view.center for view in model.views])
     if settings.method == "centers":
+        gaussians, origin = load_gaussians(scene)
+        centers = np.array([view.center for view in scene.model.views])
         cloud = center_cloud(gaussians, centers - origin, settings.min_opacity)
         write_geometry(scene.cloud, _placed(cloud, origin))
         return {"points": len(cloud.point.positions)}
     require_views(scene)
-    check_photos(scene, [view.name for view in model.views])
-    views = [undistorted(view.shifted(origin), settings.max_size) for view in model.views]
-
-    def image(row: int) -> np.ndarray:
-        return resample(scene.read_photo(model.views[row].name), model.views[row].shifted(origin), views[row])
-
-    def opaque(row: int) -> np.ndarray | None:
-        return scene.opaque_pixels(model.views[row].shifted(origin), views[row])
-
-    means = gaussians.means.detach().numpy() + origin
-    neighbors = neighbor_views(model.tracks, model.points, centers)
-    data = DepthViews(views, image, neighbors, _depth_range(model, means), opaque)
-    return _written(scene, extract_surface(gaussians, data, settings), origin)
+    with tempfile.TemporaryDirectory(prefix=temporary_name("sc3d-depth")) as folder:
+        store = EvidenceStore(Path(folder))
+        surfaces, origin = (_from_depth if settings.method == "depth" else _from_gaussians)(
+            scene, settings, store
+        )
+    write_geometry(scene.mesh, _placed(surfaces.mesh, origin))
+    write_geometry(scene.cloud, _placed(surfaces.cloud, origin))
+    return _figures(surfaces)
 
 
-def _from_depth(scene: Scene, settings: Extract) -> dict[str, object]:
-    """Mesh and cloud of the maps of `sc3d depth`."""
+def _from_gaussians(scene: Scene, settings: Extract, store: EvidenceStore) -> tuple[Surfaces, np.ndarray]:
+    """Surface of the Gaussians, after what the maps of `sc3d depth` confirm, and the world position of its origin."""
+    gaussians, origin = load_gaussians(scene)
+    check_photos(scene, [view.name for view in scene.model.views])
+    points = gaussians.means.detach().numpy()
+    data = _views(
+        scene, scene.model.views, origin, [settings.max_size] * len(scene.model.views), points + origin
+    )
+    _require_room(data)
+    if scene.depth.exists():
+        maps = _Maps(scene, data.views)
+        for row in range(len(data.views)):
+            store.write(row, maps.evidence(row, settings.min_views))
+    footprint = write_rendered(gaussians, data, store, settings.min_views)
+    voxel_size = settings.voxel_size or default_voxel_size(points, footprint)
+    return fuse_views(data, store, voxel_size, settings.fill), origin
+
+
+def _from_depth(scene: Scene, settings: Extract, store: EvidenceStore) -> tuple[Surfaces, np.ndarray]:
+    """Surface of the maps of `sc3d depth`, and the world position of its origin."""
     scene.require(scene.depth, hint="run `sc3d depth` first")
     model, origin = scene.model, local_origin(scene.model.views)
     photo_views = [view for view in model.views if depth_file(scene.depth, view.name).exists()]
@@ -66,33 +84,73 @@ def _from_depth(scene: Scene, settings: Extract) -> dict[str, object]:
         missing = sorted({view.name for view in model.views} - {view.name for view in photo_views})
         logger.warning(left_out(missing, len(model.views), "photos have no depth map"))
     check_photos(scene, [view.name for view in photo_views])
-    views = [
-        undistorted(view.shifted(origin), depth_map_size(depth_file(scene.depth, view.name)))
-        for view in photo_views
-    ]
+    sizes = [depth_map_size(depth_file(scene.depth, view.name)) for view in photo_views]
+    data = _views(scene, photo_views, origin, sizes, model.points)
+    _require_room(data)
+    maps, footprints = _Maps(scene, data.views), []
+    for row, view in enumerate(data.views):
+        store.write(row, maps.evidence(row, settings.min_views))
+        found = store.read(row, "confirmed")
+        if (found > 0).any():
+            footprints.append(float(np.median(found[found > 0])) / view.focal)
+    voxel_size = settings.voxel_size or default_voxel_size(
+        model.points, float(np.median(footprints)) if footprints else 1.0
+    )
+    return fuse_views(data, store, voxel_size, settings.fill), origin
+
+
+def _views(
+    scene: Scene, photo_views: list[View], origin: np.ndarray, sizes: list[int], means: np.ndarray
+) -> DepthViews:
+    """The views around a local origin, undistorted, each with its longest side; means: as in `_depth_range`."""
+    model, local = scene.model, [view.shifted(origin) for view in photo_views]
+    views = [undistorted(view, size) for view, size in zip(local, sizes, strict=True)]
+    tracks = {view.name: track for view, track in zip(model.views, model.tracks, strict=True)}
+    neighbors = neighbor_views(
+        [tracks[view.name] for view in photo_views],
+        model.points,
+        np.array([view.center for view in photo_views]),
+        NUM_OTHERS,
+    )
 
     def image(row: int) -> np.ndarray:
-        view = photo_views[row]
-        return resample(scene.read_photo(view.name), view.shifted(origin), views[row])
+        return resample(scene.read_photo(photo_views[row].name), local[row], views[row])
 
-    def depth(row: int) -> np.ndarray:
-        return read_depth_map(depth_file(scene.depth, views[row].name)).confirmed(settings.min_views)
+    def opaque(row: int) -> np.ndarray | None:
+        return scene.opaque_pixels(local[row], views[row])
 
-    data = DepthViews(views, image, [], _depth_range(model, model.points), lambda row: None)
-    surfaces = surface_from_depth(data, depth, model.points - origin, settings.voxel_size)
-    return _written(scene, surfaces, origin)
+    return DepthViews(views, image, neighbors, _depth_range(model, means), opaque)
 
 
-def _written(scene: Scene, surfaces: Surfaces, origin: np.ndarray) -> dict[str, object]:
-    """Write mesh and cloud; returns the figures."""
-    write_geometry(scene.mesh, _placed(surfaces.mesh, origin))
-    write_geometry(scene.cloud, _placed(surfaces.cloud, origin))
+class _Maps:
+    """The depth maps of a scene at the size of views; of a photo without one, nothing is known."""
+
+    def __init__(self, scene: Scene, views: list[View]) -> None:
+        self.scene, self.views = scene, views
+
+    def evidence(self, row: int, min_views: int) -> ViewEvidence:
+        view, file = self.views[row], depth_file(self.scene.depth, self.views[row].name)
+        shape = view.height, view.width
+        found = read_depth_map(file).resized(shape) if file.exists() else DepthMap.nothing(shape)
+        return ViewEvidence(found.confirmed(min_views), found.continued, found.normals, found.sky)
+
+
+def _require_room(data: DepthViews) -> None:
+    """Four maps of 4 bytes and 4 bytes of colors and sky per pixel."""
+    size = 20 * sum(view.width * view.height for view in data.views)
+    require_room(Path(tempfile.gettempdir()) / "depth", size)
+
+
+def _figures(surfaces: Surfaces) -> dict[str, object]:
+    """What is said of a surface."""
+    shares = {
+        name: getattr(surfaces, name) for name in ("confirmed", "continued", "occluders", "sky", "coverage")
+    }
     return {
         "points": len(surfaces.cloud.point.positions),
         "triangles": len(surfaces.mesh.triangle.indices),
         "voxel_size": round(surfaces.voxel_size, 5),
-        "confirmed": f"{surfaces.confirmed:.1%} of the pixels",
-        "coverage": f"{surfaces.coverage:.1%} of the pixels",
+        **{name: f"{share:.1%} of the pixels" for name, share in shares.items()},
     }
 
 

@@ -18,13 +18,14 @@ def count_agreements(
     """(H, W) uint8: how many other views land back within TOLERANCE px of a pixel, at the same depth within
     RELATIVE.
 
-    inverse: (H, W) float32 inverse depths of `view`, 0 = none; others: those of the other views, any sizes
+    inverse: (H, W) float32 inverse depths of `view`, 0 = none; others: (h, w, 3+) float32 planes q, a, b of the
+        other views, any sizes: between pixel centers a plane goes on, which matters on ground at grazing angles
     """
     counts = np.zeros(inverse.shape, np.uint8)
     if others:
         forth = transfers([view] * len(others), other_views)
         back = transfers(other_views, [view] * len(others))
-        sizes = np.array([other.shape[::-1] for other in others], np.int64)
+        sizes = np.array([(other.shape[1], other.shape[0]) for other in others], np.int64)
         _count(inverse, stacked(others), sizes, *forth, *back, counts)
     return counts
 
@@ -41,6 +42,20 @@ def moved(A, B, s, x, y, q):
     return u, v, w
 
 
+@numba.njit(cache=True, inline="always")
+def continued(planes, s, u, v):
+    """Inverse depth at (u, v) of the plane of the pixel there in view s, 0 = none; planes: (S, h, w, 3)."""
+    row, column = np.uintp(v), np.uintp(u)
+    q = planes[s, row, column, 0]
+    if q <= 0:
+        return np.float32(0)
+    return (
+        q
+        + planes[s, row, column, 1] * (u - np.float32(column) - np.float32(0.5))
+        + planes[s, row, column, 2] * (v - np.float32(row) - np.float32(0.5))
+    )
+
+
 @numba.njit(cache=True, parallel=True)
 def _count(inverse, others, sizes, A, B, back_A, back_B, counts):
     height, width = inverse.shape
@@ -53,7 +68,7 @@ def _count(inverse, others, sizes, A, B, back_A, back_B, counts):
                 u, v, w = moved(A, B, s, x, y, q)
                 if not (u >= 0 and v >= 0 and u < sizes[s, 0] and v < sizes[s, 1]):
                     continue
-                found = others[s, int(v), int(u)]
+                found = continued(others, s, u, v)
                 if found <= 0 or abs(found * w / q - 1) > RELATIVE:
                     continue
                 u, v, w = moved(back_A, back_B, s, u, v, found)

@@ -23,15 +23,28 @@ from sc3d.io.images import write_image
 from sc3d.scene.depth_map import DepthMap, depth_file, write_depth_map
 from sc3d.scene.scene import Scene
 from sc3d.stereo.agreement import count_agreements
+from sc3d.stereo.completion import (
+    Ground,
+    continued_planes,
+    find_sky,
+    fit_ground,
+    horizon,
+    not_below,
+    without_speckles,
+)
 from sc3d.stereo.patch_match import Stereo, evaluate, sweep
 from sc3d.stereo.pinhole_pairs import GrayView, smaller, stacked, transfers
 from sc3d.tiling.executor import Executor
 
 COARSEST = 200  # px, longest side of the first level is below twice that
-NEAREST, FARTHEST = 0.35, 10.0  # of the depths of the sparse points that a view sees: 1st and 99th percentile
+NEAR, FARTHEST = 0.35, 10.0  # of the depths of the sparse points that a view sees: 1st and 99th percentile
+NEAREST = 0.7  # of the median distance to the sources: closer, their patches are too different
+BEYOND = 20.0  # times nearer than NEAR, however close the photos stand
 MIN_SPARSE = 8
 CELL = 8  # px, side of the cells that start at the depth of the nearest sparse point
 MAX_COST = 0.6  # 1 - NCC; more is no match, whatever depths agree
+SURE = 2  # other views that must confirm what goes on
+GROUND_POINTS = 10_000  # per view, below its horizon
 REACH = 5  # px, from how far a pixel takes planes
 AROUND = 8  # sparse points through which a plane is laid
 BEGIN = (0.4, 0.3, 0.3)  # shares of pixels that start on such a plane, at the nearest sparse point, anywhere
@@ -71,18 +84,20 @@ class StereoJob:
     scene: folder; photo_views: cameras of its photos, by whose names they are found
     views: the same, undistorted
     sources: per view, rows of those it is compared with
-    ranges: per view, farthest and nearest inverse depth; seeds: per view, (n, 3) column, row and inverse depth of
+    ranges: per view, farthest, usual nearest and nearest inverse depth; seeds: per view, (n, 3) column, row and inverse depth of
         the sparse points that it sees
-    longest: side of the maps, px; work: folder of what passes leave; output: folder of the depth maps
+    longest: side of the maps, px; up: (3,) unit, world
+    work: folder of what passes leave; output: folder of the depth maps
     """
 
     scene: Path
     photo_views: list[View]
     views: list[View]
     sources: list[np.ndarray]
-    ranges: list[tuple[float, float]]
+    ranges: list[tuple[float, float, float]]
     seeds: list[np.ndarray]
     longest: int
+    up: np.ndarray
     work: Path
     output: Path
 
@@ -93,6 +108,10 @@ class StereoJob:
     def gray_file(self, row: int) -> Path:
         """The gray photo, (H, W) uint8, of the size of its view."""
         return self.work / f"gray-{row}.npy"
+
+    def checked_file(self, row: int) -> Path:
+        """(H, W) uint8, how many sources confirm a pixel of the last pass."""
+        return self.work / f"checked-{row}.npy"
 
     def gray(self, row: int) -> GrayView:
         return GrayView(self.views[row], np.load(self.gray_file(row)).astype(np.float32) / np.float32(255))
@@ -113,23 +132,26 @@ def sparse_seeds(view: View, points: np.ndarray) -> np.ndarray | None:
     return np.column_stack([pixels[usable], 1 / depths[usable]])
 
 
-def inverse_range(seeds: np.ndarray) -> tuple[float, float]:
-    """Farthest and nearest inverse depth to look at."""
-    far, near = np.quantile(seeds[:, 2], [0.01, 0.99])
-    return float(far / FARTHEST), float(near / NEAREST)
-
-
-def estimate_depths(job: StereoJob, tasks: Executor) -> list[tuple[float, float]]:
-    """Write the depth map of every view; returns per view the shares of its pixels that one and that two other
-    views confirm.
+def inverse_range(seeds: np.ndarray, baseline: float) -> tuple[float, float, float]:
+    """Farthest inverse depth to look at; nearest around the (n, 3) seeds; nearest at all: leaves and ground before
+    the camera are nearer than what has sparse points. baseline: median distance to the sources, world units
     """
+    far, near = np.quantile(seeds[:, 2], [0.01, 0.99]) / [FARTHEST, NEAR]
+    nearest = min(1 / (NEAREST * baseline), BEYOND * near) if baseline > 0 else near
+    return float(far), float(near), float(max(near, nearest))
+
+
+def estimate_depths(job: StereoJob, tasks: Executor) -> list[tuple[float, float, float, float]]:
+    """Write the depth map of every view; returns per view what `finish_view` does."""
     rows = range(len(job.views))
     tasks.run("photos", partial(write_gray, job), rows)
     for number, each in enumerate(passes(job.longest)):
         tasks.run(f"{each.size} px", partial(run_pass, job, number), rows)
         for row in rows if number >= 2 else ():
             job.file(number - 2, row).unlink(missing_ok=True)
-    return tasks.run("confirming", partial(finish_view, job), rows)
+    points = tasks.run("confirming", partial(check_view, job), rows)
+    ground = fit_ground(np.concatenate(points), np.array([view.center for view in job.views]), job.up)
+    return tasks.run("completing", partial(finish_view, job, ground), rows)
 
 
 def write_gray(job: StereoJob, row: int) -> None:
@@ -184,20 +206,19 @@ def _problem(job: StereoJob, number: int, row: int, geometric: bool) -> Stereo:
         job.gray(source).at(max(view.width, view.height)).gray
         for source, view in zip(job.sources[row], views, strict=True)
     ]
-    others = np.zeros((len(views), 0, 0), np.float32)
+    others = np.zeros((len(views), 0, 0, 3), np.float32)
     if geometric:
         before = [np.load(job.file(number - 1, source))[..., :3] for source in job.sources[row]]
-        others = stacked(
-            [upsampled(planes, gray.shape)[..., 0] for planes, gray in zip(before, grays, strict=True)]
-        )
-    far, near = job.ranges[row]
+        others = stacked([upsampled(planes, gray.shape) for planes, gray in zip(before, grays, strict=True)])
+    far, near, nearest = job.ranges[row]
     return Stereo(
         np.ascontiguousarray(job.gray(row).at(max(own.width, own.height)).gray),
         stacked(grays),
         np.array([gray.shape[::-1] for gray in grays], np.int64),
         *transfers([own] * len(views), views),
         np.float32(far),
-        np.float32(near),
+        np.float32(nearest),
+        np.float32(near - far),
         others,
         *transfers(views, [own] * len(views)),
     )
@@ -215,7 +236,10 @@ def _start(stereo: Stereo, seeds: np.ndarray) -> np.ndarray:
     x, y = np.meshgrid(np.arange(width) % CELL + 0.5 - CELL / 2, np.arange(height) % CELL + 0.5 - CELL / 2)
     fitted[..., 0] += fitted[..., 1] * x + fitted[..., 2] * y
     anywhere = np.zeros_like(fitted)
-    anywhere[..., 0] = random.uniform(stereo.farthest, stereo.nearest, (height, width))
+    usual = random.random((height, width)) < 0.5
+    anywhere[..., 0] = stereo.farthest + random.random((height, width)) * np.where(
+        usual, stereo.span, stereo.nearest - stereo.farthest
+    )
     choice = random.choice(3, (height, width, 1), p=BEGIN)
     planes = np.choose(choice, [fitted, nearest, anywhere]).astype(np.float32)
     np.clip(planes[..., 0], stereo.farthest, stereo.nearest, planes[..., 0])
@@ -258,10 +282,11 @@ def upsampled(planes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return finer
 
 
-def finish_view(job: StereoJob, row: int) -> tuple[float, float]:
-    """Check a view against its sources and write its depth map.
+def check_view(job: StereoJob, row: int) -> np.ndarray:
+    """Count the sources that confirm a view's depths; returns (n, 3) some of the confirmed points, world.
 
-    Views can also agree on chance, as they have looked at each other's maps, so the photos must agree too.
+    Views can also agree on chance, as they have looked at each other's maps, so the photos must agree too, and
+    a surface must be larger than a speckle.
     """
     last = len(passes(job.longest)) - 1
     planes, view, sources = np.load(job.file(last, row)), job.view(last, row), job.sources[row]
@@ -269,20 +294,53 @@ def finish_view(job: StereoJob, row: int) -> tuple[float, float]:
     counts = count_agreements(
         inverse,
         view,
-        [np.load(job.file(last, source))[..., 0] for source in sources],
+        [np.load(job.file(last, source))[..., :3] for source in sources],
         [job.view(last, source) for source in sources],
     )
     costs = np.empty(inverse.shape, np.float32)
     evaluate(_problem(job, last, row, geometric=False), planes, costs)
-    counts[costs > MAX_COST] = 0
     opaque = Scene(job.scene).opaque_pixels(job.photo_views[row], view)
-    if opaque is not None:
-        counts[~opaque], inverse[~opaque] = 0, 0
-    file = depth_file(job.output, view.name)
+    counts[(costs > MAX_COST) | (False if opaque is None else ~opaque)] = 0
+    counts[~without_speckles(inverse, counts >= 1)] = 0
+    counts[(counts > 1) & ~without_speckles(inverse, counts > 1)] = 1
+    save(job.checked_file(row), counts)
+    rows, columns = np.nonzero((counts >= min(SURE, len(sources))) & (horizon(view, job.up) < 0))
+    chosen = np.random.default_rng(row).permutation(len(rows))[:GROUND_POINTS]
+    rows, columns = rows[chosen], columns[chosen]
+    rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1) @ np.linalg.inv(view.matrix).T
+    points = rays / inverse[rows, columns, None]
+    return (points - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
+
+
+def finish_view(job: StereoJob, ground: Ground | None, row: int) -> tuple[float, float, float, float]:
+    """Complete a view and write its depth map; returns the shares of its pixels that one and that two other views
+    confirm, that have a depth, and of sky.
+    """
+    last = len(passes(job.longest)) - 1
+    planes, view, counts = np.load(job.file(last, row)), job.view(last, row), np.load(job.checked_file(row))
+    scene, photo_view = Scene(job.scene), job.photo_views[row]
+    image, opaque = (
+        resample(scene.read_photo(view.name), photo_view, view),
+        scene.opaque_pixels(photo_view, view),
+    )
+    if ground is not None:
+        counts[~not_below(view, planes, counts >= 1, ground)] = 0
+    sky = find_sky(image, counts >= 1, horizon(view, job.up))
+    counts[sky] = 0
+    sure = counts >= min(SURE, len(job.sources[row]))
+    complete = continued_planes(view, planes, sure, image, ground)
+    complete[counts >= 1] = planes[counts >= 1, :3]
+    complete[sky if opaque is None else sky | ~opaque] = 0
+    inverse, file = complete[..., 0], depth_file(job.output, view.name)
     depth = np.where(inverse > 0, 1 / np.maximum(inverse, 1e-30), 0).astype(np.float32)
-    write_depth_map(file, DepthMap(depth, plane_normals(view, planes), counts))
-    write_image(file.with_suffix(".png"), preview(np.where(counts > 0, inverse, 0)))
-    return float((counts >= 1).mean()), float((counts >= 2).mean())
+    write_depth_map(file, DepthMap(depth, plane_normals(view, complete), counts, sky))
+    write_image(file.with_suffix(".png"), preview(inverse))
+    return (
+        float((counts >= 1).mean()),
+        float((counts >= 2).mean()),
+        float((depth > 0).mean()),
+        float(sky.mean()),
+    )
 
 
 def plane_normals(view: View, planes: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from sc3d.stereo.agreement import moved
+from sc3d.stereo.agreement import continued, moved
 
 RADIUS = 4  # px, of the patch
 STEP = 2  # every second pixel of it
@@ -43,8 +43,8 @@ class Stereo(NamedTuple):
 
     gray: (H, W) float32, 0 to 1; sources: (S, h, w) float32, filled up with 0; sizes: (S, 2) width, height px
     A: (S, 3, 3), B: (S, 3) float32 of `pinhole_pairs.transfer`
-    farthest, nearest: inverse depths allowed, farthest <= q <= nearest
-    others: (S, h, w) float32 inverse depths that the sources have found, 0 = none; without any (S, 0, 0)
+    farthest, nearest: inverse depths allowed, farthest <= q <= nearest; span: of which random changes are a share
+    others: (S, h, w, 3) float32 planes that the sources have found, q = 0: none; without any (S, 0, 0, 3)
     back_A, back_B: A and B from each source to the reference
     """
 
@@ -55,6 +55,7 @@ class Stereo(NamedTuple):
     B: np.ndarray
     farthest: float
     nearest: float
+    span: float
     others: np.ndarray
     back_A: np.ndarray
     back_B: np.ndarray
@@ -169,7 +170,7 @@ def _contradiction(stereo, s, x, y, q):
     u, v, w = moved(stereo.A, stereo.B, s, x, y, q)
     if not (u >= 0 and v >= 0 and u < stereo.sizes[s, 0] and v < stereo.sizes[s, 1]):
         return worst
-    found = stereo.others[s, np.uintp(v), np.uintp(u)]
+    found = continued(stereo.others, s, u, v)
     if found <= 0:
         return worst
     u, v, w = moved(stereo.back_A, stereo.back_B, s, u, v, found)
@@ -235,7 +236,7 @@ def sweep(stereo, planes, costs, color, round_number, spread, tilt, num_trials, 
 
     planes: (H, W, 3) float32 q, a, b, changed in place; costs: (H, W) float32
     color: 0 or 1; round_number: seeds the random numbers
-    spread: largest change of q, share of the range; tilt: largest change of a and b, share of q
+    spread: largest change of q, share of the span; tilt: largest change of a and b, share of q
     num_trials: random changes tried per pixel; reach: how far the planes come from, px
     """
     height, width = stereo.gray.shape
@@ -259,9 +260,7 @@ def sweep(stereo, planes, costs, color, round_number, spread, tilt, num_trials, 
                         continue
                 else:
                     state = _hash(state)
-                    tq = q + (_uniform(state) * 2 - 1) * amplitude * np.float32(
-                        stereo.nearest - stereo.farthest
-                    )
+                    tq = q + (_uniform(state) * 2 - 1) * amplitude * np.float32(stereo.span)
                     slope = np.float32(tilt) * amplitude / np.float32(spread) * q
                     state = _hash(state)
                     ta = a + (_uniform(state) * 2 - 1) * slope

@@ -51,9 +51,9 @@ def transfers(views: list[View], others: list[View]) -> tuple[np.ndarray, np.nda
 
 
 def stacked(images: list[np.ndarray]) -> np.ndarray:
-    """(S, h, w) float32 of images of any sizes, filled up with 0."""
+    """(S, h, w, ...) float32 of images of any sizes, filled up with 0."""
     height, width = max(len(image) for image in images), max(image.shape[1] for image in images)
-    stack = np.zeros((len(images), height, width), np.float32)
+    stack = np.zeros((len(images), height, width, *images[0].shape[2:]), np.float32)
     for row, image in enumerate(images):
         stack[row, : len(image), : image.shape[1]] = image
     return stack

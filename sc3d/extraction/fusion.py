@@ -1,0 +1,245 @@
+"""Depth of all views, with what is known of it, to mesh and cloud."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import open3d as o3d
+from tqdm import tqdm
+
+from sc3d.errors import Sc3dError, left_out
+from sc3d.extraction.evidence import DepthViews, EvidenceStore
+from sc3d.extraction.free_space import MARGIN, count_opposed, farthest_free
+from sc3d.geometry.cameras import View
+from sc3d.geometry.raycast import Surface, first_surface
+from sc3d.geometry.tsdf import DepthFusion, Part, cloud_in_order, drop_small_parts, near_mesh, pixel_squares
+from sc3d.settings.reconstruction import Fill
+from sc3d.stereo.completion import nearest_by_color
+
+MIN_PART = 100  # triangles; smaller components are floaters
+ROUNDS = 4  # of completion, each with every fourth view
+NUM_OTHERS = 12  # views asked whether they look through a point
+NEAREST = 0.1  # of the nearest usual depth: occluders are nearer
+UNLIKE = 0.98  # quantile of the color differences on confirmed surface; more is something else
+BESIDE = 0.1  # of the longest side
+OCCLUDER = 2e-3  # of the pixels, smallest region that is taken for one
+
+FILLS: tuple[Fill, ...] = ("nothing", "continued", "occluders")
+Filled = tuple[np.ndarray, np.ndarray | None]  # (H, W) float32 depth, 0 = none; (H, W, 3) normals or None
+Step = Callable[[DepthViews, EvidenceStore, int, np.ndarray], Filled]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """mesh, cloud: in the views' local world; voxel_size: world units.
+
+    Shares of all pixels. confirmed: depth confirmed by other views; continued: added as it continues confirmed
+    surface; occluders: added before it at the farthest depth that no other view looks through; sky; coverage:
+    ray hits the mesh
+    """
+
+    mesh: o3d.t.geometry.TriangleMesh
+    cloud: o3d.t.geometry.PointCloud
+    voxel_size: float
+    confirmed: float
+    continued: float
+    occluders: float
+    sky: float
+    coverage: float
+
+
+def fuse_views(data: DepthViews, store: EvidenceStore, voxel_size: float, fill: Fill) -> Surfaces:
+    """Fuse what is confirmed, then add what only one view shows, as far as `fill` allows.
+
+    voxel_size: world units. Raises Sc3dError where nothing is confirmed.
+    """
+    fusion, confirmed = _fused(data, store, voxel_size)
+    parts = [_part(fusion)]
+    _see(data, store, parts[0][0])
+    shares = {"continued": 0.0, "occluders": 0.0}
+    steps = {"continued": _continued, "occluders": _occluding}
+    for name in list(steps)[: FILLS.index(fill)]:
+        for turn in range(min(ROUNDS, len(data.views))):
+            surface = _surface(_joined(parts)[0])
+            for row in range(turn, len(data.views), ROUNDS):
+                part, share = _added(data, store, surface, row, steps[name], voxel_size)
+                parts.append(part)
+                shares[name] += share / len(data.views)
+    mesh, cloud = _joined(parts)
+    sky = float(np.mean([store.read(row, "sky").mean() for row in range(len(data.views))]))
+    return Surfaces(
+        mesh, cloud, voxel_size, confirmed, **shares, sky=sky, coverage=_coverage(mesh, data.views)
+    )
+
+
+def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[DepthFusion, float]:
+    """The field of all confirmed depth, and its share of all pixels."""
+    fusion, num_known, empty = DepthFusion(voxel_size), 0, list[str]()
+    for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
+        known = store.read(row, "confirmed")
+        if not (known > 0).any():
+            empty.append(view.name)
+            continue
+        fusion.integrate(view, known, data.image(row), data.depth_range[1])
+        num_known += int((known > 0).sum())
+    if not num_known:
+        raise Sc3dError(
+            "no depth is confirmed by other photos: more overlap is needed, or longer training, or --min-views 1"
+        )
+    if empty:
+        logger.warning(left_out(empty, len(data.views), "photos show no confirmed surface and are not fused"))
+    return fusion, num_known / sum(view.width * view.height for view in data.views)
+
+
+def _part(fusion: DepthFusion) -> Part:
+    """Mesh and cloud of a field, without floaters."""
+    whole, cloud = fusion.mesh(), fusion.cloud()
+    mesh = drop_small_parts(whole, MIN_PART)
+    total = len(whole.triangle.indices)
+    if dropped := total - len(mesh.triangle.indices):
+        logger.info(
+            "%d of %d triangles are left out: in loose parts of fewer than %d", dropped, total, MIN_PART
+        )
+    if not len(mesh.triangle.indices):
+        return mesh, cloud.select_by_index(o3d.core.Tensor(np.empty(0, np.int64)))
+    return mesh, cloud.select_by_mask(
+        o3d.core.Tensor(near_mesh(cloud.point.positions.numpy(), mesh, 0.5 * fusion.voxel_size))
+    )
+
+
+def _see(data: DepthViews, store: EvidenceStore, mesh: o3d.t.geometry.TriangleMesh) -> None:
+    """Keep what every view knows behind a point: the mesh, or sky (inf), 0 = nothing; and the mesh's colors."""
+    surface = _surface(mesh)
+    for row, view in enumerate(data.views):
+        first = first_surface(surface, view)
+        hit = np.isfinite(first.range)
+        known = np.where(hit, first.range * first.ray_z, np.where(store.read(row, "sky"), np.inf, 0))
+        store.save(row, "known", known.astype(np.float32))
+        store.save(row, "colors", _shown_colors(surface, mesh, view))
+
+
+def _shown_colors(surface: Surface, mesh: o3d.t.geometry.TriangleMesh, view: View) -> np.ndarray:
+    """(H, W, 3) uint8 colors of the mesh in a view, 0 where nothing is hit."""
+    rows, uv = surface.triangles(view)
+    corners = mesh.triangle.indices.numpy()[rows]
+    weights = np.concatenate([1 - uv.sum(axis=2, keepdims=True), uv], axis=2)[..., None]
+    colors = (mesh.vertex.colors.numpy()[corners] * weights).sum(axis=2)
+    return np.where(rows[..., None] >= 0, np.clip(colors * 255, 0, 255), 0).astype(np.uint8)
+
+
+def _others(data: DepthViews, store: EvidenceStore, row: int) -> tuple[list[np.ndarray], list[View]]:
+    rows = data.neighbors[row][:NUM_OTHERS]
+    return [store.read(other, "known") for other in rows], [data.views[other] for other in rows]
+
+
+def _added(
+    data: DepthViews, store: EvidenceStore, surface: Surface, row: int, step: Step, voxel_size: float
+) -> tuple[Part, float]:
+    """Squares where a view has a depth by `step` and sees nothing of the surface there; their share of its pixels.
+
+    Each view's own: where views disagree, as in tree crowns, their average would be no surface at all.
+    """
+    view = data.views[row]
+    first = first_surface(surface, view)
+    hit = np.where(np.isfinite(first.range), first.range * first.ray_z, np.inf).astype(np.float32)
+    depth, normals = step(data, store, row, hit)
+    wanted = (depth > 0) & (depth < (1 - MARGIN) * hit)
+    squares, centers = pixel_squares(view, depth, data.image(row), wanted, normals)
+    if len(centers.point.positions):
+        centers = cloud_in_order(centers.voxel_down_sample(voxel_size))
+    return (squares, centers), float(wanted.mean())
+
+
+def _continued(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray) -> Filled:
+    """Depth that continues confirmed surface and that no other view looks through; and confirmed depth whose
+    surface is too thin for the field: ground at grazing angles.
+    """
+    confirmed = store.read(row, "confirmed")
+    depth = np.where(confirmed > 0, confirmed, store.read(row, "continued"))
+    normals = store.read(row, "normals")
+    free = count_opposed(depth, normals, data.views[row], *_others(data, store, row)) == 0
+    return np.where(free, depth, 0), normals
+
+
+def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray) -> Filled:
+    """Depth of what stands before the surface, or where no surface and no sky is: as far as no other view looks
+    through it; where nothing bounds it, that of the most alike pixel nearby.
+    """
+    view, empty = data.views[row], ~np.isfinite(hit) & ~store.read(row, "sky")
+    opaque = data.opaque(row)
+    if opaque is not None:
+        empty &= opaque
+    known = store.read(row, "known")
+    covered = _unlike_surface(data, store, row, (known > 0) & (np.abs(known / hit - 1) < MARGIN))
+    far = np.where(covered, (1 - MARGIN) * hit, np.where(empty, data.depth_range[1], 0)).astype(np.float32)
+    others, nearest = _others(data, store, row), NEAREST * data.depth_range[0]
+    depth = farthest_free(far, nearest, view, *others)
+    depth = cv2.medianBlur(depth, 5)
+    depth = np.where(empty & (depth == 0), _spread(depth, data.image(row)), depth)
+    return farthest_free(depth, nearest, view, *others, bounded=True), None
+
+
+def _spread(depth: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """(H, W) depth of the pixel with a depth that is reached with the least change of color, up to BESIDE away."""
+    source = nearest_by_color(image, depth > 0)
+    rows, columns = np.divmod(source, depth.shape[1])
+    gap = np.hypot(np.arange(depth.shape[0])[:, None] - rows, np.arange(depth.shape[1]) - columns)
+    return np.where((source >= 0) & (gap < BESIDE * max(depth.shape)), depth.ravel()[source], 0)
+
+
+def _unlike_surface(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray) -> np.ndarray:
+    """(H, W) bool: regions in which the photo does not look like the surface behind: something is before it.
+
+    The measure is how the two differ where this view confirms the surface.
+    """
+    confirmed = (store.read(row, "confirmed") > 0) & hit
+    if not confirmed.any():
+        return np.zeros_like(hit)
+    photo, shown = data.image(row).astype(np.float32), store.read(row, "colors").astype(np.float32)
+    gap = np.abs(cv2.blur(photo, (9, 9)) - cv2.blur(shown, (9, 9))).max(axis=2)
+    unlike = hit & ~confirmed & (gap > np.quantile(gap[confirmed], UNLIKE))
+    _, labels, sizes, _ = cv2.connectedComponentsWithStats(unlike.astype(np.uint8))
+    large = sizes[:, cv2.CC_STAT_AREA] >= OCCLUDER * hit.size
+    large[0] = False
+    seeds = large[labels]
+    source = nearest_by_color(data.image(row), seeds | confirmed | ~hit)
+    return seeds.ravel()[source] & hit & ~confirmed
+
+
+def _joined(parts: list[Part]) -> Part:
+    meshes, clouds = zip(*parts, strict=True)
+    mesh = o3d.t.geometry.TriangleMesh()
+    starts = np.cumsum([0, *(len(each.vertex.positions) for each in meshes[:-1])])
+    for name in ("positions", "normals", "colors"):
+        mesh.vertex[name] = o3d.core.Tensor(np.concatenate([each.vertex[name].numpy() for each in meshes]))
+    mesh.triangle.indices = o3d.core.Tensor(
+        np.concatenate(
+            [each.triangle.indices.numpy() + start for each, start in zip(meshes, starts, strict=True)]
+        )
+    )
+    cloud = o3d.t.geometry.PointCloud()
+    for name in ("positions", "normals", "colors"):
+        cloud.point[name] = o3d.core.Tensor(np.concatenate([each.point[name].numpy() for each in clouds]))
+    return mesh, cloud
+
+
+def _coverage(mesh: o3d.t.geometry.TriangleMesh, views: list[View]) -> float:
+    """Share of the views' pixels whose ray hits the mesh."""
+    surface = _surface(mesh)
+    return float(np.mean([np.isfinite(first_surface(surface, view).range).mean() for view in views]))
+
+
+def _surface(mesh: o3d.t.geometry.TriangleMesh) -> Surface:
+    return Surface.from_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), np.zeros(3))
+
+
+def default_voxel_size(points: np.ndarray, footprint: float) -> float:
+    """1.5 times the size of a pixel on the surface, but at most 2048 voxels along the box of the (N, 3) points."""
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    return max(1.5 * footprint, float((high - low).max()) / 2048)
