@@ -15,9 +15,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 
 from sc3d.georeferencing.alignment import main_plane, subsets
 from sc3d.georeferencing.geotags import read_drone_xmp
+from sc3d.io.colmap import cam_from_world, registered_images
 from sc3d.io.images import read_orientation
 from sc3d.io.orientation import turned_points
 
@@ -30,14 +32,21 @@ SAME_WAY = 30.0  # optical axes that differ by less, on average, look the same w
 POINTED_DOWN = 3.0  # standard deviation of what is meant to look straight down
 GIMBAL = 1.0  # smallest standard deviation of stated angles
 UNSURE = 5.0  # beyond, planes in the points may turn up a little
+AGREED = 0.6  # of the photos agree on up, or what they say is worth nothing
 VAGUE = 20.0  # beyond, rows do not even tell level photos from those that look down
-LEVEL_PITCH, GROUND, WALL, WALK = 10.0, 5.0, 2.0, 5.0  # standard deviations: pitch of level photos, slopes, ...
+LEVEL_PITCH, GROUND, WALL, WALK = (
+    10.0,
+    5.0,
+    2.0,
+    5.0,
+)  # standard deviations: pitch of level photos, slopes, ...
 LOOKING_DOWN = 0.9  # cosine: photos that look along the vertical by more have no top
 NEAR = 15.0  # planes that lean by less may be ground
 GUESS = 45.0  # what a guess is worth
 LEVEL_PRIOR = 4  # photos that HELD_LEVEL counts as much as
 THIN = 0.01  # thickness of a plane, in distances of the points from the cameras
 MIN_SUPPORT = 0.2  # of the points in question lie on a plane that counts
+APART = 10.0  # witnesses that differ by more contradict one another
 MANY, TRIALS = 2000, 1500  # points at most, and triples of them, that planes are looked for in
 
 
@@ -74,29 +83,51 @@ class Poses:
         shown = np.stack([_shown_axes(each.orientation) for each in stated]) @ rotations[:, :2]
         up = [np.full(3, np.nan) if each.up is None else each.up for each in stated]
         return cls(
-            shown[:, 0], shown[:, 1], rotations[:, 2], centers, np.einsum("nij,ni->nj", rotations, np.stack(up))
+            shown[:, 0],
+            shown[:, 1],
+            rotations[:, 2],
+            centers,
+            np.einsum("nij,ni->nj", rotations, np.stack(up)),
         )
 
 
 @dataclass(frozen=True)
 class UpDirection:
     """up: (3,) unit, world; deviation: its standard deviation in the worst direction, degrees; how: it was
-    found, in words
+    found, in words; doubt: what speaks against it, in words
     """
 
     up: np.ndarray
     deviation: float
     how: str
+    doubt: str = ""
 
     @property
     def figures(self) -> dict[str, object]:
         """What a stage reports."""
         return {"up_from": self.how, "up_deviation_deg": round(self.deviation, 1)}
 
+    def tell(self) -> None:
+        """One warning, where there is a doubt."""
+        if self.doubt:
+            logger.warning("%s", self.doubt)
+
 
 def read_stated(photos: Path, names: list[str]) -> list[Stated]:
     """What photos (names relative to the folder) say of their own; nothing of those that are not there."""
     return [_read(photos / name) if (photos / name).is_file() else Stated() for name in names]
+
+
+def model_poses(model: pycolmap.Reconstruction, images: Path | None) -> Poses:
+    """Those of the registered photos, by name. images: folder of the photos; None = it is not known, they lie
+    as stored
+    """
+    registered = registered_images(model)
+    return Poses.from_cameras(
+        np.array([cam_from_world(image)[:3, :3] for image in registered]),
+        np.array([image.projection_center() for image in registered]),
+        None if images is None else read_stated(images, [image.name for image in registered]),
+    )
 
 
 def _read(photo: Path) -> Stated:
@@ -116,38 +147,50 @@ def gimbal_up(pitch: float, roll: float) -> np.ndarray:
     return np.array([-np.cos(pitch) * np.sin(roll), -np.cos(pitch) * np.cos(roll), np.sin(pitch)])
 
 
-def find_up(poses: Poses, points: np.ndarray) -> UpDirection:
-    """Up, from the cameras; where they leave it unsure, planes in the sparse points (P, 3) help. Warns where
-    the witnesses disagree, or where up is little better than a guess.
-    """
-    rows, kind = _from_rows(poses), _from_kind(poses, points)
-    looking_down, gimbal = _from_view(poses, rows), _from_gimbal(poses)
-    cameras = [found for found in (looking_down, rows) if found is not None and found.deviation < VAGUE]
-    if gimbal is not None:
-        found = gimbal
-    elif cameras:
-        found = min(cameras, key=lambda each: each.deviation)
-    else:
-        found = kind
-    found = _refine(found, poses, points)
-    _warn(found, rows, gimbal)
+def settle_up(poses: Poses, points: np.ndarray) -> UpDirection:
+    """As `find_up`, for a model that is leveled by it: with a warning where there is a doubt."""
+    found = find_up(poses, points)
+    found.tell()
     return found
 
 
-def _warn(found: UpDirection, rows: UpDirection | None, gimbal: UpDirection | None) -> None:
-    """One line where the witnesses disagree, or where up is little better than a guess."""
+def find_up(poses: Poses, points: np.ndarray) -> UpDirection:
+    """Up, from the cameras; where they leave it unsure, planes in the sparse points (P, 3) help."""
+    rows, gimbal = _from_rows(poses), _from_gimbal(poses)
+    if gimbal is not None and gimbal.deviation < UNSURE:
+        found = gimbal
+    else:
+        found = _from_cameras(poses, rows, points)
+    found = _refine(found, poses, points)
+    return replace(found, doubt=found.doubt or _doubt(found, rows, gimbal))
+
+
+def _from_cameras(poses: Poses, rows: UpDirection | None, points: np.ndarray) -> UpDirection:
+    """The surest of what rows, viewing directions and positions say."""
+    walk = _from_walk(poses, points)
+    known = [each for each in (_from_view(poses, rows, walk), rows) if each is not None]
+    known = [each for each in known if each.deviation < VAGUE]
+    if walk is not None and known and min(each.deviation for each in known) > UNSURE:
+        known.append(walk)
+    return min(known, key=lambda each: each.deviation) if known else _from_kind(poses, walk, points)
+
+
+def _doubt(found: UpDirection, rows: UpDirection | None, gimbal: UpDirection | None) -> str:
+    if gimbal is not None and gimbal.deviation > UNSURE:
+        return f"gimbal angles in XMP do not fit the cameras, by about {gimbal.deviation:.0f} degrees: they are not used, up is from {found.how}"
     apart = 0.0 if rows is None else angle(found.up, rows.up)
-    if gimbal is not None and rows is not None and apart > max(10.0, 3 * rows.deviation):
-        logger.warning(
-            "up by the gimbal angles in XMP and up by the rows of the photos are %.0f degrees apart: the gimbal's is taken",
-            apart,
+    if rows is not None and apart > max(APART, 3 * rows.deviation):
+        return (
+            f"up from {found.how} and up from {rows.how} are {apart:.0f} degrees apart: the former is taken"
         )
-    elif found.deviation > 2 * UNSURE:
-        logger.warning(
-            "up is not sure, by about %.0f degrees (%s): control points or GPS would tell",
-            found.deviation,
-            found.how,
-        )
+    if found.deviation > 2 * UNSURE:
+        return f"up is not sure, by about {found.deviation:.0f} degrees: it is from {found.how}; control points or GPS would tell"
+    return ""
+
+
+def upside_down(poses: Poses, up: np.ndarray) -> bool:
+    """Whether `up` (3,) puts the cameras on their heads: looking up, photos with the ground on top."""
+    return bool(_upright(up, poses) @ up < 0)
 
 
 def angle(one: np.ndarray, other: np.ndarray) -> float:
@@ -166,29 +209,22 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _from_gimbal(poses: Poses) -> UpDirection | None:
-    """Up by the gimbal angles, if half of the photos state them and most of those agree."""
+    """Up by the gimbal angles, if half of the photos state them; a large deviation if they do not agree."""
     stated = poses.stated[np.isfinite(poses.stated).all(axis=1)]
     if len(stated) < max(3, len(poses.centers) / 2):
         return None
     up = _unit(np.median(stated, axis=0))
     off = np.degrees(np.arccos(np.clip(stated @ up, -1, 1)))
     near = off < OFF_LEVEL
-    if near.mean() < 0.7:
-        logger.warning(
-            "gimbal angles in XMP do not fit the cameras, by %.0f degrees in the middle: they are not used",
-            np.median(off),
-        )
-        return None
+    if near.mean() < AGREED:
+        return UpDirection(up, float(np.median(off)), "gimbal angles")
     spread = np.sqrt((off[near] ** 2).mean() / near.sum())
-    return UpDirection(
-        _unit(stated[near].mean(axis=0)),
-        float(np.hypot(GIMBAL, spread)),
-        f"gimbal angles of {near.sum()} photos",
-    )
+    how = f"gimbal angles of {near.sum()} photos"
+    return UpDirection(_unit(stated[near].mean(axis=0)), float(np.hypot(GIMBAL, spread)), how)
 
 
 def _from_rows(poses: Poses) -> UpDirection | None:
-    """Up across the rows of the photos; None if fewer than half of them agree on any."""
+    """Up across the rows of the photos; None if fewer than AGREED of them agree on any."""
     found = _across(poses.right, poses.down)
     around = np.linalg.norm(poses.forward.mean(axis=0)) < 0.6  # no camera pitches that far: it went around
     if around and (found is None or found.deviation > VAGUE):
@@ -213,7 +249,7 @@ def _upright(up: np.ndarray, poses: Poses) -> np.ndarray:
 
 def _across(level: np.ndarray, other: np.ndarray) -> UpDirection | None:
     """Direction across the `level` axes (N, 3) of most cameras, and across the `other` of the rest, which were
-    held on their sides; sign open. None if that holds for fewer than half of them.
+    held on their sides; sign open. None if that holds for fewer than AGREED of them.
     """
     num, limit = len(level), np.sin(np.radians(OFF_LEVEL))
     if num < 2:
@@ -229,7 +265,7 @@ def _across(level: np.ndarray, other: np.ndarray) -> UpDirection | None:
         aside = np.abs(level @ up) > limit
         axes = np.where((aside & (np.abs(other @ up) < limit))[:, None], other, level)
         kept = np.abs(axes @ up) < limit
-        if 2 * kept.sum() < num or kept.sum() < 2:
+        if kept.mean() < AGREED or kept.sum() < 2:
             return None
         up = np.linalg.svd(axes[kept])[2][2]
     return UpDirection(up, _deviation(axes[kept], up), _counted(kept, aside & kept))
@@ -252,9 +288,9 @@ def _deviation(axes: np.ndarray, up: np.ndarray) -> float:
     return float(min(error / max(spread, 1e-6), 90.0))
 
 
-def _from_view(poses: Poses, rows: UpDirection | None) -> UpDirection | None:
-    """Up against the mean viewing direction, if the photos look the same way and the rows do not say that this
-    is level; None otherwise, or if nothing tells the two apart.
+def _from_view(poses: Poses, rows: UpDirection | None, walk: UpDirection | None) -> UpDirection | None:
+    """Up against the mean viewing direction, if the photos look the same way and neither the rows nor the way
+    of the cameras says that this is level or oblique; None otherwise, or if nothing tells.
     """
     mean = poses.forward.mean(axis=0)
     alike = float(np.linalg.norm(mean))
@@ -265,6 +301,8 @@ def _from_view(poses: Poses, rows: UpDirection | None) -> UpDirection | None:
         known = True
     else:
         known = rows is not None and rows.deviation < VAGUE and angle(up, rows.up) < 45
+    if walk is not None and angle(up, walk.up) > max(APART, 2 * walk.deviation):
+        known = False
     spread = np.degrees(np.arccos(min(alike, 1.0)))
     found = UpDirection(up, float(np.hypot(POINTED_DOWN, spread / 2)), "the view of photos that look down")
     return found if known else None
@@ -275,7 +313,7 @@ def _all_headings(poses: Poses) -> bool:
     return bool(np.linalg.norm(poses.down.mean(axis=0)) < 0.5)
 
 
-def _from_kind(poses: Poses, points: np.ndarray) -> UpDirection:
+def _from_kind(poses: Poses, walk: UpDirection | None, points: np.ndarray) -> UpDirection:
     """Up where rows tell one direction at most: photos that look ahead, or down, by what their cameras and the
     ground below them are like.
     """
@@ -285,15 +323,20 @@ def _from_kind(poses: Poses, points: np.ndarray) -> UpDirection:
     ahead = UpDirection(-_unit(down), LEVEL_PITCH, "the tops of photos that look ahead")
     below = UpDirection(-_unit(forward), POINTED_DOWN, "the view of photos that look down")
     same_way = np.linalg.norm(forward) > np.cos(np.radians(SAME_WAY))
-    walked = _from_walk(poses, points)
-    if walked is None:
+    if walk is None:
         if _ground(poses, points, ahead.up) is not None:
             return ahead
-        return replace(below if same_way else ahead, deviation=VAGUE)
-    if angle(walked.up, below.up) < SAME_WAY and same_way:
+        if not same_way:
+            return replace(ahead, deviation=VAGUE)
+        return replace(
+            below,
+            deviation=VAGUE,
+            doubt="up is not sure: all photos look the same way, from one line, and nothing tells whether ahead or down. Down is taken; control points or GPS would tell",
+        )
+    if angle(walk.up, below.up) < NEAR and same_way:
         return below
-    near = angle(walked.up, ahead.up) < SAME_WAY and ahead.deviation < walked.deviation
-    return ahead if near else walked
+    near = angle(walk.up, ahead.up) < SAME_WAY and ahead.deviation < walk.deviation
+    return ahead if near else walk
 
 
 def _from_walk(poses: Poses, points: np.ndarray) -> UpDirection | None:
@@ -315,6 +358,8 @@ def _from_walk(poses: Poses, points: np.ndarray) -> UpDirection | None:
 
 def _guess(poses: Poses, points: np.ndarray) -> UpDirection:
     """The main plane of the points, cameras above it, as of a flight."""
+    if len(points) < 3:
+        return UpDirection(-_unit(poses.down.mean(axis=0)), GUESS, "the tops of the photos")
     axes, middle = main_plane(points)
     up = axes[2] if axes[2] @ (poses.centers.mean(axis=0) - middle) > 0 else -axes[2]
     return UpDirection(up, GUESS, "the main plane of the points: the cameras are not held level")
@@ -325,13 +370,16 @@ def _refine(found: UpDirection, poses: Poses, points: np.ndarray) -> UpDirection
     the cameras: as much as they are surer.
     """
     ahead = abs((poses.forward @ found.up).mean()) < 0.5
+    if found.deviation >= GUESS:
+        return found
     wall = _wall(poses, points, found) if ahead and found.deviation > WALL else None
     ground = _ground(poses, points, found.up) if found.deviation > UNSURE else None
     if wall is None and ground is None:
         return found
     known, words = [(np.eye(3) - np.outer(found.up, found.up), found.deviation)], [found.how]
-    side = np.linalg.svd(poses.right)[2][0]
-    if abs(side @ found.up) < np.sin(np.radians(NEAR)):
+    level = poses.right[np.abs(poses.right @ found.up) < np.sin(np.radians(OFF_LEVEL))]
+    if 2 * len(level) > len(poses.right):
+        side = np.linalg.svd(level)[2][0]
         known.append((np.outer(side, side), HELD_LEVEL))
     if ground is not None:
         known.append((np.eye(3) - np.outer(ground, ground), GROUND))
@@ -341,11 +389,13 @@ def _refine(found: UpDirection, poses: Poses, points: np.ndarray) -> UpDirection
         words.append("an upright wall")
     weights, axes = np.linalg.eigh(sum(part / deviation**2 for part, deviation in known))
     up = axes[:, 0] * np.sign(axes[:, 0] @ found.up)
-    return UpDirection(up, float(weights[1] ** -0.5), ", ".join(words))
+    return replace(found, up=up, deviation=float(weights[1] ** -0.5), how=", ".join(words))
 
 
 def _distance(poses: Poses, points: np.ndarray) -> float:
-    """Median distance of the points from the middle camera."""
+    """Median distance of the points from the middle camera; infinite without points."""
+    if not len(points):
+        return float("inf")
     return float(np.median(np.linalg.norm(points - np.median(poses.centers, axis=0), axis=1)))
 
 
