@@ -34,7 +34,7 @@ from sc3d.georeferencing.geotags import (
     enu_positions,
     read_geotags,
 )
-from sc3d.georeferencing.up_direction import Poses, read_stated, settle_up, upside_down
+from sc3d.georeferencing.up_direction import settle_up, upside_down, view_poses
 from sc3d.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -301,11 +301,7 @@ def georeference_photos(scene: Scene, epsg: int | None) -> Georeference:
         )
     flight = read_flight(scene.images, [view.name for view in views])
     centers = {view.name: view.center for view in views}
-    poses = Poses.from_cameras(
-        np.array([view.cam_from_world[:3, :3] for view in views]),
-        np.array([view.center for view in views]),
-        read_stated(scene.images, [view.name for view in views]),
-    )
+    poses = view_poses(views, scene.images)
     found = (
         find_georeference(flight, centers, lambda: settle_up(poses, scene.model.points).up, epsg)
         if flight

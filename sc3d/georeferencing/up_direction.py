@@ -17,11 +17,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from sc3d.geometry.cameras import View
 from sc3d.georeferencing.alignment import main_plane, subsets
 from sc3d.georeferencing.geotags import read_drone_xmp
 from sc3d.io.colmap import cam_from_world, registered_images
 from sc3d.io.images import read_orientation
 from sc3d.io.orientation import turned_points
+from sc3d.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
 
@@ -128,6 +130,25 @@ def model_poses(model: pycolmap.Reconstruction, images: Path | None) -> Poses:
         np.array([image.projection_center() for image in registered]),
         None if images is None else read_stated(images, [image.name for image in registered]),
     )
+
+
+def view_poses(views: list[View], images: Path) -> Poses:
+    """Those of views, in their order. images: folder of the photos"""
+    return Poses.from_cameras(
+        np.array([view.cam_from_world[:3, :3] for view in views]),
+        np.array([view.center for view in views]),
+        read_stated(images, [view.name for view in views]),
+    )
+
+
+def scene_up(scene: Scene) -> np.ndarray | None:
+    """(3,) up in the world of a scene, by its cameras, whatever frame it is in; None if it has none, or they do
+    not say.
+    """
+    if not scene.sparse.is_dir():
+        return None
+    found = find_up(view_poses(scene.model.views, scene.images), scene.model.points)
+    return found.up if found.deviation < VAGUE else None
 
 
 def _read(photo: Path) -> Stated:
