@@ -7,6 +7,12 @@ import pycolmap
 import pytest
 from PIL import Image
 
+from sc3d.geometry.cameras import pinhole_view
+from sc3d.georeferencing.alignment import fit_similarity
+from sc3d.georeferencing.georeference import enu_to_geodetic, triple
+from sc3d.georeferencing.geotags import Geotag
+from sc3d.georeferencing.gps import Flight, place
+from sc3d.georeferencing.placement import make_level
 from sc3d.georeferencing.up_direction import (
     Poses,
     Stated,
@@ -15,9 +21,14 @@ from sc3d.georeferencing.up_direction import (
     find_up,
     gimbal_up,
     read_stated,
+    scene_up,
+    settle_up,
     upside_down,
 )
-from sc3d.io.orientation import turned_points
+from sc3d.io.orientation import ORIENTATION, turned_points
+from sc3d.propagation.terrain import GroundModel, NormalStatistics
+from sc3d.scene.scene import Scene
+from tests.georeferencing.test_georeference import BRIGHTON, build_model
 
 FRAME = pycolmap.Rotation3d(np.array([0.4, -1.0, 0.7])).matrix()  # world of the model from the true one
 RNG = np.random.default_rng
@@ -164,7 +175,7 @@ class TestOrientation:
 
     def test_read_from_photos(self, tmp_path: Path):
         exif = Image.Exif()
-        exif[0x0112] = 6
+        exif[ORIENTATION] = 6
         Image.new("RGB", (40, 30)).save(tmp_path / "a.jpg", exif=exif)
         xmp = (
             '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GimbalPitchDegree="-30.0" '
@@ -230,3 +241,85 @@ class TestFlights:
             for points in (np.zeros((0, 3)), terrain()[:2], terrain()):
                 found, _ = found_up(cameras(np.arange(count) * 20.0, 5.0), grid()[:count], points)
                 assert np.isfinite(found.up).all() and found.deviation <= 90
+
+
+class TestModels:
+    @staticmethod
+    def model(tmp_path: Path, points: np.ndarray) -> pycolmap.Reconstruction:
+        """A turned model of portraits of a facade, and their photos, which say that they are turned."""
+        azimuths, centers = on_foot()
+        stored = as_stored(cameras(azimuths, 8.0, 0.5), [6] * 11)
+        views = []
+        for row, (rotation, center) in enumerate(zip(stored, centers, strict=True)):
+            cam_from_world = np.eye(4)
+            cam_from_world[:3, :3] = rotation @ FRAME.T
+            cam_from_world[:3, 3] = -rotation @ center
+            views.append(pinhole_view(f"{row:02d}.jpg", (80, 60), (60, 60, 40, 30), cam_from_world))
+            exif = Image.Exif()
+            exif[ORIENTATION] = 6
+            Image.new("RGB", (80, 60)).save(tmp_path / views[-1].name, exif=exif)
+        return build_model(views, points @ FRAME.T)
+
+    def test_make_level(self, tmp_path):
+        points = facade()
+        model = self.model(tmp_path, points)
+        figures = make_level(model, tmp_path)
+        assert figures["up_from"] == "rows of 11 of 11 photos, an upright wall"
+        assert 0 < figures["up_deviation_deg"] < 5
+        leveled = np.array([model.point3D(number).xyz for number in sorted(model.point3D_ids())])
+        turn = fit_similarity(points, leveled)
+        assert turn.scale == pytest.approx(1) and turn.rotation[2, 2] > np.cos(np.radians(2))
+        # x along the wall, the middle of the points at the origin
+        assert abs(turn.rotation[0, 0]) > 0.99
+        middle = np.median(points @ FRAME.T, axis=0) @ FRAME
+        np.testing.assert_allclose(turn.apply(middle[None]), 0, atol=1e-6)
+
+    def test_photos_of_people_that_walk_along_a_wall_with_gps(self):
+        """GPS along a line leaves the roll about it to the cameras; the main plane is the wall."""
+        line = np.column_stack([np.linspace(-14, 14, 11), np.zeros(11), np.full(11, 1.7)])
+        azimuths = np.degrees(np.arctan2(-line[:, 0], 20))
+        rotations, points = cameras(azimuths, 8.0, 0.5) @ FRAME.T, facade() @ FRAME.T
+        poses, centers = (
+            Poses.from_cameras(rotations, line @ FRAME.T),
+            dict(zip("abcdefghijk", line @ FRAME.T)),
+        )
+        tags = {name: Geotag(triple(row)) for name, row in zip(centers, enu_to_geodetic(line, BRIGHTON))}
+        flight = Flight(tags, "line", BRIGHTON)
+        fit = place(flight, centers, lambda: settle_up(poses, points).up)
+        assert (fit.rotation @ FRAME)[2, 2] > np.cos(np.radians(2))
+
+    def test_up_of_a_scene_in_any_frame(self, tmp_path):
+        scene = Scene(tmp_path / "scene")
+        assert scene_up(scene) is None
+        photos = tmp_path / "photos"
+        photos.mkdir()
+        model = self.model(photos, facade())
+        scene.sparse.mkdir(parents=True)
+        model.write(str(scene.sparse))
+        scene.images.symlink_to(photos)
+        assert angle(scene_up(scene), FRAME[:, 2]) < 2.0
+
+
+class TestGroundModel:
+    @staticmethod
+    def ground_model(share_of_wall: float, camera_up: np.ndarray | None) -> GroundModel:
+        normals = np.zeros((1000, 3), np.float32)
+        normals[: int(1000 * share_of_wall), 1] = -1
+        normals[int(1000 * share_of_wall) :] = [np.sin(0.2), 0, np.cos(0.2)]  # a slope
+        normals = normals @ FRAME.T.astype(np.float32)
+        corner = np.full(3, 10.0)
+        statistics = NormalStatistics.from_normals(normals, np.full(1000, 0.1, np.float32))
+        return GroundModel.from_statistics(statistics, -corner, corner, camera_up)
+
+    def test_before_a_facade_heights_count_along_the_cameras_up(self):
+        found = self.ground_model(0.7, FRAME[:, 2])
+        assert angle(found.up, FRAME[:, 2]) == pytest.approx(0, abs=1e-3)
+        axes = np.column_stack([found.up, found.axes])
+        np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-9)
+        assert angle(self.ground_model(0.7, None).up, -FRAME[:, 1]) < 1
+
+    def test_on_a_slope_they_count_across_it_as_before(self):
+        found, before = self.ground_model(0.2, FRAME[:, 2]), self.ground_model(0.2, None)
+        np.testing.assert_array_equal(found.up, before.up)
+        np.testing.assert_array_equal(found.axes, before.axes)
+        assert angle(found.up, FRAME[:, 2]) == pytest.approx(np.degrees(0.2), abs=0.1)
