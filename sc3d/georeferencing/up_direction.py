@@ -145,10 +145,30 @@ def scene_up(scene: Scene) -> np.ndarray | None:
     """(3,) up in the world of a scene, by its cameras, whatever frame it is in; None if it has none, or they do
     not say.
     """
+    found = _scene_direction(scene)
+    return None if found is None else found.up
+
+
+def tell_tilt(scene: Scene) -> None:
+    """One warning where z, which stands for up in a scene without a georeference, is not up by its cameras."""
+    found = _scene_direction(scene)
+    if found is None:
+        return
+    tilt = angle(found.up, np.array([0.0, 0.0, 1.0]))
+    if tilt > max(2 * APART, 3 * found.deviation):
+        logger.warning(
+            "z of %s is %.0f degrees off up by its cameras (%s): views and exports take z as up, so turn the model in the program that made it, or give it a place (`sc3d georeference`)",
+            scene.path,
+            tilt,
+            found.how,
+        )
+
+
+def _scene_direction(scene: Scene) -> UpDirection | None:
     if not scene.sparse.is_dir():
         return None
     found = find_up(view_poses(scene.model.views, scene.images), scene.model.points)
-    return found.up if found.deviation < VAGUE else None
+    return found if found.deviation < VAGUE else None
 
 
 def _read(photo: Path) -> Stated:

@@ -23,6 +23,7 @@ from sc3d.georeferencing.up_direction import (
     read_stated,
     scene_up,
     settle_up,
+    tell_tilt,
     upside_down,
 )
 from sc3d.io.orientation import ORIENTATION, turned_points
@@ -288,7 +289,7 @@ class TestModels:
         fit = place(flight, centers, lambda: settle_up(poses, points).up)
         assert (fit.rotation @ FRAME)[2, 2] > np.cos(np.radians(2))
 
-    def test_up_of_a_scene_in_any_frame(self, tmp_path):
+    def test_up_of_a_scene_in_any_frame(self, tmp_path, caplog):
         scene = Scene(tmp_path / "scene")
         assert scene_up(scene) is None
         photos = tmp_path / "photos"
@@ -298,6 +299,14 @@ class TestModels:
         model.write(str(scene.sparse))
         scene.images.symlink_to(photos)
         assert angle(scene_up(scene), FRAME[:, 2]) < 2.0
+        tell_tilt(scene)
+        tilt = round(angle(scene_up(scene), np.array([0, 0, 1.0])))
+        assert f"is {tilt} degrees off up by its cameras" in caplog.text
+        caplog.clear()
+        make_level(model, photos)
+        model.write(str(scene.sparse))
+        tell_tilt(Scene(scene.path))
+        assert not caplog.text
 
 
 class TestGroundModel:
