@@ -209,10 +209,11 @@ def find_up(poses: Poses, points: np.ndarray) -> UpDirection:
 def _from_cameras(poses: Poses, rows: UpDirection | None, points: np.ndarray) -> UpDirection:
     """The surest of what rows, viewing directions and positions say."""
     walk = _from_walk(poses, points)
-    known = [each for each in (_from_view(poses, rows, walk), rows) if each is not None]
-    known = [each for each in known if each.deviation < VAGUE]
-    if walk is not None and known and min(each.deviation for each in known) > UNSURE:
-        known.append(walk)
+    view = _from_view(poses, rows, walk)
+    known = [each for each in (view, rows) if each is not None and each.deviation < VAGUE]
+    if view is None and known and known[0].deviation > UNSURE:
+        other = _from_tops(poses, points) if walk is None else walk
+        known += [] if other is None else [other]
     return min(known, key=lambda each: each.deviation) if known else _from_kind(poses, walk, points)
 
 
@@ -342,10 +343,13 @@ def _from_view(poses: Poses, rows: UpDirection | None, walk: UpDirection | None)
         known = True
     else:
         known = rows is not None and rows.deviation < VAGUE and angle(up, rows.up) < 45
-    if walk is not None and angle(up, walk.up) > max(APART, 2 * walk.deviation):
+    tilt = 0.0 if walk is None else angle(up, walk.up)  # of the cameras, or of the slope that they followed
+    if walk is not None and tilt > max(APART, 2 * walk.deviation):
         known = False
     spread = np.degrees(np.arccos(min(alike, 1.0)))
-    found = UpDirection(up, float(np.hypot(POINTED_DOWN, spread / 2)), "the view of photos that look down")
+    found = UpDirection(
+        up, float(np.linalg.norm([POINTED_DOWN, spread / 2, tilt / 2])), "the view of photos that look down"
+    )
     return found if known else None
 
 
@@ -358,26 +362,26 @@ def _from_kind(poses: Poses, walk: UpDirection | None, points: np.ndarray) -> Up
     """Up where rows tell one direction at most: photos that look ahead, or down, by what their cameras and the
     ground below them are like.
     """
-    down, forward = poses.down.mean(axis=0), poses.forward.mean(axis=0)
-    if np.linalg.norm(down) < np.cos(np.radians(SAME_WAY)):
+    if np.linalg.norm(poses.down.mean(axis=0)) < np.cos(np.radians(SAME_WAY)):
         return _guess(poses, points)
-    ahead = UpDirection(-_unit(down), LEVEL_PITCH, "the tops of photos that look ahead")
+    forward, tops = poses.forward.mean(axis=0), _from_tops(poses, points)
     below = UpDirection(-_unit(forward), POINTED_DOWN, "the view of photos that look down")
     same_way = np.linalg.norm(forward) > np.cos(np.radians(SAME_WAY))
-    if walk is None:
-        if _ground(poses, points, ahead.up) is not None:
-            return ahead
-        if not same_way:
-            return replace(ahead, deviation=VAGUE)
-        return replace(
-            below,
-            deviation=VAGUE,
-            doubt="up is not sure: all photos look the same way, from one line, and nothing tells whether ahead or down. Down is taken; control points or GPS would tell",
-        )
-    if angle(walk.up, below.up) < NEAR and same_way:
-        return below
-    near = angle(walk.up, ahead.up) < SAME_WAY and ahead.deviation < walk.deviation
-    return ahead if near else walk
+    if walk is not None:
+        tilt = angle(walk.up, below.up)
+        below = replace(below, deviation=float(np.hypot(POINTED_DOWN, tilt / 2)))
+        return below if same_way and tilt < max(APART, 2 * walk.deviation) else walk
+    if tops is not None:
+        return tops
+    doubt = "up is not sure: all photos look the same way, from one line, and nothing tells whether ahead or down. Down is taken; control points or GPS would tell"
+    return replace(below, deviation=VAGUE, doubt=doubt) if same_way else _guess(poses, points)
+
+
+def _from_tops(poses: Poses, points: np.ndarray) -> UpDirection | None:
+    """Up by the tops of photos that look ahead, if there is ground below their cameras; else None."""
+    up = -_unit(poses.down.mean(axis=0))
+    ground = _ground(poses, points, up)
+    return None if ground is None else UpDirection(up, LEVEL_PITCH, "the tops of photos that look ahead")
 
 
 def _from_walk(poses: Poses, points: np.ndarray) -> UpDirection | None:
