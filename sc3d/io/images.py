@@ -456,6 +456,41 @@ def read_samples(path: Path) -> IndexImage:
     return IndexImage(np.where(np.isin(samples, clear), np.uint8(0), samples), bits, None)
 
 
+def is_indexed(path: Path) -> bool:
+    """Whether a picture has one channel of up to 8 bits, or a palette: what `read_samples` reads."""
+    with open_image(path, "mask") as image:
+        return image.mode in ("L", "P", "1", "LA") and bits_of(image) == 8
+
+
+def read_channels(path: Path) -> np.ndarray:
+    """(H, W) uint16 gray of a picture of 16 bits, else (H, W, 3) uint8 or uint16 RGB, palettes as their colors, as
+    stored; 0 where alpha is 0. InputError for other depths.
+    """
+    import cv2
+
+    with open_image(path, "mask") as image:
+        bits = bits_of(image)
+        if bits == FLOAT:
+            raise InputError(f"{path} holds floating point: whole numbers of 8 or 16 bits are expected")
+        if bits == 8:
+            rgba = np.array(image.convert("RGBA"))
+            rgba[rgba[..., 3] == 0] = 0
+            return rgba[..., :3]
+        if image.mode.startswith("I"):
+            gray, clear = np.array(image), image.info.get("transparency")
+            if gray.min() < 0 or gray.max() >= 1 << 16:
+                raise InputError(
+                    f"{path} holds values of more than 16 bits: ids from 0 to 65535 are expected"
+                )
+            return np.where(gray == clear, 0, gray).astype(np.uint16)
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # of colors of 16 bits, Pillow keeps the high byte
+    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3:
+        raise InputError(f"cannot read the mask {path}: save it with 8 bits per channel")
+    if pixels.shape[2] == 4:
+        pixels[pixels[..., 3] == 0] = 0
+    return np.ascontiguousarray(pixels[..., 2::-1])
+
+
 def _clear_values(transparency: int | bytes | None) -> tuple[int, ...]:
     """Values that a tRNS chunk makes transparent: one gray level or entry, or the alpha of every entry."""
     if isinstance(transparency, bytes):

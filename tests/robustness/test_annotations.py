@@ -537,3 +537,126 @@ def test_a_transparent_gray_level_is_no_class(tmp_path, mode, clear):
     image = Image.fromarray(values * 255).convert("1") if mode == "1" else Image.fromarray(values)
     image.save(file, transparency=255 if mode == "1" else clear)
     np.testing.assert_array_equal(imported(scene, tmp_path / "m"), np.where(values == clear, 0, values))
+
+
+# ids and colors in any kind of PNG, each file looked at alone
+
+
+def colored(mask: np.ndarray, alpha: np.ndarray | None = None) -> Image.Image:
+    rgb = np.array([(0, 0, 0), *(COLORS[label] for label in range(1, 5))], np.uint8)[mask]
+    return Image.fromarray(rgb if alpha is None else np.dstack([rgb, alpha]))
+
+
+def saved(path: Path, image: Image.Image | np.ndarray) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    (image if isinstance(image, Image.Image) else Image.fromarray(image)).save(path)
+    return path
+
+
+def in_channels(mask: np.ndarray) -> np.ndarray:
+    return np.repeat(mask[..., None], 3, axis=2)
+
+
+def wide_png(path: Path, pixels: np.ndarray) -> Path:
+    """A PNG of 16 bits per channel; pixels: (H, W) or (H, W, 3)."""
+    import cv2
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    wide = pixels.astype(np.uint16)
+    cv2.imwrite(str(path), np.ascontiguousarray(wide[..., ::-1]) if wide.ndim == 3 else wide)
+    return path
+
+
+MEMBERS = {  # what a mask of `bands` may be, in one folder with any other
+    "colors": lambda path: saved(path, colored(bands())),
+    "colors with alpha": lambda path: saved(path, colored(bands(), np.full(bands().shape, 255, np.uint8))),
+    "palette of colors": lambda path: palette_png(path, bands(), [0, 4, 2, 1, 3], {0: (0, 0, 0)} | COLORS),
+    "palette of ids": lambda path: palette_png(
+        path, bands(), [0, 1, 2, 3, 4], {row: (9, row, 9) for row in range(5)}
+    ),
+    "gray": lambda path: saved(path, bands()),
+    "ids in three channels": lambda path: saved(path, in_channels(bands())),
+    "16 bits": lambda path: wide_png(path, bands().astype(np.uint16)),
+    "16 bits in three channels": lambda path: wide_png(path, in_channels(bands())),
+    "colors of 16 bits": lambda path: wide_png(path, np.array(colored(bands())).astype(np.uint16) * 257),
+}
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_every_kind_of_png_in_one_folder(tmp_path, name):
+    """Imported, and as it lies in a folder of truth."""
+    scene = make_scene(tmp_path)
+    for row, kind in enumerate((name, "colors", "gray")):
+        Image.new("RGB", STORED).save(scene.images / f"p{row}.jpg")
+        MEMBERS[kind](tmp_path / "m" / f"p{row}.png")
+    execute("segment", scene, Segment(masks=tmp_path / "m"))
+    for row in range(3):
+        np.testing.assert_array_equal(read_index_image(scene.masks / f"p{row}.png"), bands())
+    np.testing.assert_array_equal(scene.read_mask(tmp_path / "m" / "p0.png", "p0.jpg"), bands())
+
+
+def test_channels_that_may_be_ids_or_colors_are_refused(tmp_path):
+    scene = make_scene(tmp_path)
+    table = json.loads(json.dumps(TABLE))
+    table[0]["color"] = [table[1]["id"]] * 3
+    scene.classes.write_text(json.dumps(table))
+    both = np.where(bands() > 2, table[1]["id"], 0).astype(np.uint8)
+    saved(tmp_path / "m" / "a.png", in_channels(both))
+    with pytest.raises(
+        InputError, match=r"a\.png .* whose colors stand for different classes.*--format index"
+    ):
+        imported(scene, tmp_path / "m")
+    with pytest.raises(InputError, match=r"a\.png .* stand for different classes"):
+        scene.read_mask(tmp_path / "m" / "a.png", "a.jpg")
+    np.testing.assert_array_equal(imported(scene, tmp_path / "m", format="index"), both)
+    found = imported(scene, tmp_path / "m", format="color")
+    np.testing.assert_array_equal(found, np.where(both > 0, table[0]["id"], 0))
+
+
+def test_colors_of_16_bits_are_no_black(tmp_path):
+    """Whose high byte alone was read."""
+    wide_png(tmp_path / "m" / "a.png", np.dstack([bands(), bands() * 2, bands()]))
+    with pytest.raises(InputError, match="16 bits that are none of 8"):
+        imported(make_scene(tmp_path), tmp_path / "m")
+
+
+@pytest.mark.parametrize("mode", ["gray", "channels", "16 bits"])
+def test_a_binary_mask_is_told_what_to_say(tmp_path, mode):
+    top = 65535 if mode == "16 bits" else 255
+    mask = np.where(bands() > 2, top, 0).astype(np.uint16 if mode == "16 bits" else np.uint8)
+    saved(tmp_path / "m" / "a.png", in_channels(mask) if mode == "channels" else mask)
+    with pytest.raises(InputError, match="binary mask.*--mapping mapping.json") as told:
+        imported(make_scene(tmp_path), tmp_path / "m")
+    shown = f'{{"{top}": "{TABLE[0]["name"]}"}}'
+    assert shown in str(told.value)
+    mapping = tmp_path / "mapping.json"
+    mapping.write_text(shown)
+    found = imported(make_scene(tmp_path / "b"), tmp_path / "m", mapping=mapping)
+    np.testing.assert_array_equal(found, np.where(mask > 0, TABLE[0]["id"], 0))
+
+
+def test_a_mapping_of_ids_and_colors(tmp_path):
+    scene = make_scene(tmp_path)
+    Image.new("RGB", STORED).save(scene.images / "b.jpg")
+    saved(tmp_path / "m" / "a.png", np.where(bands() > 2, 77, 0).astype(np.uint8))
+    saved(tmp_path / "m" / "b.png", colored(np.where(bands() > 2, 4, 0)))
+    mapping = tmp_path / "mapping.json"
+    color = "#{:02x}{:02x}{:02x}".format(*COLORS[4])
+    mapping.write_text(json.dumps({"77": NAMES[1], color: NAMES[2]}))
+    np.testing.assert_array_equal(
+        imported(scene, tmp_path / "m", mapping=mapping), np.where(bands() > 2, 1, 0)
+    )
+    np.testing.assert_array_equal(read_index_image(scene.masks / "b.png"), np.where(bands() > 2, 2, 0))
+
+
+def test_confidence_in_three_channels(tmp_path):
+    scene = make_scene(tmp_path)
+    saved(scene.confidence / "a.png", in_channels(bands() * np.uint8(60)))
+    found = scene.read_confidence(scene.confidence / "a.png", "a.jpg")
+    np.testing.assert_array_equal(found, bands() * np.uint8(60))
+    saved(scene.confidence / "a.png", colored(bands()))
+    with pytest.raises(InputError, match="has colors: a confidence map is"):
+        scene.read_confidence(scene.confidence / "a.png", "a.jpg")
+    wide_png(scene.confidence / "a.png", bands())
+    with pytest.raises(InputError, match="16 bits per pixel: a confidence map is"):
+        scene.read_confidence(scene.confidence / "a.png", "a.jpg")
