@@ -23,6 +23,7 @@ from sc3d.scene.class_table import parse_classes
 from sc3d.scene.scene import Scene
 from sc3d.segmentation.segment import Folders, Segmentation, segment_photos
 from sc3d.segmentation.strokes.files import read_strokes
+from sc3d.segmentation.text_prompts import replace_prompts
 from sc3d.settings.labels import Segment
 from tests.builders import ROOT, instance_of
 
@@ -660,3 +661,201 @@ def test_confidence_in_three_channels(tmp_path):
     wide_png(scene.confidence / "a.png", bands())
     with pytest.raises(InputError, match="16 bits per pixel: a confidence map is"):
         scene.read_confidence(scene.confidence / "a.png", "a.jpg")
+
+
+# what programs write otherwise: one rule for masks and strokes
+
+
+def square(label: str, kind: str = "polygon", **more: object) -> dict:
+    """An area of 12 x 8 px at column 6, row 10."""
+    corners = {
+        "rectangle": [[6, 10], [18, 18]],
+        "mask": [[6, 10], [17, 17]],
+        "circle": [[12, 14], [12, 18]],
+        "linestrip": [[6, 14], [18, 14]],
+    }
+    return {"label": label, "shape_type": kind, "points": corners.get(kind, polygon(6, 10, 18, 18))} | more
+
+
+def picture(mask: np.ndarray) -> str:
+    stream = io.BytesIO()
+    Image.fromarray(mask.astype(np.uint8)).save(stream, "PNG")
+    return base64.b64encode(stream.getvalue()).decode()
+
+
+CORNER = np.ones((8, 12), bool)
+CORNER[:4, :6] = False  # of a mask shape
+
+
+def both(tmp_path: Path, content: dict, orientation: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Class ids as `segment --masks` and as strokes read them, in the frame of the photo as stored."""
+    scene = make_scene(tmp_path, orientation)
+    scene.strokes.mkdir()
+    (scene.strokes / "a.json").write_text(json.dumps(content))
+    (strokes,) = read_strokes(scene.strokes, scene.images, scene.class_table())
+    painted = np.maximum(strokes.paint(*strokes.size)[0], 0)
+    return imported(scene, scene.strokes), turned(painted, inverse(orientation))
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [
+        (square(NAMES[2].upper()), (48, 32)),
+        (square(f" {NAMES[2].title()} "), (48, 32)),
+        (square(NAMES[2]), (48.0, 32.0)),
+        (square(NAMES[2], "rectangle"), (48.0, 32)),
+        (square(NAMES[2], "oriented_rectangle"), (48, 32)),
+        (square(NAMES[2], "rotation"), (48, 32)),
+        (square(NAMES[2], "mask", mask=picture(np.ones((8, 12)))), (48, 32)),
+    ],
+)
+def test_masks_and_strokes_are_read_alike(tmp_path, shape, size):
+    content = {"shapes": [shape], "imageWidth": size[0], "imageHeight": size[1]}
+    mask, strokes = both(tmp_path, content)
+    expected = np.zeros(STORED[::-1], np.uint8)
+    expected[10:18, 6:18] = 2
+    np.testing.assert_array_equal(mask, expected)
+    differ = strokes != expected
+    differ[9:19, 5:19] = False  # OpenCV draws the edge of polygons, too
+    assert not differ.any() and (strokes[10:18, 6:18] == 2).all()
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+@pytest.mark.parametrize("stated", ["shown", "stored", "half"])
+def test_mask_shapes_in_strokes(tmp_path, orientation, stated):
+    if stated == "half" and orientation != 1:
+        return
+    size = {"shown": turned_size(STORED, orientation), "stored": STORED, "half": (24, 16)}[stated]
+    shape = square(NAMES[2], "mask", mask=picture(CORNER))
+    if stated == "half":
+        shape |= {"points": [[3, 5], [8, 8]], "mask": picture(CORNER[::2, ::2])}
+    content = {"shapes": [shape], "imageWidth": size[0], "imageHeight": size[1]}
+    mask, strokes = both(tmp_path, content, orientation)
+    if stated == "half":
+        mask = np.repeat(np.repeat(mask, 2, 0), 2, 1)
+    assert (mask == 2).sum() == CORNER.sum()
+    np.testing.assert_array_equal(strokes, mask)
+
+
+def test_mask_shapes_survive_the_page(tmp_path):
+    scene = make_scene(tmp_path)
+    shape = square(NAMES[2], "mask", mask=picture(CORNER))
+    session = Session(scene)
+    line = square(NAMES[1], "linestrip", width=2) | {"points": [[6, 28], [18, 28]]}
+    session.save("a", {"shapes": [shape, line]})
+    session.save("a", {"shapes": session.read("a")})
+    first = session.read("a")[0]
+    assert first["points"] == shape["points"] and first["shape_type"] == "mask"
+    (strokes,) = read_strokes(scene.strokes, scene.images, scene.class_table())
+    labels = strokes.paint(*STORED)[0]
+    assert labels[11, 7] == -1 and labels[17, 17] == 2
+    small = strokes.paint(6, 4)[0]
+    assert 2 in small  # a small mask does not vanish
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"mask": "no picture"}, {"mask": None}, {"points": [[40, 10], [51, 17]]}, {"mask": picture(CORNER * 0)}],
+)
+def test_junk_mask_shapes_in_strokes_are_refused(tmp_path, change):
+    scene = make_scene(tmp_path)
+    scene.strokes.mkdir()
+    shape = square(NAMES[2], "mask", mask=picture(CORNER)) | change
+    (scene.strokes / "a.json").write_text(json.dumps({"shapes": [shape]}))
+    with pytest.raises(InputError, match="shape 1: the mask"):
+        read_strokes(scene.strokes, scene.images, scene.class_table())
+
+
+def test_background_of_strokes_in_other_letter_case(tmp_path):
+    scene = make_scene(tmp_path)
+    scene.strokes.mkdir()
+    (scene.strokes / "a.json").write_text(json.dumps({"shapes": [square("_Background_")]}))
+    (strokes,) = read_strokes(scene.strokes, scene.images, scene.class_table())
+    assert strokes.shapes[0].label == 0
+
+
+@pytest.mark.parametrize("kind", [float, str, lambda value: f"{value}.0"])
+def test_numbers_of_coco_as_floats_and_texts(tmp_path, kind):
+    content = json.loads(coco(1))
+    for entry in content["images"]:
+        entry |= {key: kind(entry[key]) for key in ("id", "width", "height")}
+    for entry in content["annotations"]:
+        entry |= {"category_id": kind(entry["category_id"])}
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    np.testing.assert_array_equal(imported(make_scene(tmp_path), tmp_path / "coco.json"), bands())
+
+
+def test_numbers_of_cvat_as_floats(tmp_path):
+    box = f'<mask label="{NAMES[2]}" left="6.0" top="10.0" width="12.0" height="8.0" rle="0, 96" z_order="1.0"/>'
+    text = f'<annotations><image id="0" name="a.jpg" width="48.0" height="32.0">{box}</image></annotations>'
+    (tmp_path / "cvat.xml").write_text(text)
+    found = imported(make_scene(tmp_path), tmp_path / "cvat.xml")
+    assert (found[10:18, 6:18] == 2).all() and (found == 2).sum() == 96
+
+
+@pytest.mark.parametrize(
+    ("mapping", "label", "expected"),
+    [
+        ({"wall": NAMES[1]}, "Wall", 1),
+        ({"Wall ": NAMES[1].upper()}, "wall", 1),
+        ({"wall": 1.0}, "wall", 1),
+        ({"wall": "1"}, "wall", 1),
+        ({NAMES[2]: NAMES[1]}, NAMES[2].upper(), 1),
+        ({NAMES[2].upper(): NAMES[1]}, NAMES[2], 2),  # as ever: the table has this very name
+    ],
+)
+def test_mappings_in_other_letter_case(tmp_path, mapping, label, expected):
+    (tmp_path / "a.json").write_text(json.dumps({"shapes": [square(label)]}))
+    (tmp_path / "map.json").write_text(json.dumps(mapping))
+    found = imported(make_scene(tmp_path), tmp_path / "a.json", mapping=tmp_path / "map.json")
+    assert (found[10:18, 6:18] == expected).all()
+
+
+def test_class_tables_with_floats():
+    entry = TABLE[0] | {"id": 1.0, "color": [1.0, 2.0, 3.0], "asprs": 6.0}
+    (found,) = parse_classes([entry], "classes.json")
+    assert (found.id, found.color, found.asprs) == (1, (1, 2, 3), 6)
+    with pytest.raises(InputError, match="whole number"):
+        parse_classes([entry | {"id": 1.5}], "classes.json")
+
+
+def test_prompts_name_classes_in_any_letter_case():
+    table = replace_prompts(parse_classes(TABLE, "classes"), (f"{NAMES[2].upper()}=street,lane",))
+    assert next(entry.prompts for entry in table if entry.id == 2) == ("street", "lane")
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda one: [one, one | {"file_name": "b.jpg"}], r"gives the id 1 to two images, a\.jpg and b\.jpg"),
+        (
+            lambda one: [one, one | {"id": 2}],
+            r"lists the image a\.jpg twice, as id 1 and 2, both with annotations",
+        ),
+        (lambda one: [one | {"id": 9}], "annotations of an image that it does not list, id 1: add it"),
+    ],
+)
+def test_images_listed_twice_in_coco(tmp_path, change, told):
+    content = json.loads(coco(1))
+    content["annotations"].append(content["annotations"][0] | {"image_id": 2})
+    content["images"] = change(content["images"][0])
+    if len(content["images"]) < 2 or content["images"][1]["id"] == 1:
+        content["annotations"].pop()
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=told):
+        imported(make_scene(tmp_path), tmp_path / "coco.json")
+
+
+def test_equal_entries_of_an_image_in_coco_are_one(tmp_path):
+    content = json.loads(coco(1))
+    content["images"] *= 2
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    np.testing.assert_array_equal(imported(make_scene(tmp_path), tmp_path / "coco.json"), bands())
+
+
+def test_categories_of_one_id_in_coco_are_refused(tmp_path):
+    content = json.loads(coco(1))
+    content["categories"][1]["id"] = content["categories"][0]["id"]
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=f"two categories, {NAMES[1]} and {NAMES[2]}"):
+        imported(make_scene(tmp_path), tmp_path / "coco.json")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.json_files import read_json
+from sc3d.io.json_files import read_json, whole_number_of
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.mask_values import BLACK, UNKNOWN, Meanings, color_code, meanings_of
 
@@ -36,13 +37,28 @@ class ClassMapping:
         return ", ".join(entry.name for entry in self.table)
 
     def find(self, keys: tuple[str, ...]) -> int | None:
-        """Class id for the first key that the mapping has, or else for a name in the table (upper or lower
-        case); None if there is none.
+        """Class id for the first key that the mapping has, or else for a name in the table; of both also in
+        another letter case, where that is clear. None if there is none.
         """
+        mapping = self.mapping or {}
         for key in keys:
-            if self.mapping is not None and key in self.mapping:
-                return self.mapping[key]
-        return _by_name(keys[0], self.table)
+            if key in mapping:
+                return mapping[key]
+        if any(entry.name == keys[0].strip() for entry in self.table):
+            return self.table.find(keys[0])
+        for key in keys:
+            alike = self._folded.get(key.strip().casefold(), set())
+            if len(alike) == 1:
+                return next(iter(alike))
+        return self.table.find(keys[0])
+
+    @cached_property
+    def _folded(self) -> dict[str, set[int]]:
+        """Class ids by the keys of the mapping in lower case."""
+        found = defaultdict[str, set[int]](set)
+        for key, class_id in (self.mapping or {}).items():
+            found[key.casefold()].add(class_id)
+        return found
 
     @cached_property
     def meanings(self) -> Meanings:
@@ -102,31 +118,13 @@ def read_mapping(mapping: Path | None, table: ClassTable) -> ClassMapping:
 
 
 def _class_id(key: str, value: object, table: ClassTable, origin: Path) -> int:
-    found = None
-    if value is None:
-        found = 0
-    elif isinstance(value, str):
-        found = _by_name(value, table)
-        if found is None and value.strip().casefold() in UNLABELLED:
-            found = 0
-    elif (
-        isinstance(value, int)
-        and not isinstance(value, bool)
-        and value in {0, *(entry.id for entry in table)}
-    ):
-        found = value
-    if found is None:
+    found = 0 if value is None else whole_number_of(value)
+    if isinstance(value, str):
+        found = named if (named := table.find(value)) is not None else found
+        found = 0 if found is None and value.strip().casefold() in UNLABELLED else found
+    if found is None or found not in {0, *(entry.id for entry in table)}:
         names = ", ".join(entry.name for entry in table)
         raise InputError(
             f"{origin}: {key!r} stands for {value!r}, which is no class: write one of {names}, or null for unlabelled"
         )
     return found
-
-
-def _by_name(name: str, table: ClassTable) -> int | None:
-    """Class id of a name; exact if there is one, else whatever the case if only one fits."""
-    exact = [entry.id for entry in table if entry.name == name.strip()]
-    alike = [entry.id for entry in table if entry.name.casefold() == name.strip().casefold()]
-    if exact:
-        return exact[0]
-    return alike[0] if len(alike) == 1 else None
