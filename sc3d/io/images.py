@@ -199,7 +199,7 @@ def list_photos(folder: Path) -> list[Path]:
     return _survey(folder)[0]
 
 
-def left_out(folder: Path) -> str:
+def unused_files(folder: Path) -> str:
     """What in a folder of photos is not used, by reason, with numbers and examples; "" if nothing is."""
     parts = []
     for reason, files in _survey(folder)[1].items():
@@ -239,7 +239,7 @@ def find_photos(folder: Path) -> list[Path]:
         raise InputError(f"{folder} is not a folder: give the folder that holds the photos")
     photos = list_photos(folder)
     if not photos:
-        others = left_out(folder)
+        others = unused_files(folder)
         raise InputError(
             f"no photos in {folder}: JPEG, PNG or TIFF files are expected"
             + (f"; left out: {others}" if others else "")

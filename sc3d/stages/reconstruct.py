@@ -26,7 +26,7 @@ from sc3d.georeferencing.gps import read_flight
 from sc3d.georeferencing.placement import make_level, place_model
 from sc3d.io.atomic import require_writable
 from sc3d.io.colmap import load_model, registered_images, write_model
-from sc3d.io.images import check_photo, find_photos, left_out, link_photos, num_pages
+from sc3d.io.images import check_photo, find_photos, link_photos, num_pages, unused_files
 from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.runner import execute
 from sc3d.scene.photo_names import photo_name
@@ -76,7 +76,7 @@ def prepare(photos: Path, scene: Scene, settings: Reconstruct) -> None:
 
 def _tell(photos: Path, files: list[Path]) -> None:
     """Say what of the folder is not used."""
-    others, several = left_out(photos), [file.name for file in files if num_pages(file) > 1]
+    others, several = unused_files(photos), [file.name for file in files if num_pages(file) > 1]
     if others:
         logger.warning("%s: left out %s", photos, others)
     if several:

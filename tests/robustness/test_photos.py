@@ -19,10 +19,10 @@ from sc3d.io.images import (
     data_uri,
     find_photos,
     image_size,
-    left_out,
     link_photos,
     read_image,
     read_opaque,
+    unused_files,
     used_range,
 )
 from sc3d.io.orientation import turned
@@ -357,7 +357,7 @@ def test_a_scene_inside_the_folder_of_photos(tmp_path):
     for folder in (photos, scene.images):
         assert [file.name for file in find_photos(folder)] == ["a.jpg", "b.jpg"]
         assert digest(folder) == before
-    assert left_out(photos) == "1 written by sc3d (out)"
+    assert unused_files(photos) == "1 written by sc3d (out)"
 
 
 def test_a_scene_that_is_the_folder_of_photos(tmp_path):
@@ -394,7 +394,7 @@ def test_leftovers_are_no_photos(tmp_path):
         (photos / name).parent.mkdir(exist_ok=True)
         shutil.copyfile(photos / "a.jpg", photos / name)
     assert [file.name for file in find_photos(photos)] == ["a.jpg", "b.jpg"]
-    assert left_out(photos).startswith("2 hidden (._a.jpg, .trash/c.jpg); 3 thumbnails or leftovers")
+    assert unused_files(photos).startswith("2 hidden (._a.jpg, .trash/c.jpg); 3 thumbnails or leftovers")
 
 
 # links
