@@ -13,8 +13,9 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import require_inside
-from sc3d.io.images import find_photos, read_image, require_within
+from sc3d.io.images import read_image
 from sc3d.io.json_files import read_json, write_json
+from sc3d.io.photo_folder import find_photos, require_within
 from sc3d.io.provenance import digest
 from sc3d.scene.photo_names import PhotoNames, photo_name
 from sc3d.scene.scene import Scene

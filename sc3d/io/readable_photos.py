@@ -11,7 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import left_out
-from sc3d.io.images import has_alpha, image_size, photo_bits, read_image, read_opaque, used_range, write_image
+from sc3d.io.images import (
+    has_alpha,
+    image_size,
+    photo_bits,
+    read_image,
+    read_opaque,
+    used_range,
+    write_image,
+)
 
 logger = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import IndexImage, is_indexed, read_channels, read_samples
+from sc3d.io.mask_images import IndexImage, is_indexed, read_channels, read_samples
 from sc3d.scene.class_table import ClassTable
 
 UNKNOWN = -1

@@ -22,7 +22,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from urllib.parse import unquote
 
 from sc3d.errors import InputError
-from sc3d.io.images import IMAGE_SUFFIXES
+from sc3d.io.photo_folder import IMAGE_SUFFIXES
 
 # of a foreign name; all others belong to the name
 SUFFIXES = IMAGE_SUFFIXES | set(".json .webp .bmp .gif .dng .heic .heif .arw .cr2 .nef .raw .rw2".split())

@@ -13,18 +13,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from sc3d.io.atomic import claim, discard, remove_leftovers
-from sc3d.io.images import (
-    find_photos,
-    image_size,
-    index_image_size,
-    read_image,
-    read_opaque,
-    read_orientation,
-    require_within,
-    write_image,
-)
+from sc3d.io.images import image_size, read_image, read_opaque, read_orientation, write_image
 from sc3d.io.json_files import read_json, write_json
+from sc3d.io.mask_images import index_image_size
 from sc3d.io.orientation import inverse, turned
+from sc3d.io.photo_folder import find_photos, require_within
 from sc3d.io.provenance import digest
 from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.scene.class_table import ClassTable

@@ -26,7 +26,8 @@ from sc3d.georeferencing.gps import read_flight
 from sc3d.georeferencing.placement import make_level, place_model
 from sc3d.io.atomic import require_writable
 from sc3d.io.colmap import load_model, registered_images, write_model
-from sc3d.io.images import check_photo, find_photos, link_photos, num_pages, unused_files
+from sc3d.io.images import check_photo, num_pages
+from sc3d.io.photo_folder import find_photos, link_photos, unused_files
 from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.runner import execute
 from sc3d.scene.photo_names import photo_name

@@ -10,7 +10,7 @@ from pathlib import Path
 from sc3d.errors import InputError, left_out
 from sc3d.geometry.blocks import split_blocks
 from sc3d.io.atomic import atomic_path, claim, remove
-from sc3d.io.images import find_photos
+from sc3d.io.photo_folder import find_photos
 from sc3d.io.provenance import digest
 from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.io.splats import origin_comment, write_splat_ply

@@ -16,7 +16,8 @@ from PIL import Image
 
 from sc3d.annotate.session import Session
 from sc3d.errors import InputError
-from sc3d.io.images import read_index_image, read_orientation
+from sc3d.io.images import read_orientation
+from sc3d.io.mask_images import read_index_image
 from sc3d.io.orientation import inverse, turned, turned_points, turned_size
 from sc3d.runner import execute
 from sc3d.scene.class_table import parse_classes

@@ -18,8 +18,9 @@ from sc3d.errors import InputError
 from sc3d.importers.clouds import read_geometry
 from sc3d.importers.metashape import read as read_metashape
 from sc3d.importers.photos import locate_photos
-from sc3d.io.images import read_index_image, write_image
+from sc3d.io.images import write_image
 from sc3d.io.json_files import read_json, write_json
+from sc3d.io.mask_images import read_index_image
 from sc3d.runner import execute
 from sc3d.scene.class_table import read_classes
 from sc3d.scene.photo_names import NamePattern, PhotoNames

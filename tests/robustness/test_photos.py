@@ -17,15 +17,13 @@ from sc3d.errors import InputError
 from sc3d.io.images import (
     check_photo,
     data_uri,
-    find_photos,
     image_size,
-    link_photos,
     read_image,
     read_opaque,
-    unused_files,
     used_range,
 )
 from sc3d.io.orientation import turned
+from sc3d.io.photo_folder import find_photos, link_photos, unused_files
 from sc3d.io.provenance import digest
 from sc3d.io.readable_photos import readable_photos
 from sc3d.runner import execute

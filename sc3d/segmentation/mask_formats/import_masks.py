@@ -11,7 +11,8 @@ from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path, discard
-from sc3d.io.images import index_image_size, is_indexed, read_orientation, turned_onto, write_image
+from sc3d.io.images import read_orientation, write_image
+from sc3d.io.mask_images import index_image_size, is_indexed, turned_onto
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.mask_values import read_confidence
 from sc3d.scene.photo_names import PhotoNames

@@ -18,9 +18,11 @@ import cv2
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import find_photos, image_size, mask_orientation, open_image, read_orientation
+from sc3d.io.images import image_size, open_image, read_orientation
 from sc3d.io.json_files import read_json, whole_number
+from sc3d.io.mask_images import mask_orientation
 from sc3d.io.orientation import mask_turn, turned, turned_points, turned_size
+from sc3d.io.photo_folder import find_photos
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.photo_names import PhotoNames, files_of_photos, photo_name
 from sc3d.scene.scene import check_mask_aspect
