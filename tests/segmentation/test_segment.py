@@ -296,7 +296,7 @@ def test_import_masks(tmp_path):
         ("c", np.zeros((6, 8), np.uint8), "belongs to no photo"),
         ("b", np.zeros((8, 8), np.uint8), "aspect"),
         ("b", np.full((6, 8), 3, np.uint8), "class id 3"),
-        ("b", np.zeros((6, 8, 3), np.uint8), "colors"),
+        ("b", np.full((6, 8, 3), (1, 2, 3), np.uint8), "colors"),
     ],
 )
 def test_import_writes_nothing_if_a_mask_does_not_fit(tmp_path, stem, mask, message):
