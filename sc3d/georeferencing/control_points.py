@@ -34,7 +34,6 @@ logger = logging.getLogger(__name__)
 PIXEL_CENTER = 0.5  # ODM and OpenSfM call the center of the first pixel (0, 0)
 # of the distance to the cameras; points that miss the fit by less are as good as the cameras
 MAX_ERROR = 0.02
-SAME_HEIGHT = 1e-3  # m: heights that differ by less were not measured
 BAD_MARK = 0.02  # of the photo's longer side: marks that miss the others by more were set wrong
 FAR_FROM_GPS = 20_000.0  # m: control points this far from the photos' GPS are in another CRS
 
@@ -243,8 +242,9 @@ def align_to_control_points(
     fit, rows = found.fit, found.rows
     transform(model, fit.similarity)
     if fit.exact:
-        kept = rows[fit.kept]
-        _adjust(model, [points.observations[row] for row in kept], found.target[fit.kept], refine_focal)
+        held = fit.kept & fit.points.measured
+        observations = [points.observations[row] for row in rows[held]]
+        _adjust(model, observations, fit.points.target[held], refine_focal)
     return found.figures(model, points)
 
 
@@ -252,19 +252,21 @@ def align_to_control_points(
 class Matched:
     """How control points fit a model.
 
-    rows: (U,) of the points that two or more photos show; target: (U, 3) their ENU positions, m
+    rows: (U,) of the points that two or more photos show
     """
 
     fit: ControlFit
     rows: np.ndarray
-    target: np.ndarray
 
     def figures(self, model: pycolmap.Reconstruction, points: ControlPoints) -> dict[str, object]:
         """Residuals of a model that has been brought onto the points."""
         offsets = np.array([triangulate(model, points.observations[row])[0] for row in self.rows])
-        offsets = offsets - self.target
-        kept = self.fit.kept
-        squares = (offsets[kept] ** 2).mean(axis=0)
+        offsets = offsets - self.fit.points.target
+        kept, measured = self.fit.kept, self.fit.points.measured
+        horizontal = float((offsets[kept, :2] ** 2).sum(axis=1).mean())
+        counted = offsets[kept & measured, 2] if measured.any() else np.zeros(1)
+        # heights that are no measurements say nothing
+        vertical = 0.0 if self.fit.upright else (counted**2).sum() / kept.sum()
         apart = self.fit.leave_one_out
         listed = {
             points.names[row]: {
@@ -283,10 +285,11 @@ class Matched:
             "leave_one_out_rms": None if apart is None else round(float(np.sqrt((apart**2).mean())), 4),
             "accuracy_horizontal_vertical_m": np.round(self.fit.accuracy, 4).tolist(),
             "up_from_cameras": self.fit.upright,
-            # heights that are no measurements say nothing
-            "rms": round(float(np.sqrt(squares[: 2 if self.fit.upright else 3].sum())), 4),
-            "rms_horizontal": round(float(np.sqrt(squares[:2].sum())), 4),
-            "rms_vertical": round(float(np.sqrt(squares[2])), 4),
+            "heights_not_used": [points.names[row] for row in self.rows[~measured]],
+            "height_unit": self.fit.unit or "as given",
+            "rms": round(float(np.sqrt(horizontal + vertical)), 4),
+            "rms_horizontal": round(float(np.sqrt(horizontal)), 4),
+            "rms_vertical": round(float(np.sqrt((counted**2).mean())), 4),
             "residuals": {name: found for name, found in listed.items() if name not in out},
             "residuals_left_out": {name: found for name, found in listed.items() if name in out},
         }
@@ -313,7 +316,7 @@ def match_control_points(
             camera_up(rotations),
             MAX_ERROR * _distance(model, source, target[rows]),
             accuracy,
-            bool(np.ptp(heights) < SAME_HEIGHT),
+            heights,
         ),
         [points.names[row] for row in rows],
     )
@@ -321,13 +324,15 @@ def match_control_points(
         raise InputError(
             "the ground control points would turn the cameras upside down: check the order x y (east, north)"
         )
-    _tell(fit, [points.names[row] for row in rows], source, target[rows], float(heights[0]))
-    return Matched(fit, rows, target[rows])
+    _tell(fit, [points.names[row] for row in rows], heights)
+    return Matched(fit, rows)
 
 
-def _tell(fit: ControlFit, names: list[str], source: np.ndarray, target: np.ndarray, height: float) -> None:
-    """One line of what the user should know of a fit; nothing if all is as it should be."""
-    distances = np.linalg.norm((fit.similarity.apply(source) - target)[:, : 2 if fit.upright else 3], axis=1)
+def _tell(fit: ControlFit, names: list[str], heights: np.ndarray) -> None:
+    """One line of what the user should know of a fit; nothing if all is as it should be. heights: (U,) m, as
+    given
+    """
+    distances = np.linalg.norm(fit.points.offsets(fit.similarity, fit.upright), axis=1)
     words = []
     if not fit.exact:
         rms = np.sqrt((distances[fit.kept] ** 2).mean())
@@ -339,10 +344,27 @@ def _tell(fit: ControlFit, names: list[str], source: np.ndarray, target: np.ndar
     if not fit.kept.all():
         left_out = [f"{names[row]} ({distances[row]:.2f} m)" for row in np.flatnonzero(~fit.kept)]
         words.append(f"left out, as they do not fit the others: {', '.join(left_out)}")
-    if fit.upright:
-        words.append(f"heights are all {height:g} or say nothing: up comes from the cameras")
+    words += _tell_heights(fit, names, heights)
     if words:
         logger.warning("ground control points: %s", "; ".join(words))
+
+
+def _tell_heights(fit: ControlFit, names: list[str], heights: np.ndarray) -> list[str]:
+    words, unused = [], np.flatnonzero(~fit.points.measured)
+    if fit.unit:
+        words.append(
+            f"heights are {fit.slope:.2f} times what the cameras and the coordinates say: they are taken for {fit.unit}; write them in the unit of the CRS"
+        )
+    if len(unused):
+        values = ", ".join(f"{value:g}" for value in dict.fromkeys(heights[unused]))
+        words.append(
+            f"heights of {len(unused)} of {len(names)} are {values}, which is no measurement: these points count horizontally only, "
+            + examples([names[row] for row in unused])
+        )
+    if fit.upright:
+        reason = "" if len(unused) else f"heights are all {heights[0]:g} or say nothing: "
+        words.append(f"{reason}up comes from the cameras")
+    return words
 
 
 def transform(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
