@@ -36,6 +36,8 @@ UNMEASURED, TIMES_WORSE = 0.25, 5.0
 # what heights may be multiplied by, and how much better than as given they must then fit
 UNITS = {"feet": 1 / 0.3048, "meters, where the CRS has feet": 0.3048}
 TIMES_BETTER = 3.0
+BETTER_AND_UPRIGHT = 1.5  # where the cameras say so too
+EXCHANGED = "with x and y exchanged they fit: the order is x y (east, north)"
 
 Accuracy = tuple[float, float]  # standard deviations, m: horizontal, vertical
 Fitter = Callable[[np.ndarray], Similarity]  # from rows of points
@@ -226,8 +228,8 @@ def _in_other_unit(points: Correspondences, found: ControlFit | None) -> Control
         if other is None or other.upright or other.kept.sum() < MIN_SHARE * len(other.kept):
             continue
         if _fits_far_better(other, factor, points, found):
-            found_heights = other.similarity.apply(points.source)[other.kept, 2]
-            slope = np.polyfit(found_heights, points.target[other.kept, 2], 1)[0]
+            rows = other.kept & points.measured
+            slope = np.polyfit(other.similarity.apply(points.source)[rows, 2], points.target[rows, 2], 1)[0]
             return replace(other, unit=unit, slope=float(slope))
     return None
 
@@ -249,7 +251,11 @@ def _fits_far_better(
     plane = np.column_stack([some.target[:, :2], np.ones(kept.sum())])
     relief = some.target[:, 2] - plane @ np.linalg.lstsq(plane, some.target[:, 2], rcond=None)[0]
     none = np.sqrt((relief**2).mean()) if factor < 1 else np.inf
-    return bool(now * TIMES_BETTER < min(misfit, none))
+    askew, upright = (
+        np.arccos(np.clip(fit.rotation[2] @ points.up, -1, 1)) for fit in (before, other.similarity)
+    )
+    wanted = BETTER_AND_UPRIGHT if upright < TILT / 2 < TILT < askew else TIMES_BETTER
+    return bool(now * wanted < min(misfit, none))
 
 
 def _exact(points: Correspondences) -> ControlFit | None:
@@ -436,13 +442,19 @@ def _moved(fit: Similarity, step: np.ndarray, middle: np.ndarray) -> Similarity:
     )
 
 
+def fits_exchanged(points: Correspondences) -> bool:
+    """Whether points fit the model with x and y exchanged."""
+    exchanged = replace(points, target=points.target[:, [1, 0, 2]])
+    found = _fit(exchanged)
+    found = _without_fillers(exchanged, found) or found
+    found = found or _in_other_unit(exchanged, found)
+    return found is not None and bool(found.similarity.rotation[2] @ points.up > 0)
+
+
 def _refusal(points: Correspondences, names: list[str]) -> str:
     """Why nothing fits, as far as it can be told."""
-    exchanged = replace(points, target=points.target[:, [1, 0, 2]])
-    for try_fit in (_exact, _loose):
-        found = try_fit(exchanged)
-        if found is not None and found.similarity.rotation[2] @ points.up > 0:
-            return "the ground control points do not fit the model, but would with x and y exchanged: the order is x y (east, north)"
+    if fits_exchanged(points):
+        return f"the ground control points do not fit the model: {EXCHANGED}"
     missed = fit_similarity(points.source, points.target).apply(points.source) - points.target
     offsets = np.linalg.norm(missed, axis=1)
     worst = ", ".join(f"{names[row]} {offsets[row]:.1f} m" for row in np.argsort(-offsets)[:5])
