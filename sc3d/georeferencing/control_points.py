@@ -288,7 +288,7 @@ def _check_axes(model: pycolmap.Reconstruction, points: ControlPoints, limit: fl
     if share(lambda _, pixel: pixel) >= MOST_MEET[0]:
         return
     for read, what in (
-        (lambda _, pixel: pixel[::-1], "x and y of the pixels exchanged: the order is px py (column, row)"),
+        (lambda _, pixel: pixel[[1, 0]], "x and y of the pixels exchanged: the order is px py (column, row)"),
         (
             lambda photo, pixel: np.array([pixel[0], heights[photo] - pixel[1]]),
             "y of the pixels counted from the top: it runs downwards",
