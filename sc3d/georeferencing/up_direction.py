@@ -80,7 +80,7 @@ class Poses:
     def from_cameras(
         cls, rotations: np.ndarray, centers: np.ndarray, stated: list[Stated] | None = None
     ) -> Poses:
-        """rotations: (N, 3, 3) cam_from_world of the photos as stored; centers: (N, 3); stated: in their order"""
+        """rotations: (N, 3, 3) cam_from_world of the photos as stored; centers: (N, 3); stated: of each"""
         stated = stated or [Stated()] * len(rotations)
         shown = np.stack([_shown_axes(each.orientation) for each in stated]) @ rotations[:, :2]
         up = [np.full(3, np.nan) if each.up is None else each.up for each in stated]
@@ -142,22 +142,23 @@ def view_poses(views: list[View], images: Path) -> Poses:
 
 
 def scene_up(scene: Scene) -> np.ndarray | None:
-    """(3,) up in the world of a scene, by its cameras, whatever frame it is in; None if it has none, or they do
-    not say.
+    """(3,) up in the world of a scene, by its cameras, whatever frame it is in; None if it has none, or
+    they do not say.
     """
     found = _scene_direction(scene)
     return None if found is None else found.up
 
 
 def tell_tilt(scene: Scene) -> None:
-    """One warning where z, which stands for up in a scene without a georeference, is not up by its cameras."""
+    """One warning where z, which stands for up in a scene without a place, is not up by its cameras."""
     found = _scene_direction(scene)
     if found is None:
         return
     tilt = angle(found.up, np.array([0.0, 0.0, 1.0]))
     if tilt > max(2 * APART, 3 * found.deviation):
         logger.warning(
-            "z of %s is %.0f degrees off up by its cameras (%s): views and exports take z as up, so turn the model in the program that made it, or give it a place (`sc3d georeference`)",
+            "z of %s is %.0f degrees off up by its cameras (%s): views and exports take z as up, so turn the "
+            "model in the program that made it, or give it a place (`sc3d georeference`)",
             scene.path,
             tilt,
             found.how,
@@ -219,14 +220,20 @@ def _from_cameras(poses: Poses, rows: UpDirection | None, points: np.ndarray) ->
 
 def _doubt(found: UpDirection, rows: UpDirection | None, gimbal: UpDirection | None) -> str:
     if gimbal is not None and gimbal.deviation > UNSURE:
-        return f"gimbal angles in XMP do not fit the cameras, by about {gimbal.deviation:.0f} degrees: they are not used, up is from {found.how}"
+        return (
+            f"gimbal angles in XMP do not fit the cameras, by about {gimbal.deviation:.0f} degrees: "
+            f"they are not used, up is from {found.how}"
+        )
     apart = 0.0 if rows is None else angle(found.up, rows.up)
     if rows is not None and apart > max(APART, 3 * rows.deviation):
         return (
             f"up from {found.how} and up from {rows.how} are {apart:.0f} degrees apart: the former is taken"
         )
     if found.deviation > 2 * UNSURE:
-        return f"up is not sure, by about {found.deviation:.0f} degrees: it is from {found.how}; control points or GPS would tell"
+        return (
+            f"up is not sure, by about {found.deviation:.0f} degrees: it is from {found.how}; "
+            "control points or GPS would tell"
+        )
     return ""
 
 
@@ -290,8 +297,8 @@ def _upright(up: np.ndarray, poses: Poses) -> np.ndarray:
 
 
 def _across(level: np.ndarray, other: np.ndarray) -> UpDirection | None:
-    """Direction across the `level` axes (N, 3) of most cameras, and across the `other` of the rest, which were
-    held on their sides; sign open. None if that holds for fewer than AGREED of them.
+    """Direction across the `level` axes (N, 3) of most cameras, and across the `other` of the rest, which
+    were held on their sides; sign open. None if that holds for fewer than AGREED of them.
     """
     num, limit = len(level), np.sin(np.radians(OFF_LEVEL))
     if num < 2:
@@ -359,8 +366,8 @@ def _all_headings(poses: Poses) -> bool:
 
 
 def _from_kind(poses: Poses, walk: UpDirection | None, points: np.ndarray) -> UpDirection:
-    """Up where rows tell one direction at most: photos that look ahead, or down, by what their cameras and the
-    ground below them are like.
+    """Up where rows tell one direction at most: photos that look ahead, or down, by what their cameras and
+    the ground below them are like.
     """
     if np.linalg.norm(poses.down.mean(axis=0)) < np.cos(np.radians(SAME_WAY)):
         return _guess(poses, points)
@@ -373,7 +380,10 @@ def _from_kind(poses: Poses, walk: UpDirection | None, points: np.ndarray) -> Up
         return below if same_way and tilt < max(APART, 2 * walk.deviation) else walk
     if tops is not None:
         return tops
-    doubt = "up is not sure: all photos look the same way, from one line, and nothing tells whether ahead or down. Down is taken; control points or GPS would tell"
+    doubt = (
+        "up is not sure: all photos look the same way, from one line, and nothing tells whether ahead or "
+        "down. Down is taken; control points or GPS would tell"
+    )
     return replace(below, deviation=VAGUE, doubt=doubt) if same_way else _guess(poses, points)
 
 
@@ -411,8 +421,8 @@ def _guess(poses: Poses, points: np.ndarray) -> UpDirection:
 
 
 def _refine(found: UpDirection, poses: Poses, points: np.ndarray) -> UpDirection:
-    """Up turned away from a wall before photos that look ahead, and, where it is unsure, towards a ground below
-    the cameras: as much as they are surer.
+    """Up turned away from a wall before photos that look ahead, and, where it is unsure, towards a ground
+    below the cameras: as much as they are surer.
     """
     ahead = abs((poses.forward @ found.up).mean()) < 0.5
     if found.deviation >= GUESS:
@@ -445,7 +455,7 @@ def _distance(poses: Poses, points: np.ndarray) -> float:
 
 
 def _ground(poses: Poses, points: np.ndarray, up: np.ndarray) -> np.ndarray | None:
-    """(3,) normal of a plane below all cameras, with little under it, that leans by less than NEAR; or None."""
+    """(3,) normal of a plane below all cameras, with little under it, that leans by less than NEAR."""
     low = points[points @ up < (poses.centers @ up).min()]
     thickness = THIN * _distance(poses, points)
     found = _plane(low, thickness, lambda normals: np.abs(normals @ up) > np.cos(np.radians(NEAR)))
@@ -458,8 +468,8 @@ def _ground(poses: Poses, points: np.ndarray, up: np.ndarray) -> np.ndarray | No
 
 
 def _wall(poses: Poses, points: np.ndarray, found: UpDirection) -> np.ndarray | None:
-    """(3,) normal of a plane that holds MIN_SUPPORT of the points and is upright within what up is known to; or
-    None.
+    """(3,) normal of a plane that holds MIN_SUPPORT of the points and is upright within what up is known to;
+    or None.
     """
     lean = np.sin(np.radians(min(found.deviation, NEAR)))
     plane = _plane(points, THIN * _distance(poses, points), lambda normals: np.abs(normals @ found.up) < lean)

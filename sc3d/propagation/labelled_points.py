@@ -18,7 +18,8 @@ class LabelledPoints:
     """What is known of N points, canonical order.
 
     points: (N, 3) world; seeds: labels of fusion, which are channels (`sc3d.scene.channels`); votes: (N, C + 1)
-        float32 or None, column 0 is ignored; colors: (N, 3) uint8 or None; up: (3,) of the cameras, None = not known
+        float32 or None, column 0 is ignored; colors: (N, 3) uint8 or None
+    up: (3,) of the cameras, None = not known
     """
 
     points: np.ndarray

@@ -46,8 +46,8 @@ class NormalStatistics:
 
 @dataclass(frozen=True)
 class GroundModel:
-    """A frame and a raster over it. Up is the main direction of the normals if that is near the cameras' up, as
-    it is over ground of any slope; else, as before a facade, the cameras' up itself.
+    """A frame and a raster over it. Up is the main direction of the normals if that is near the cameras' up,
+    as it is over ground of any slope; else, as before a facade, the cameras' up itself.
 
     low: (3,) world corner of the cloud; up: (3,); axes: (3, 2); corner: (2,) of the raster, in the frame;
         cell, spacing: world units; shape: of the raster
@@ -137,8 +137,8 @@ class GroundModel:
 
 
 def relief_features(graph: Graph, points: np.ndarray, camera_up: np.ndarray | None = None) -> np.ndarray:
-    """(N, 4) float32 features of a whole cloud; points: (N, 3) world, in the order of the graph; camera_up: (3,),
-    None = not known
+    """(N, 4) float32 features of a whole cloud; points: (N, 3) world, in the order of the graph; camera_up:
+    (3,), None = not known
     """
     terrain = GroundModel.from_statistics(
         NormalStatistics.from_normals(graph.normals, graph.spacings),
