@@ -23,7 +23,7 @@ class Synthesize:
     """Fixes the world, the cameras and the mask errors."""
     views: int | None = None
     """Number of photos. Aerial: 40 by default, a nadir grid (60 %) and two oblique rings; street: 24, three
-    of four from the pavements.
+    of four from the pavement.
     """
     width: int = 800
     """Width of the photos, px; the height follows at 3:2."""

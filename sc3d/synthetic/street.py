@@ -97,7 +97,7 @@ def _plant(
     for side in (-1.0, 1.0):
         for x in np.arange(-reach, reach, 9.5):
             spot = _on_ground(ground, x + rng.uniform(-2.5, 2.5), side * rng.uniform(5.5, 6.1))
-            add_tree(builder, spot, rng.uniform(1.2, 1.8), rng, NEAR_LEAF, stem=2.3)
+            add_tree(builder, spot, rng.uniform(1.3, 2.0), rng, NEAR_LEAF, stem=rng.uniform(2.2, 2.9))
         for x in np.arange(-reach, reach, 1.9):
             if rng.random() < 0.5:
                 size = rng.uniform(0.3, 0.55)

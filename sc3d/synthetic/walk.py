@@ -1,4 +1,4 @@
-"""The walk: photos from eye height on both pavements of a street, and low oblique ones above the carriageway."""
+"""The walk: photos from eye height on the pavement of a street, and low oblique ones from above it."""
 
 from __future__ import annotations
 
@@ -12,29 +12,27 @@ from sc3d.synthetic.ground import Ground
 EYE_HEIGHT = 1.6  # m
 PAVEMENT = 4.1  # m from the middle of the street to the photographer
 REACH = 0.22  # the walk ends this far from the middle, in sides of the site
-# degrees from straight across the street, and up; one after the other
+# degrees to the right of straight across the street, and up; one after the other
 GAZES = (
-    (22.0, 9.0),
-    (-24.0, 2.0),
-    (10.0, -23.0),
-    (-20.0, 11.0),
-    (55.0, 4.0),
-    (-12.0, 6.0),
-    (26.0, -14.0),
-    (-55.0, 3.0),
+    (16.0, 9.0),
+    (-18.0, 11.0),
+    (6.0, -21.0),
+    (-14.0, 6.0),
+    (40.0, 5.0),
+    (10.0, 12.0),
+    (-40.0, 4.0),
+    (-6.0, -12.0),
 )
 
 
 def walk(settings: Synthesize, ground: Ground) -> list[View]:
     """True cameras, `settings.num_views` of them: names view_000.jpg ..., pinhole, world = site center, z up,
-    meters, the street along x. First one pavement, then the other, both looking across to the facades of the
-    other side, then every fourth photo from 5 to 8 m above the carriageway.
+    meters, the street along x. All stand in the south and see the row of houses in the north: three of four
+    from the pavement, the last quarter from 5 to 8 m above the edge of the carriageway.
     """
     rng = np.random.default_rng([settings.seed, 2])
     num_low = settings.num_views // 4
-    num_near = (settings.num_views - num_low + 1) // 2
-    poses = _pavement_poses(num_near, -1.0, settings, ground, rng)
-    poses += _pavement_poses(settings.num_views - num_low - num_near, 1.0, settings, ground, rng)
+    poses = _pavement_poses(settings.num_views - num_low, settings, ground, rng)
     poses += _low_poses(num_low, settings, ground, rng)
     digits = max(3, len(str(settings.num_views - 1)))
     size = (settings.width, settings.height)
@@ -44,29 +42,34 @@ def walk(settings: Synthesize, ground: Ground) -> list[View]:
 
 
 def _pavement_poses(
-    num: int, side: float, settings: Synthesize, ground: Ground, rng: np.random.Generator
+    num: int, settings: Synthesize, ground: Ground, rng: np.random.Generator
 ) -> list[np.ndarray]:
-    """Photos held by hand; side: -1 or 1, of the street."""
+    """Photos held by hand, from west to east."""
     poses = []
-    for i, x in enumerate(np.linspace(-1, 1, num) * REACH * settings.side if num > 1 else [0.0]):
+    for i, x in enumerate(_stations(num, settings)):
         aside, up = np.array(GAZES[i % len(GAZES)]) + rng.normal(0, 1.5, 2)
-        place = np.array([x, side * PAVEMENT]) + rng.normal(0, [0.25, 0.12])
+        place = np.array([x, -PAVEMENT]) + rng.normal(0, [0.25, 0.12])
+        poses.append(_pose(ground, place, EYE_HEIGHT + rng.normal(0, 0.05), (90.0 - aside, up), rng))
+    return poses
+
+
+def _low_poses(
+    num: int, settings: Synthesize, ground: Ground, rng: np.random.Generator
+) -> list[np.ndarray]:
+    """Photos from a pole, turned to the east and to the west in turn."""
+    poses = []
+    for i, x in enumerate(_stations(num, settings)):
+        aside = rng.uniform(22.0, 40.0) * (1.0 if i % 2 == 0 else -1.0)
+        place = np.array([x, -2.0]) + rng.normal(0, 0.3, 2)
         poses.append(
-            _pose(ground, place, EYE_HEIGHT + rng.normal(0, 0.05), (-side * 90.0 + side * aside, up), rng)
+            _pose(ground, place, rng.uniform(5.0, 8.0), (90.0 - aside, rng.uniform(-20.0, -8.0)), rng)
         )
     return poses
 
 
-def _low_poses(num: int, settings: Synthesize, ground: Ground, rng: np.random.Generator) -> list[np.ndarray]:
-    """Photos from a pole, turned along the street and to its sides in turn."""
-    poses = []
-    for i, x in enumerate(np.linspace(-1.1, 1.1, num) * REACH * settings.side if num > 1 else [0.0]):
-        inwards = 1.0 if x <= 0 else -1.0
-        side = 1.0 if i % 2 == 0 else -1.0
-        heading = np.degrees(np.arctan2(side * rng.uniform(0.7, 1.1), inwards))
-        place = np.array([x, -0.8 * side]) + rng.normal(0, 0.3, 2)
-        poses.append(_pose(ground, place, rng.uniform(5.0, 8.0), (heading, rng.uniform(-20.0, -6.0)), rng))
-    return poses
+def _stations(num: int, settings: Synthesize) -> np.ndarray:
+    """(num,) x of the photos."""
+    return np.linspace(-1, 1, num) * REACH * settings.side if num > 1 else np.zeros(num)
 
 
 def _pose(
