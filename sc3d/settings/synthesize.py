@@ -45,6 +45,8 @@ class Synthesize:
             raise InputError("views and num_points must be at least 1, width at least 32")
         if self.side < 40 or self.altitude < 20:
             raise InputError("extent must be at least 40 m and altitude at least 20 m")
+        if self.kind == "street" and self.altitude != 60:
+            raise InputError("altitude is that of an aerial site: leave it out for a street")
         if self.mask_noise < 0 or self.gps_noise < 0:
             raise InputError("mask_noise and gps_noise must not be negative")
 

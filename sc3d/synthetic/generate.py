@@ -41,7 +41,8 @@ CLASSES = [
 ]
 # fmt: on
 FOLDERS = ("images", "truth_depth", "truth", "truth_sky", "masks", "confidence")
-NUM_SPARSE = 16_000  # candidates for sparse points; those seen by three views are kept
+# candidates for sparse points; those seen by three views are kept, of a street fewer of them
+NUM_SPARSE, NUM_SPARSE_STREET = 16_000, 50_000
 
 
 def synthesize(
@@ -142,7 +143,10 @@ def _mesh(world: World) -> o3d.t.geometry.TriangleMesh:
 def _write_sparse(path: Path, world: World, views: list[View], settings: Synthesize) -> int:
     """Write the true cameras and points with tracks as a COLMAP model; returns the number of points."""
     points, triangles, observations = find_tracks(
-        world, views, NUM_SPARSE, np.random.default_rng([settings.seed, 7])
+        world,
+        views,
+        NUM_SPARSE_STREET if world.street else NUM_SPARSE,
+        np.random.default_rng([settings.seed, 7]),
     )
     colors = display(world.light(points.astype(np.float32), triangles, np.full(len(points), 0.1, np.float32)))
     write_model(path, build_model(views, points, colors, observations))

@@ -53,9 +53,7 @@ def _pavement_poses(
     return poses
 
 
-def _low_poses(
-    num: int, settings: Synthesize, ground: Ground, rng: np.random.Generator
-) -> list[np.ndarray]:
+def _low_poses(num: int, settings: Synthesize, ground: Ground, rng: np.random.Generator) -> list[np.ndarray]:
     """Photos from a pole, turned to the east and to the west in turn."""
     poses = []
     for i, x in enumerate(_stations(num, settings)):
