@@ -35,7 +35,7 @@ def build_street(settings: Synthesize) -> tuple[World, list[View]]:
         add_town_house(builder, building, streams[2])
     _add_curbs(builder, ground)
     _plant(builder, ground, buildings, views, streams[3])
-    _park_cars(builder, ground, streams[4])
+    _park_cars(builder, ground, views, streams[4])
     _add_lamps(builder, ground, streams[5])
     return finish_world(settings.seed, ground, buildings, builder, street=True), views
 
@@ -142,13 +142,16 @@ def _hang_bough(builder: MeshBuilder, ground: Ground, view: View, rng: np.random
     add_bough(builder, trunk + [0.0, 0.0, 2.5], tip, rng)
 
 
-def _park_cars(builder: MeshBuilder, ground: Ground, rng: np.random.Generator) -> None:
-    """Cars along both curbs."""
+def _park_cars(builder: MeshBuilder, ground: Ground, views: list[View], rng: np.random.Generator) -> None:
+    """Cars along both curbs, but not right before a photographer who looks down at the road."""
+    down = np.array([view.center[0] for view in views if view.cam_from_world[2, 2] < -0.1])
     reach = ground.extent / 2 + BEYOND
     for side in (-1.0, 1.0):
         for x in np.arange(-reach, reach, 6.5):
             if rng.random() < (0.2 if side < 0 else 0.5):  # few that hide the houses
                 spot = _on_ground(ground, x + rng.uniform(-0.8, 0.8), side * rng.uniform(1.95, 2.05))
+                if side < 0 and (np.abs(down - spot[0]) < 2.6).any():
+                    continue
                 _add_car(builder, spot, 0.0 if side < 0 else np.pi, rng)
 
 

@@ -343,7 +343,9 @@ def test_walls_in_the_sky_spikes_and_stored_depth_are_counted(tmp_path, monkeypa
     (truth.path / "truth_depth").mkdir()
     for name in ("a", "b"):
         np.save(truth.path / "truth_depth" / f"{name}.npy", exact)
-        write_image(truth.truth / f"{name}.png", (exact > 0).astype(np.uint8))
+        label = (exact > 0).astype(np.uint8)
+        label[39] = 2  # trees
+        write_image(truth.truth / f"{name}.png", label)
         file = depth_file(scene.depth, f"{name}.jpg")
         file.parent.mkdir(exist_ok=True)
         normals, num_views = np.zeros((20, 20, 3), np.int8), np.full((20, 20), 2, np.uint8)
