@@ -9,7 +9,7 @@ from PIL import ExifTags, Image
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, pinhole_view, project, rays
-from sc3d.io.images import read_index_image
+from sc3d.io.mask_images import read_index_image
 from sc3d.scene.scene import read_sparse_model
 from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.facades import RECESS, Opening, _add_opening, _add_wall, choose_style

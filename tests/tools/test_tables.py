@@ -17,8 +17,9 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin, pinhole_view
 from sc3d.io.clouds import read_cloud, write_geometry
 from sc3d.io.colmap import build_model, write_model
-from sc3d.io.images import read_index_image, write_image
+from sc3d.io.images import write_image
 from sc3d.io.json_files import write_json
+from sc3d.io.mask_images import read_index_image
 from sc3d.io.splats import write_splat_ply
 from sc3d.labelling.cloud import Cloud
 from sc3d.scene.depth_map import depth_file
