@@ -54,8 +54,8 @@ class Opening:
 
 @dataclass(frozen=True)
 class Style:
-    """wall: material; the others: linear RGB, (3,); shutters: beside the windows, for each of them; balconies,
-    lintels: there are some.
+    """wall: material; tint of the wall, trim, wood and roof: linear RGB, (3,); shutters, balconies: the house has
+    some.
     """
 
     wall: int

@@ -148,7 +148,7 @@ def _park_cars(builder: MeshBuilder, ground: Ground, views: list[View], rng: np.
     reach = ground.extent / 2 + BEYOND
     for side in (-1.0, 1.0):
         for x in np.arange(-reach, reach, 6.5):
-            if rng.random() < (0.2 if side < 0 else 0.5):  # few that hide the houses
+            if rng.random() < (0.2 if side < 0 else 0.5):  # the near ones hide the houses
                 spot = _on_ground(ground, x + rng.uniform(-0.8, 0.8), side * rng.uniform(1.95, 2.05))
                 if side < 0 and (np.abs(down - spot[0]) < 2.6).any():
                     continue
