@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
@@ -47,8 +47,10 @@ class BenchmarkTables:
     ]
     scenes: tuple[Path, ...] = ()
     """Scene folders to add; each needs cloud.ply, masks/ and truth/."""
+    kinds: tuple[Literal["aerial", "street"], ...] = ("aerial", "street")
+    """Kinds of synthetic scenes, each with every seed: WORKDIR/seed<n> and WORKDIR/street<n>."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Synthetic scenes, in WORKDIR/seed<n>."""
+    """Seeds of the synthetic scenes."""
     noises: tuple[float, ...] = (0.5, 1.0, 1.5)
     """Strengths of the mask errors, for every seed."""
     views: int = 40
@@ -89,8 +91,8 @@ class BenchmarkFusionSpeed:
 
 @dataclass(frozen=True)
 class BenchmarkSurface:
-    """Compare gaussians.ply and mesh.ply of a scene with the exact depth and surface of the synthetic scene
-    that its photos come from.
+    """Compare gaussians.ply (without it depth/) and mesh.ply of a scene with the exact depth and surface of
+    the synthetic scene, of either kind, that its photos come from.
     """
 
     scene: Annotated[Positional[Path], arg(help="Reconstructed scene folder, with the true cameras.")]
