@@ -44,7 +44,10 @@ def render(
     if any(tensor.dtype != torch.float32 for tensor in gaussians.parameters().values()):
         raise ValueError("Gaussians must be float32 to be rendered")
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
-    backend, median = render_cpu if device.has_kernels(gaussians.means) else render_gpu, depth_mode == "median"
+    backend, median = (
+        render_cpu if device.has_kernels(gaussians.means) else render_gpu,
+        depth_mode == "median",
+    )
     return backend(gaussians, view, degree, background, geometry, geometry and median)
 
 

@@ -1,12 +1,16 @@
 """Numba kernels: the depth at which half of a pixel's light is gone, and its gradient.
 
-The ray of a pixel meets the plane of fragment i at depth z_i, where it loses the weight w_i (both of
-`rasterization`). The transmittance along the ray, 1 - sum of w_i over z_i < z, is averaged over one pixel's
-footprint z_i / f, f = focal length in px, which makes it continuous; the median depth z is where it is 1/2:
+The ray of a pixel meets the plane of fragment i at depth z_i, where it loses the weight w_i (that of
+`rasterization`, in the order of the means). The transmittance along the ray, 1 - sum of w_i over z_i < z, is
+averaged over one pixel's footprint z_i / f, f = focal length in px, which makes it continuous; the median
+depth z is where it is 1/2:
     F(z) = sum w_i c_i = 1/2,   c_i = f (z s_i - 1) + 1/2 cut to [0, 1],   s_i = 1 / z_i = -(n_i . r) / d_i
-s_i is linear in the pixel. Fragments are weighed in the order of their means, as everywhere, but F does not
-ask for their order: where planes cross between two pixels, z does not jump. Its gradient is that of the
-implicit function, dz = -dF / F'(z).
+s_i is linear in the pixel; a plane that the ray does not meet before the camera is at infinity, s_i <= 0.
+The gradient is that of the implicit function: dz = -dF / F'(z).
+
+Taken without that average, at the fragment that brings the product of 1 - alpha to 1/2, depth follows one
+plane in one pixel and another in the next; interpolated between that fragment and the one before it, a faint
+floater would draw the surface behind it into the air.
 
 F is monotone: each walk over a tile's fragments evaluates it at 8 depths between those that still enclose
 the solution.
@@ -51,7 +55,7 @@ MIN_SLOPE = 0.01  # sum of the weights within the footprint; below it the depth 
 _PROBES = 8
 _FIRST = (120.0, 20.0, 3.0, 0.5)  # footprints between the first probes and the blended depth
 _WALKS = 8  # mostly 3 are enough
-_ACCURACY = 0.02  # footprints between the depths that enclose the solution, which is interpolated in between
+_ACCURACY = 0.1  # footprints between the depths that enclose the solution, which is interpolated in between
 _SCALE = np.float32(LOG2E_HALF)
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
@@ -112,19 +116,27 @@ def _probe_tile(tiles, tile, frame, camera, pixels):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _first_probes(x, y, camera, image, probes):
-    """Fills probes (8,), inverse depths from near to far around the blended one; whether this pixel can have
-    a median depth.
+def _spread(bracket, probes):
+    """Fills probes (8,) evenly between the ends of a bracket."""
+    for k in range(_PROBES):
+        probes[k] = bracket[0] + (k + 1) / (_PROBES + 1) * (bracket[1] - bracket[0])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _first_probes(x, y, camera, image, bracket, probes):
+    """Fills bracket (`_narrow`) and probes (8,), inverse depths from near to far around the blended one, if
+    there is one.
     """
+    bracket[:], bracket[0] = 0.0, 1.0 / NEAR
     across, down = (x + 0.5 - camera[14]) / camera[12], (y + 0.5 - camera[15]) / camera[13]
     facing = -(image[3, y, x] * across + image[4, y, x] * down + image[5, y, x])
-    if image[7, y, x] < 0.5 or not facing > 1e-6 or not image[6, y, x] > 0.0:
-        return False
+    if not facing > 1e-6 or not image[6, y, x] > 0.0:
+        _spread(bracket, probes)
+        return
     middle, count = facing / image[6, y, x], len(_FIRST)
     for k in range(count):
         factor = 1.0 + _FIRST[k] / _focal(camera)
         probes[k], probes[2 * count - 1 - k] = middle * factor, middle / factor
-    return True
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -137,8 +149,7 @@ def _narrow(place, pixels, probes, bracket):
         else:
             bracket[1], bracket[3] = probes[k], value
             break
-    for k in range(_PROBES):
-        probes[k] = bracket[0] + (k + 1) / (_PROBES + 1) * (bracket[1] - bracket[0])
+    _spread(bracket, probes)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -156,11 +167,12 @@ def _solve_tile(tiles, tile, frame, camera, image, depth):
     left, top, rows, columns = frame
     focal, pixels = _focal(camera), np.empty((1 + 2 * _PROBES) * PLANE, np.float32)
     active, probes = np.empty((rows, columns), np.bool_), np.empty((rows, columns, _PROBES))
-    brackets = np.zeros((rows, columns, 4))
+    brackets = np.empty((rows, columns, 4))
     for row in range(rows):
         for column in range(columns):
-            active[row, column] = _first_probes(left + column, top + row, camera, image, probes[row, column])
-            brackets[row, column, 0] = 1.0 / NEAR
+            x, y = left + column, top + row
+            active[row, column] = image[7, y, x] >= 0.5
+            _first_probes(x, y, camera, image, brackets[row, column], probes[row, column])
     for walk in range(_WALKS):
         if not active.any():
             return
@@ -292,9 +304,7 @@ def _backward_tile(tiles, tile, frame, camera, pixels, gradients):
                 g = load(pixels, place + 2 * PLANE) * w
                 q = where_at_least(c, zero, where_at_least(one, c, g * focal_depth))
                 q_row, qx_sum = q_row + q, fma(q, across_tile, qx_sum)
-                s = alpha_gradient(
-                    pixels, place, g * minimum(maximum(c, zero), one), alpha, exponent
-                )
+                s = alpha_gradient(pixels, place, g * minimum(maximum(c, zero), one), alpha, exponent)
                 su = s * u
                 s_row, su_row, suu_sum = s_row + s, su_row + su, fma(su, u, suu_sum)
                 x_sum = x_sum + absolute(su)
