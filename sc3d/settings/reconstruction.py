@@ -107,7 +107,7 @@ class Extract:
     """
     depth_mode: DepthMode = "blended"
     """Depth that the Gaussians render: of the alpha-blended planes, or where half of the light is gone (median):
-    sharper where surfaces lie behind one another (tsdf).
+    it does not mix surfaces that lie behind one another; any trained model will do (tsdf).
     """
     max_size: int = 800
     """Longest side of the depth maps, px."""

@@ -53,7 +53,9 @@ class TrainSettings:
     surface_from: float = 0.25
     """when normal and multi-view terms begin, fraction of the run"""
     depth_mode: DepthMode = "blended"
-    """depth that these terms look at: of the alpha-blended planes, or where half of the light is gone (median)"""
+    """depth that the normal and multi-view terms look at: of the alpha-blended planes, or where half of the
+    light is gone (median), which takes more time
+    """
     num_neighbors: int = 8
     """neighboring views to choose from"""
     num_patches: int = 8192

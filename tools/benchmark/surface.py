@@ -13,6 +13,7 @@ from sc3d.geometry.raycast import Surface, first_surface, see_points
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.images import read_index_image
 from sc3d.scene.scene import Scene
+from sc3d.settings.common import DepthMode
 from sc3d.splatting.dataset import load_gaussians
 from sc3d.splatting.evaluation import depth_map
 from sc3d.splatting.gaussians import Gaussians
@@ -45,7 +46,9 @@ class SurfaceFigures:
     voxel_size: float
 
 
-def surface_figures(scene: Scene, truth: Scene, voxel_size: float) -> SurfaceFigures:
+def surface_figures(
+    scene: Scene, truth: Scene, voxel_size: float, depth_mode: DepthMode = "blended"
+) -> SurfaceFigures:
     """Compare gaussians.ply and mesh.ply of `scene` with truth_depth/, truth/, truth.ply and truth_mesh.ply of
     `truth`, whose cameras it must have.
     """
@@ -53,14 +56,14 @@ def surface_figures(scene: Scene, truth: Scene, voxel_size: float) -> SurfaceFig
     views = [view.shifted(origin) for view in scene.model.views]
     mesh, true_mesh = _surface(scene.mesh, origin), _surface(truth.path / "truth_mesh.ply", origin)
     ids = {entry.name: entry.id for entry in truth.class_table()}
-    depth = _depth_errors(load_gaussians(scene)[0], mesh, views, truth, ids["tree"])
+    depth = _depth_errors(load_gaussians(scene)[0], mesh, views, truth, ids["tree"], depth_mode)
     completeness = _completeness(mesh, true_mesh, views, truth, WITHIN * voxel_size, origin)
     accuracy = float((_distances(true_mesh, _samples(scene, origin)) <= WITHIN * voxel_size).mean())
     return SurfaceFigures(**depth, completeness=completeness, accuracy=accuracy, voxel_size=voxel_size)
 
 
 def _depth_errors(
-    gaussians: Gaussians, mesh: Surface, views: list[View], truth: Scene, tree: int
+    gaussians: Gaussians, mesh: Surface, views: list[View], truth: Scene, tree: int, depth_mode: DepthMode
 ) -> dict[str, float]:
     errors, labels, shares = [], [], []
     for view in tqdm(views, desc="depth", unit="view", disable=None):
@@ -70,7 +73,7 @@ def _depth_errors(
             read_index_image(truth.truth / f"{stem}.png"),
         )
         small = undistorted(view, max(exact.shape))
-        depth, alpha, _ = depth_map(gaussians, small)
+        depth, alpha, _ = depth_map(gaussians, small, depth_mode)
         known = np.isfinite(exact) & (exact > 0)
         used = known & (alpha > MIN_ALPHA) & (depth > 0)
         errors.append(np.abs(depth[used] - exact[used]) / exact[used])

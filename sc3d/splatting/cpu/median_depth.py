@@ -333,7 +333,7 @@ def _load_depth(pixels, plane, frame, camera, depth):
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
 def backward(tiles, camera, depth, depth_gradient, gradients):
-    """Reverse of `solve`: adds to gradients (P * 16,). depth, depth_gradient: (H, W)"""
+    """Reverse of `solve`: adds to gradients (P * 16,), also to their absolute sums. depth, depth_gradient: (H, W)"""
     height, width = depth.shape
     for item in numba.prange(tiles.order.shape[0]):
         tile = tiles.order[item]

@@ -3,11 +3,12 @@
 The rules are those of the CPU kernels: near plane 0.01, +0.3 px^2, Jacobian clamp at 1.3 tan(fov / 2) around
 the real principal point, pixel centers at +0.5, fragments from alpha 1/255 on. gsplat bins boxes of
 min(3.33, sqrt(2 ln(255 opacity))) standard deviations, rounded up to whole pixels; alpha is below 1/255
-outside of them, so no fragment is lost. It differs in four ways:
+outside of them, so no fragment is lost. It differs in five ways:
 - alpha is limited to 0.999 instead of 0.99;
 - a pixel ends before the fragment that would bring its transmittance to 1e-4 instead of after it;
 - a Gaussian is visible (radius > 0) if that box touches the image, the CPU's if the box without rounding
   holds a pixel center;
+- absolute gradients leave out what comes through the median depth;
 - sums are float32 in the order of the GPU's atomic additions: gradients vary in their last digits from run to
   run.
 """
