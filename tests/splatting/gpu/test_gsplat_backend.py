@@ -221,7 +221,7 @@ def test_image_and_gradients_equal_gsplat(reference, count, size, sh_degree):
 
 def test_median_depth_and_its_gradients_equal_the_kernels(functions, monkeypatch):
     monkeypatch.setattr(gsplat_backend, "BAND_PIXELS", 96 * 20)  # several bands
-    gaussians, view = make_scene(600, 1, seed=4, size=-1.6), make_view()
+    gaussians, view = make_scene(300, 1, seed=4, size=-1.4), make_view()
     cpu, gpu = with_gradients(gaussians), with_gradients(gaussians)
     expected = render(cpu, view, depth_mode="median").median_depth
     found = render_gpu(gpu, view, 0, None, True, True).median_depth
