@@ -18,7 +18,7 @@ from sc3d.importers.photos import locate_photos
 from sc3d.importers.project import Project, project_files, read_project, warn_of_left_out
 from sc3d.io.atomic import require_writable
 from sc3d.io.clouds import write_geometry
-from sc3d.io.images import find_photos, require_place
+from sc3d.io.photo_folder import find_photos, require_place
 from sc3d.runner import execute
 from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
