@@ -106,8 +106,8 @@ class Extract:
     as the cloud.
     """
     depth_mode: DepthMode = "blended"
-    """Depth that the Gaussians render: of the alpha-blended planes, or where half of the light is gone (median):
-    it does not mix surfaces that lie behind one another; any trained model will do (tsdf).
+    """Depth that the Gaussians render: of the alpha-blended planes, or where half of the light is gone
+    (median): it does not mix surfaces that lie behind one another; any trained model will do (tsdf).
     """
     max_size: int = 800
     """Longest side of the depth maps, px."""

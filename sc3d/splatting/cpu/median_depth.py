@@ -83,7 +83,7 @@ def _passed(inverse_depth, focal_depth, offset):
 
 @numba.njit(cache=True, error_model="numpy")
 def _probe_tile(tiles, tile, frame, camera, pixels):
-    """Evaluates F. pixels: planes transmittance, F at each of the probes (0 on entry), f z of each of them."""
+    """Evaluates F. pixels: planes transmittance, F at each of the probes (0 on entry), f z of each."""
     records, lane, first = tiles.records, ramp(), tiles.starts[tile]
     offset = splat(np.float32(0.5 - _focal(camera)))
     lines, ends = np.empty(3 * TILE, np.float32), np.empty(2 * TILE, np.int32)
@@ -141,7 +141,7 @@ def _first_probes(x, y, camera, image, bracket, probes):
 
 @numba.njit(cache=True, error_model="numpy")
 def _narrow(place, pixels, probes, bracket):
-    """Moves the bracket (near end, far end: inverse depths; F there) to the two probes (8,) around F = 1/2."""
+    """Moves the bracket (near and far inverse depth; F there) to the two probes (8,) around F = 1/2."""
     for k in range(_PROBES):
         value = pixels[place + (k + 1) * PLANE]
         if value < 0.5:
@@ -333,7 +333,10 @@ def _load_depth(pixels, plane, frame, camera, depth):
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
 def backward(tiles, camera, depth, depth_gradient, gradients):
-    """Reverse of `solve`: adds to gradients (P * 16,), also to their absolute sums. depth, depth_gradient: (H, W)"""
+    """Reverse of `solve`: adds to gradients (P * 16,), also to their absolute sums.
+
+    depth, depth_gradient: (H, W)
+    """
     height, width = depth.shape
     for item in numba.prange(tiles.order.shape[0]):
         tile = tiles.order[item]

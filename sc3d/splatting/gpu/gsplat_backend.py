@@ -242,7 +242,7 @@ def _half_depth(weights: Tensor, inverse: Tensor, pixels: Tensor, like: Tensor, 
 
 
 def _fragments(screen: _Screen, functions: Functions) -> Iterator[tuple[Tensor, Tensor]]:
-    """(M,) Gaussians and (M,) pixels of all fragments, a band of rows at a time, pixel by pixel and near to far.
+    """(M,) Gaussians and (M,) pixels of all fragments by bands of rows, pixel by pixel and near to far.
 
     gsplat lists those of a whole image, but a pixel that starts with transmittance 0 has none.
     """
