@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
+from sc3d.settings.common import DepthMode
 from sc3d.settings.synthesize import SynthesizeCity as SynthesizeCity
 
 
@@ -101,6 +102,8 @@ class BenchmarkSurface:
     ]
     voxel_size: float = 0.0
     """Voxel of the mesh, world units; 0 = as in mesh.ply.json."""
+    depth_mode: DepthMode = "blended"
+    """Depth of the Gaussians to compare, as for extract."""
     output: Path | None = None
     """JSON file for the figures; a Markdown table is written beside it."""
 

@@ -15,6 +15,7 @@ from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.mask_images import read_index_image
 from sc3d.scene.depth_map import depth_file, read_depth_map
 from sc3d.scene.scene import Scene
+from sc3d.settings.common import DepthMode
 from sc3d.splatting.dataset import load_gaussians
 from sc3d.splatting.evaluation import depth_map
 
@@ -53,7 +54,9 @@ class SurfaceFigures:
     voxel_size: float
 
 
-def surface_figures(scene: Scene, truth: Scene, voxel_size: float) -> SurfaceFigures:
+def surface_figures(
+    scene: Scene, truth: Scene, voxel_size: float, depth_mode: DepthMode = "blended"
+) -> SurfaceFigures:
     """Compare gaussians.ply and mesh.ply of `scene` with truth_depth/, truth/, truth.ply and truth_mesh.ply of
     `truth`, whose cameras it must have.
     """
@@ -61,7 +64,7 @@ def surface_figures(scene: Scene, truth: Scene, voxel_size: float) -> SurfaceFig
     views = [view.shifted(origin) for view in scene.model.views]
     mesh, true_mesh = _surface(scene.mesh, origin), _surface(truth.path / "truth_mesh.ply", origin)
     ids = {entry.name: entry.id for entry in truth.class_table()}
-    depth = _depth_errors(_depths_of(scene), mesh, views, truth, ids["tree"])
+    depth = _depth_errors(_depths_of(scene, depth_mode), mesh, views, truth, ids["tree"])
     completeness = _completeness(mesh, true_mesh, views, truth, WITHIN * voxel_size, origin)
     away = _distances(true_mesh, _samples(scene, origin)) / voxel_size
     return SurfaceFigures(
@@ -74,14 +77,14 @@ def surface_figures(scene: Scene, truth: Scene, voxel_size: float) -> SurfaceFig
     )
 
 
-def _depths_of(scene: Scene) -> Depth:
+def _depths_of(scene: Scene, depth_mode: DepthMode) -> Depth:
     """From the Gaussians if there are any, else from depth/."""
     if not scene.gaussians.exists():
         return lambda view: _stored_depth(scene, view)
     gaussians = load_gaussians(scene)[0]
 
     def rendered(view: View) -> tuple[np.ndarray, np.ndarray]:
-        depth, alpha, _ = depth_map(gaussians, view)
+        depth, alpha, _ = depth_map(gaussians, view, depth_mode)
         return depth, alpha > MIN_ALPHA
 
     return rendered

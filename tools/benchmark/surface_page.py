@@ -29,11 +29,13 @@ def run_surface(command: BenchmarkSurface) -> None:
         truth.classes,
     )
     truth.require(*exact, hint="the exact surface comes from `sc3d synthesize`")
-    figures = surface_figures(scene, truth, command.voxel_size or voxel_size_of(scene))
+    voxel_size = command.voxel_size or voxel_size_of(scene)
+    figures = surface_figures(scene, truth, voxel_size, command.depth_mode)
     record = {
         "benchmark": "surface",
         "scene": scene.path.resolve().name,
         "truth": truth.path.resolve().name,
+        "depth_mode": command.depth_mode,
         "versions": versions(),
         "figures": asdict(figures),
     }
