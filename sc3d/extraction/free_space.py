@@ -11,6 +11,7 @@ from sc3d.stereo.agreement import moved
 from sc3d.stereo.pinhole_pairs import stacked, transfers
 
 MARGIN = 0.03  # share of the depth by which a surface must lie behind to be another one
+Prepared = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 AROUND = 5  # px: outlines and ground at grazing angles are not surer
 MIN_COSINE = 0.2  # between ray and normal; flatter, MARGIN grows no more
 STEPS = 64  # depths tried along a ray
@@ -55,7 +56,7 @@ def farthest_free(
     return depth
 
 
-def _prepared(view: View, others: list[np.ndarray], views: list[View]) -> tuple[np.ndarray, ...]:
+def _prepared(view: View, others: list[np.ndarray], views: list[View]) -> Prepared:
     """Nearest inverse depth around every pixel, -1 = unknown, 0 = sky; sizes; the maps of the pixels."""
     inverses = [np.where(other > 0, 1 / np.where(other > 0, other, 1), -1) for other in others]
     inverses = [cv2.dilate(inverse.astype(np.float32), np.ones((AROUND, AROUND))) for inverse in inverses]

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from sc3d.errors import Sc3dError, left_out
 from sc3d.extraction.evidence import DepthViews, EvidenceStore, ViewEvidence
+from sc3d.settings.common import DepthMode
 from sc3d.splatting.consistency import consistent
 from sc3d.splatting.evaluation import facing_depth
 from sc3d.splatting.gaussians import Gaussians
@@ -22,20 +23,25 @@ COHERENT = 0.03  # of the depth, from pixel to pixel of one surface
 logger = logging.getLogger(__name__)
 
 
-def write_rendered(gaussians: Gaussians, data: DepthViews, store: EvidenceStore, min_views: int) -> float:
+def write_rendered(
+    gaussians: Gaussians, data: DepthViews, store: EvidenceStore, min_views: int, mode: DepthMode
+) -> float:
     """Write the evidence of all views, after that of stereo if the store holds some; returns the median size of a
     pixel on the surface, world units.
     """
-    footprint = _render(gaussians, data, store)
+    footprint = _render(gaussians, data, store, mode)
     for row in range(len(data.views)):
         store.write(row, _evidence(data, store, row, min_views))
     return footprint
 
 
-def _render(gaussians: Gaussians, data: DepthViews, store: EvidenceStore) -> float:
+def _render(gaussians: Gaussians, data: DepthViews, store: EvidenceStore, mode: DepthMode) -> float:
     footprints, empty = [], list[str]()
     for row, view in enumerate(tqdm(data.views, desc="depth", unit="view", disable=None)):
-        (depth, normals), (nearest, farthest) = facing_depth(gaussians, view, MAX_ANGLE), data.depth_range
+        (depth, normals), (nearest, farthest) = (
+            facing_depth(gaussians, view, MAX_ANGLE, mode),
+            data.depth_range,
+        )
         depth[(depth <= nearest) | (depth >= farthest)] = 0
         opaque = data.opaque(row)
         if opaque is not None:

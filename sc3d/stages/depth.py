@@ -10,8 +10,10 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import undistorted
 from sc3d.geometry.view_selection import neighbor_views
+from sc3d.georeferencing.georeference import georeference_path
+from sc3d.georeferencing.up_direction import find_up, view_poses
 from sc3d.io.atomic import atomic_path
-from sc3d.scene.scene import Scene, check_photos
+from sc3d.scene.scene import Scene, SparseModel, check_photos
 from sc3d.settings.reconstruction import Depth
 from sc3d.stereo.multi_view import MIN_SPARSE, StereoJob, estimate_depths, inverse_range, sparse_seeds
 from sc3d.tiling.executor import open_executor
@@ -46,16 +48,6 @@ def run(scene: Scene, settings: Depth) -> dict[str, object]:
     }
 
 
-def level_up(views):
-    rows = np.array([view.cam_from_world[0, :3] for view in views])
-    _, size, axes = np.linalg.svd(rows)
-    up = -np.mean([view.cam_from_world[1, :3] for view in views], axis=0)
-    if size[1] < 0.2 * size[0] or np.linalg.norm(up) < 0.5:
-        up = -np.mean([view.cam_from_world[2, :3] for view in views], axis=0)
-        return up / np.linalg.norm(up)
-    return axes[2] * np.sign(axes[2] @ up)
-
-
 def _job(scene: Scene, settings: Depth, work: WorkFolder) -> tuple[StereoJob, list[str]]:
     """What there is to do; names of the photos that see too few sparse points to begin with."""
     model = scene.model
@@ -84,8 +76,15 @@ def _job(scene: Scene, settings: Depth, work: WorkFolder) -> tuple[StereoJob, li
         [inverse_range(seed, baseline) for seed, baseline in zip(used, baselines, strict=True)],
         used,
         settings.max_size,
-        level_up(photo_views),
+        _up(scene, model),
         work.subfolder("passes"),
         scene.depth,
     )
     return job, [view.name for view, seed in zip(model.views, seeds, strict=True) if seed is None]
+
+
+def _up(scene: Scene, model: SparseModel) -> np.ndarray:
+    """(3,) unit, world: z where the scene has a place, else by the cameras."""
+    if georeference_path(scene).exists():
+        return np.array([0.0, 0.0, 1.0])
+    return find_up(view_poses(model.views, scene.images), model.points).up

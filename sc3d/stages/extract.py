@@ -68,7 +68,7 @@ def _from_gaussians(scene: Scene, settings: Extract, store: EvidenceStore) -> tu
         maps = _Maps(scene, data.views)
         for row in range(len(data.views)):
             store.write(row, maps.evidence(row, settings.min_views))
-    footprint = write_rendered(gaussians, data, store, settings.min_views)
+    footprint = write_rendered(gaussians, data, store, settings.min_views, settings.depth_mode)
     voxel_size = settings.voxel_size or default_voxel_size(points, footprint)
     return fuse_views(data, store, voxel_size, settings.fill), origin
 
