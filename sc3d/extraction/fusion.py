@@ -187,7 +187,7 @@ def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
 
 def _spread(depth: np.ndarray, image: np.ndarray) -> np.ndarray:
     """(H, W) depth of the pixel with a depth that is reached with the least change of color, up to BESIDE away."""
-    source = nearest_by_color(image, depth > 0)
+    source, _ = nearest_by_color(image, depth > 0)
     rows, columns = np.divmod(source, depth.shape[1])
     gap = np.hypot(np.arange(depth.shape[0])[:, None] - rows, np.arange(depth.shape[1]) - columns)
     return np.where((source >= 0) & (gap < BESIDE * max(depth.shape)), depth.ravel()[source], 0)
@@ -208,7 +208,7 @@ def _unlike_surface(data: DepthViews, store: EvidenceStore, row: int, hit: np.nd
     large = sizes[:, cv2.CC_STAT_AREA] >= OCCLUDER * hit.size
     large[0] = False
     seeds = large[labels]
-    source = nearest_by_color(data.image(row), seeds | confirmed | ~hit)
+    source, _ = nearest_by_color(data.image(row), seeds | confirmed | ~hit)
     return seeds.ravel()[source] & hit & ~confirmed
 
 

@@ -13,10 +13,14 @@ RELATIVE = 0.01  # of the depth
 
 
 def count_agreements(
-    inverse: np.ndarray, view: View, others: list[np.ndarray], other_views: list[View]
+    inverse: np.ndarray,
+    view: View,
+    others: list[np.ndarray],
+    other_views: list[View],
+    looseness: float = 1.0,
 ) -> np.ndarray:
     """(H, W) uint8: how many other views land back within TOLERANCE px of a pixel, at the same depth within
-    RELATIVE.
+    RELATIVE; both times `looseness`.
 
     inverse: (H, W) float32 inverse depths of `view`, 0 = none; others: (h, w, 3+) float32 planes q, a, b of the
         other views, any sizes: between pixel centers a plane goes on, which matters on ground at grazing angles
@@ -26,7 +30,7 @@ def count_agreements(
         forth = transfers([view] * len(others), other_views)
         back = transfers(other_views, [view] * len(others))
         sizes = np.array([(other.shape[1], other.shape[0]) for other in others], np.int64)
-        _count(inverse, stacked(others), sizes, *forth, *back, counts)
+        _count(inverse, stacked(others), sizes, *forth, *back, np.float32(looseness), counts)
     return counts
 
 
@@ -57,7 +61,7 @@ def continued(planes, s, u, v):
 
 
 @numba.njit(cache=True, parallel=True)
-def _count(inverse, others, sizes, A, B, back_A, back_B, counts):
+def _count(inverse, others, sizes, A, B, back_A, back_B, looseness, counts):
     height, width = inverse.shape
     for row in numba.prange(height):
         for column in range(width):
@@ -69,8 +73,8 @@ def _count(inverse, others, sizes, A, B, back_A, back_B, counts):
                 if not (u >= 0 and v >= 0 and u < sizes[s, 0] and v < sizes[s, 1]):
                     continue
                 found = continued(others, s, u, v)
-                if found <= 0 or abs(found * w / q - 1) > RELATIVE:
+                if found <= 0 or abs(found * w / q - 1) > looseness * RELATIVE:
                     continue
                 u, v, w = moved(back_A, back_B, s, u, v, found)
-                if w > 1e-6 and (u - x) ** 2 + (v - y) ** 2 < TOLERANCE * TOLERANCE:
+                if w > 1e-6 and (u - x) ** 2 + (v - y) ** 2 < (looseness * TOLERANCE) ** 2:
                     counts[row, column] += 1

@@ -30,9 +30,12 @@ BELOW = 0.01  # of the pixels
 CLEARANCE = 0.25  # of the height of a camera above the ground, by which ground differs from a plane
 CONTINUED = 0.02  # of the longest side, how far a surface goes on
 COLOR_STEP = 8.0  # gray values that cost as much as a pixel
+FLATTEST = (
+    0.35  # sine of the angle at which ground is seen; steeper, its patches match, and what does not is a tree
+)
 FARTHEST = 3.0  # of the farthest confirmed depth, how far ground goes on
 EVEN = 20  # gray values within 5x5 px
-FATTENED = 4  # px of the small image, by which surface is carried over its outline
+FATTENED = 7  # px of the small image, by which surface is carried over its outline
 SKY_PIXELS = 50  # at least, of the small image
 SKY_SIZE = 480  # px, longest side of the image in which sky is looked for
 
@@ -84,7 +87,8 @@ def without_speckles(inverse: np.ndarray, confirmed: np.ndarray, share: float = 
 
 @numba.njit(cache=True)
 def nearest_by_color(image, seeds):
-    """(H, W) int64 flat index of the seed that each pixel reaches with the least change of color, -1 without seeds.
+    """(H, W) int64 flat index of the seed that each pixel reaches with the least change of color, -1 without seeds;
+    (H, W) float32 length of that way, px, changes of color included.
 
     image: (H, W, 3) uint8; seeds: (H, W) bool. Raster scans forth and back (chamfer distance), three times.
     """
@@ -117,7 +121,7 @@ def nearest_by_color(image, seeds):
                     reached = distance[r, c] + step + change / np.float32(COLOR_STEP)
                     if reached < distance[row, column]:
                         distance[row, column], source[row, column] = reached, source[r, c]
-    return source
+    return source, distance
 
 
 def fit_ground(points: np.ndarray, centers: np.ndarray, up: np.ndarray) -> Ground | None:
@@ -229,7 +233,7 @@ def find_sky(image: np.ndarray, confirmed: np.ndarray, elevation: np.ndarray) ->
     if core.sum() < SKY_PIXELS:
         return np.zeros(confirmed.shape, bool)
     core |= even & _like(small, core)
-    source = nearest_by_color(small, core | sure | ~above | ~shiny)
+    source, _ = nearest_by_color(small, core | sure | ~above | ~shiny)
     sky = core.ravel()[source] & above & ~sure
     _, labels, sizes, _ = cv2.connectedComponentsWithStats(sky.astype(np.uint8), connectivity=4)
     open_sky = np.bincount(labels[~known], minlength=len(sizes)) > 0.5 * sizes[:, cv2.CC_STAT_AREA]
@@ -271,33 +275,41 @@ def continued_planes(
     result = np.where(confirmed[..., None], planes[..., :3], 0).astype(np.float32)
     if not confirmed.any():
         return result
-    source = nearest_by_color(image, confirmed)
+    source, way = nearest_by_color(image, confirmed)
     rows, columns = np.divmod(source, width)
     dy, dx = np.arange(height)[:, None] - rows, np.arange(width) - columns
     q, a, b = np.moveaxis(planes[rows, columns, :3], 2, 0)
     further = q + a * dx + b * dy
-    near = (np.hypot(dx, dy) <= CONTINUED * max(height, width)) & (np.abs(further / q - 1) < 0.2)
+    near = (way <= CONTINUED * max(height, width)) & (np.abs(further / q - 1) < 0.2)
     goes_on = near & ~confirmed
     result[goes_on] = np.stack([further, a, b], axis=2)[goes_on]
     if ground is not None:
-        _continue_ground(result, _ground_planes(view, ground), confirmed, source, image)
+        level, steep = _ground_planes(view, ground), horizon(view, ground.up)
+        _continue_ground(result, level, steep, confirmed, source, image)
     return result
 
 
 def _continue_ground(
-    result: np.ndarray, level: np.ndarray, confirmed: np.ndarray, source: np.ndarray, image: np.ndarray
+    result: np.ndarray,
+    level: np.ndarray,
+    steep: np.ndarray,
+    confirmed: np.ndarray,
+    source: np.ndarray,
+    image: np.ndarray,
 ) -> None:
     """Change planes to those of the ground where that goes on, or hides what goes on behind it.
 
-    result: (H, W, 3) planes so far; level: (H, W, 3) of the ground; source: (H, W) confirmed pixel of each
+    result: (H, W, 3) planes so far; level: (H, W, 3) of the ground; steep: (H, W) sine of `horizon` above it
+    source: (H, W) confirmed pixel of each
     """
     reachable = (level[..., 0] > 0) & (level[..., 0] * FARTHEST > result[..., 0][confirmed].min())
+    reachable &= steep > -FLATTEST
     on_ground = _on_ground(result, level) & confirmed
     hidden = (result[..., 0] > 0) & (result[..., 0] < level[..., 0])
     lies = (on_ground.ravel()[source] | hidden) & ~confirmed & reachable
     result[lies] = level[lies]
     on_ground |= lies
-    source = nearest_by_color(image, result[..., 0] > 0)  # around what went on for a few pixels only
+    source, _ = nearest_by_color(image, result[..., 0] > 0)  # around what went on for a few pixels only
     lies = on_ground.ravel()[source] & (result[..., 0] == 0) & reachable
     result[lies] = level[lies]
 

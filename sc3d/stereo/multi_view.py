@@ -43,6 +43,7 @@ BEYOND = 20.0  # times nearer than NEAR, however close the photos stand
 MIN_SPARSE = 8
 CELL = 8  # px, side of the cells that start at the depth of the nearest sparse point
 MAX_COST = 0.6  # 1 - NCC; more is no match, whatever depths agree
+LOOSE = 3.0  # times the disagreement allowed, where nothing better is known: leaves
 SURE = 2  # other views that must confirm what goes on
 GROUND_POINTS = 10_000  # per view, below its horizon
 REACH = 5  # px, from how far a pixel takes planes
@@ -110,7 +111,7 @@ class StereoJob:
         return self.work / f"gray-{row}.npy"
 
     def checked_file(self, row: int) -> Path:
-        """(H, W) uint8, how many sources confirm a pixel of the last pass."""
+        """(2, H, W) uint8, how many sources confirm a pixel of the last pass, and how many loosely."""
         return self.work / f"checked-{row}.npy"
 
     def gray(self, row: int) -> GrayView:
@@ -291,19 +292,19 @@ def check_view(job: StereoJob, row: int) -> np.ndarray:
     last = len(passes(job.longest)) - 1
     planes, view, sources = np.load(job.file(last, row)), job.view(last, row), job.sources[row]
     inverse = np.ascontiguousarray(planes[..., 0])
-    counts = count_agreements(
-        inverse,
-        view,
-        [np.load(job.file(last, source))[..., :3] for source in sources],
-        [job.view(last, source) for source in sources],
-    )
+    others = [np.load(job.file(last, source))[..., :3] for source in sources]
+    other_views = [job.view(last, source) for source in sources]
+    counts = count_agreements(inverse, view, others, other_views)
+    loose = count_agreements(inverse, view, others, other_views, LOOSE)
     costs = np.empty(inverse.shape, np.float32)
     evaluate(_problem(job, last, row, geometric=False), planes, costs)
     opaque = Scene(job.scene).opaque_pixels(job.photo_views[row], view)
-    counts[(costs > MAX_COST) | (False if opaque is None else ~opaque)] = 0
+    unsure = (costs > MAX_COST) | (False if opaque is None else ~opaque)
+    counts[unsure], loose[unsure] = 0, 0
     counts[~without_speckles(inverse, counts >= 1)] = 0
     counts[(counts > 1) & ~without_speckles(inverse, counts > 1)] = 1
-    save(job.checked_file(row), counts)
+    loose[~without_speckles(inverse, loose >= 1)] = 0
+    save(job.checked_file(row), np.stack([counts, loose]))
     rows, columns = np.nonzero((counts >= min(SURE, len(sources))) & (horizon(view, job.up) < 0))
     chosen = np.random.default_rng(row).permutation(len(rows))[:GROUND_POINTS]
     rows, columns = rows[chosen], columns[chosen]
@@ -317,19 +318,21 @@ def finish_view(job: StereoJob, ground: Ground | None, row: int) -> tuple[float,
     confirm, that have a depth, and of sky.
     """
     last = len(passes(job.longest)) - 1
-    planes, view, counts = np.load(job.file(last, row)), job.view(last, row), np.load(job.checked_file(row))
+    planes, view = np.load(job.file(last, row)), job.view(last, row)
+    counts, loose = np.load(job.checked_file(row))
     scene, photo_view = Scene(job.scene), job.photo_views[row]
     image, opaque = (
         resample(scene.read_photo(view.name), photo_view, view),
         scene.opaque_pixels(photo_view, view),
     )
     if ground is not None:
-        counts[~not_below(view, planes, counts >= 1, ground)] = 0
+        below = ~not_below(view, planes, loose >= 1, ground)
+        counts[below], loose[below] = 0, 0
     sky = find_sky(image, counts >= 1, horizon(view, job.up))
     counts[sky] = 0
     sure = counts >= min(SURE, len(job.sources[row]))
     complete = continued_planes(view, planes, sure, image, ground)
-    complete[counts >= 1] = planes[counts >= 1, :3]
+    complete[loose >= 1] = planes[loose >= 1, :3]
     complete[sky if opaque is None else sky | ~opaque] = 0
     inverse, file = complete[..., 0], depth_file(job.output, view.name)
     depth = np.where(inverse > 0, 1 / np.maximum(inverse, 1e-30), 0).astype(np.float32)

@@ -33,6 +33,7 @@ NOISE = (1.5 / 255) ** 2  # variance of gray values that counts as noise
 SPATIAL = 3.0  # px, standard deviation of the weights
 COLOR = 0.06  # gray value, standard deviation of the weights
 WORST = 2.0  # the cost where nothing can be compared
+LONELY = 0.25  # cost of a plane that one source only sees
 BEST = 2  # sources whose costs are averaged: the others may not see the pixel
 AGREEMENT = 0.2  # cost per px by which a source's own depth contradicts
 CONTRADICTION = 3.0  # px; more does not count
@@ -182,7 +183,7 @@ def _contradiction(stereo, s, x, y, q):
 
 @numba.njit(cache=True, fastmath=True)
 def _cost(stereo, flat, row, column, q, a, b, weights, values, variance):
-    """Mean cost of the BEST sources for one plane; WORST counts for sources that do not see it."""
+    """Mean cost of the BEST sources for one plane; where one source only sees it, its cost and LONELY."""
     best, next_best = np.float32(WORST), np.float32(WORST)
     x, y = np.float32(column + 0.5), np.float32(row + 0.5)
     for s in range(len(stereo.sizes)):
@@ -196,8 +197,8 @@ def _cost(stereo, flat, row, column, q, a, b, weights, values, variance):
             best = cost
         elif cost < next_best:
             next_best = cost
-    if len(stereo.sizes) == 1:
-        return best
+    if next_best >= np.float32(WORST):
+        return best if len(stereo.sizes) == 1 else best + np.float32(LONELY)
     return np.float32(0.5) * (best + next_best)
 
 
