@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.colors import COLORS, color_names, to_bytes
 from sc3d.io.crs import read_las_crs
-from sc3d.io.las import open_las
+from sc3d.io.las import open_las, warn_of_spare
 from sc3d.io.ply import RESERVED, read_header
 from sc3d.io.splats import OTHER_FORMATS, SPLATS
 from sc3d.io.text_clouds import read_table
@@ -52,8 +52,27 @@ NORMALS = (
     ("nx", "ny", "nz"),
     ("normal_x", "normal_y", "normal_z"),
 )
+UNIT = 1e-3  # by which lengths of normals differ from 1 that are left as they are
 AXES = (("x", "easting", "east", "e"), ("y", "northing", "north", "n"), ("z", "height", "elevation", "h"))
-LAS_EXTRAS = ("intensity", "return_number", "number_of_returns")
+# kept where a file makes use of them
+LAS_EXTRAS = (
+    "intensity",
+    "return_number",
+    "number_of_returns",
+    "gps_time",
+    "user_data",
+    "point_source_id",
+    "scan_angle",
+    "scan_angle_rank",
+    "nir",
+    "synthetic",
+    "key_point",
+    "withheld",
+    "overlap",
+    "scanner_channel",
+    "scan_direction_flag",
+    "edge_of_flight_line",
+)
 
 
 @dataclass(frozen=True)
@@ -130,6 +149,7 @@ def to_open3d(geometry: Geometry) -> o3d.t.geometry.PointCloud | o3d.t.geometry.
 
 
 def _read_las(path: Path) -> Geometry:
+    warn_of_spare(path)
     with open_las(path) as reader:
         return _las_geometry(reader.read(), path)
 
@@ -143,22 +163,47 @@ def _las_geometry(file: laspy.LasData, path: Path) -> Geometry:
     attributes |= {name: np.asarray(file[name]) for name in file.point_format.extra_dimension_names}
     colors = None
     if {"red", "green", "blue"} <= names:
-        colors = to_bytes(np.stack([np.asarray(file[name]) for name in ("red", "green", "blue")], axis=1))
+        colors = to_bytes(np.stack([np.asarray(file[name]) for name in COLORS], axis=1), path)
+    _warn_of_withheld(attributes, path)
     crs = read_las_crs(file.header, path)
     positions = np.asarray(file.xyz, np.float64)
     positions[:, 2] *= crs.height_scale
     return Geometry(positions, colors, _with_normals(attributes), epsg=crs.epsg)
 
 
+def _warn_of_withheld(attributes: dict[str, np.ndarray], path: Path) -> None:
+    withheld = attributes.get("withheld")
+    if withheld is not None:
+        logger.warning(
+            "%s: %d of %d points are marked as withheld, which others take for deleted; they are kept, with the mark as"
+            " the column withheld",
+            path,
+            np.count_nonzero(withheld),
+            len(withheld),
+        )
+
+
 def _with_normals(attributes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The same attributes, with normals in three of them under their usual name."""
+    """The same attributes, with normals in three of them under their usual name, of length 1."""
+    attributes = dict(attributes)
     for names in NORMALS:
-        if set(names) <= attributes.keys():
-            normals = np.stack([attributes[name] for name in names], axis=1).astype(np.float32)
-            return {name: values for name, values in attributes.items() if name not in names} | {
-                "normals": normals
-            }
+        if set(names) <= attributes.keys() and "normals" not in attributes:
+            columns = [attributes.pop(name).reshape(-1) for name in names]
+            attributes["normals"] = np.stack(columns, axis=1).astype(np.float32)
+    if "normals" in attributes and attributes["normals"].shape[1:] == (3,):
+        attributes["normals"] = _of_length_1(attributes["normals"])
     return attributes
+
+
+def _of_length_1(normals: np.ndarray) -> np.ndarray:
+    """(N, 3) normals, those of another length than 0 or about 1 made so."""
+    length = np.linalg.norm(normals.astype(np.float64), axis=1)
+    other = np.isfinite(length) & (length > 0) & (np.abs(length - 1) > UNIT)
+    if not other.any():
+        return normals
+    made = normals.astype(np.float32)
+    made[other] = (normals[other] / length[other, None]).astype(np.float32)
+    return made
 
 
 def _read_open3d(path: Path) -> Geometry:
@@ -169,14 +214,14 @@ def _read_open3d(path: Path) -> Geometry:
     return Geometry(
         positions.astype(np.float64),
         colors,
-        _with_normals(_classified(table)),
+        _with_normals(_classified(table, path)),
     )
 
 
 def _read_ply_mesh(path: Path) -> Geometry:
     """Further attributes of the vertices are lost."""
     mesh = read_mesh(path)
-    colors = to_bytes(mesh.vertex.colors.numpy()) if "colors" in mesh.vertex else None
+    colors = to_bytes(mesh.vertex.colors.numpy(), path) if "colors" in mesh.vertex else None
     return Geometry(
         mesh.vertex.positions.numpy().astype(np.float64), colors, {}, mesh.triangle.indices.numpy()
     )
@@ -204,7 +249,7 @@ def _read_obj(path: Path) -> Geometry:
         raise InputError(f"{path} cannot be read as OBJ: {error}") from None
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(table):
         raise InputError(f"{path} holds no triangles, or triangles of vertices that it does not hold")
-    colors = to_bytes(table[:, 3:6]) if table.shape[1] >= 6 else None
+    colors = to_bytes(table[:, 3:6], path) if table.shape[1] >= 6 else None
     return Geometry(table[:, :3], colors, {}, triangles)
 
 
@@ -281,10 +326,26 @@ def has_faces(path: Path) -> bool:
     return face is not None and face.rows > 0
 
 
-def _classified(attributes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The same attributes, with the class under the name `classification` as uint8."""
+def _classified(attributes: dict[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
+    """The same attributes, with the class under the name `classification` as uint8; 0 and a warning for
+    what is no class from 0 to 255.
+    """
     for name in CLASSIFICATION:
         if name in attributes:
             values = attributes.pop(name)
-            return attributes | {"classification": np.clip(np.rint(values), 0, 255).astype(np.uint8)}
+            return attributes | {"classification": _as_classes(values, path)}
     return attributes
+
+
+def _as_classes(values: np.ndarray, path: Path) -> np.ndarray:
+    numbers = np.nan_to_num(values.astype(np.float64), nan=-1.0)
+    wrong = (numbers != np.rint(numbers)) | (numbers < 0) | (numbers > 255)
+    if wrong.any():
+        logger.warning(
+            "%s: %d of %d points have a classification that is no whole number from 0 to 255 (%s): they get 0",
+            path,
+            np.count_nonzero(wrong),
+            len(values),
+            examples([f"{value:g}" for value in np.unique(values[wrong])]),
+        )
+    return np.where(wrong, 0, numbers).astype(np.uint8)

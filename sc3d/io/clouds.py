@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import redirect_stdout
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
 from sc3d.io.colors import COLORS, color_names, to_bytes
 from sc3d.io.limits import FARTHEST
-from sc3d.io.pcd import check_pcd
+from sc3d.io.pcd import check_pcd, read_fields
 from sc3d.io.ply import (
     RESERVED,
     TOGETHER,
@@ -30,9 +30,10 @@ from sc3d.io.splats import SPLATS, is_splat_ply
 logger = logging.getLogger(__name__)
 
 COARSE = 0.005  # steps of positions that are told, world units
+PCD_NORMALS = ["normal_x", "normal_y", "normal_z"]
 MAX_NAME = 200  # characters of an attribute
 TAKEN = {name for group in TOGETHER for name in group}  # columns of what Open3D reads together
-CHECKS = {".ply": check_ply, ".pcd": check_pcd}
+CHECKS: dict[str, Callable[[Path], object]] = {".ply": check_ply, ".pcd": check_pcd}
 
 
 def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported late
@@ -41,13 +42,15 @@ def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported 
     """
     if path.suffix.lower() == ".ply" and path.is_file() and is_splat_ply(read_header(path)):
         raise InputError(f"{path} {SPLATS}")
-    cloud = _read_geometry(path, "read_point_cloud", {".ply", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts"})
+    cloud = _read_pcd(path) if path.suffix.lower() == ".pcd" and path.is_file() else None
+    if cloud is None:
+        cloud = _read_geometry(path, "read_point_cloud", {".ply", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts"})
     if "positions" not in cloud.point or not len(cloud.point.positions):
         raise InputError(f"{path} holds no points")
     _check_positions(path, cloud.point.positions.numpy(), "remove those points first")
     if path.suffix.lower() == ".ply":
         _add_columns(cloud, path)
-    _unify_colors(cloud)
+    _unify_colors(cloud, path)
     return cloud
 
 
@@ -73,6 +76,30 @@ def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
     return mesh
 
 
+def _read_pcd(path: Path):
+    """A PCD with padding or with fields of several numbers, over which Open3D ends the process; None for any
+    other.
+    """
+    import open3d as o3d
+
+    header = check_pcd(path)
+    if header.is_plain:
+        return None
+    fields = read_fields(path, header)
+    if not set("xyz") <= fields.keys():
+        raise InputError(f"{path} holds no points: it has no fields x, y and z")
+    cloud = o3d.t.geometry.PointCloud()
+    for attribute, group in (("positions", list("xyz")), ("normals", PCD_NORMALS)):
+        if set(group) <= fields.keys():
+            columns = np.concatenate([fields.pop(name) for name in group], axis=1)
+            cloud.point[attribute] = o3d.core.Tensor(np.ascontiguousarray(columns))
+    for name, values in fields.items():
+        cloud.point[f"{name}_" if name in RESERVED - {"colors"} else name] = o3d.core.Tensor(
+            np.ascontiguousarray(_widened(values))
+        )
+    return cloud
+
+
 def _add_columns(cloud, path: Path) -> None:
     """Give a cloud the columns of a checked PLY that Open3D passes over: those of the older names of
     types.
@@ -91,7 +118,7 @@ def _add_columns(cloud, path: Path) -> None:
         cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(column.astype(kinds[name])[:, None]))
 
 
-def _unify_colors(cloud) -> None:
+def _unify_colors(cloud, path: Path) -> None:
     """Give a cloud its colors under the usual name, as (N, 3) uint8."""
     import open3d as o3d
 
@@ -104,7 +131,7 @@ def _unify_colors(cloud) -> None:
         columns = cloud.point.colors.numpy()
     else:
         return
-    cloud.point.colors = o3d.core.Tensor(np.ascontiguousarray(to_bytes(columns)))
+    cloud.point.colors = o3d.core.Tensor(np.ascontiguousarray(to_bytes(columns, path)))
 
 
 def _mesh_colors(path: Path, header: Header) -> np.ndarray | None:
@@ -117,7 +144,7 @@ def _mesh_colors(path: Path, header: Header) -> np.ndarray | None:
     found = read_columns(path, header, names)
     if found is None:
         return None
-    return to_bytes(found.astype(types[names[0]])).astype(np.float32) / 255
+    return to_bytes(found.astype(types[names[0]]), path).astype(np.float32) / 255
 
 
 def _read_geometry(path: Path, reader: str, suffixes: set[str]):
