@@ -19,7 +19,7 @@ from sc3d.io.crs import read_las_crs
 from sc3d.io.las import open_las, warn_of_spare
 from sc3d.io.ply import RESERVED, read_header
 from sc3d.io.splats import OTHER_FORMATS, SPLATS
-from sc3d.io.text_clouds import read_table
+from sc3d.io.text_clouds import DEGREES, axes_of, read_table
 
 if TYPE_CHECKING:
     import laspy
@@ -52,8 +52,9 @@ NORMALS = (
     ("nx", "ny", "nz"),
     ("normal_x", "normal_y", "normal_z"),
 )
+# of columns without names: points that tell by correlation, by which it differs; else mean differences
+FEW, UNLIKE, RATIO = 10, 0.3, 4.0
 UNIT = 1e-3  # by which lengths of normals differ from 1 that are left as they are
-AXES = (("x", "easting", "east", "e"), ("y", "northing", "north", "n"), ("z", "height", "elevation", "h"))
 # kept where a file makes use of them
 LAS_EXTRAS = (
     "intensity",
@@ -258,54 +259,95 @@ def _read_text(path: Path) -> Geometry:
     values.
     """
     names, table = read_table(path)
-    columns = dict(zip(names, table.T, strict=True)) if names else {}
-    axes = [next((name for name in known if name in columns), "") for known in AXES]
-    if not all(axes):
-        if names:
-            logger.warning(
-                "%s: its header (%s) names no x, y and z: the first three columns are taken",
-                path,
-                " ".join(names),
-            )
+    axes = axes_of(names)
+    if names and not all(axes):
+        _require_plain_order(path, names, axes)
+    if all(axes):
+        columns = dict(zip(names, table.T, strict=True))
+    else:
         columns, axes = _unnamed(path, table), list("xyz")
     positions = np.stack([columns.pop(axis) for axis in axes], axis=1)
     found = color_names(columns)
     colors = None if found is None else np.stack([columns.pop(name) for name in found], axis=1)
     if colors is not None:
-        are_bytes = colors.max(initial=0) > 1 and bool((colors == np.rint(colors)).all())
-        colors = to_bytes(colors.astype(np.int64) if are_bytes else colors)
-    return Geometry(positions, colors, _with_normals(_classified(columns)))
+        are_whole = np.nanmax(colors, initial=0) > 1 and bool((colors == np.rint(colors)).all())
+        colors = to_bytes(colors.astype(np.int64) if are_whole else colors, path)
+    return Geometry(positions, colors, _with_normals(_classified(columns, path)))
+
+
+def _require_plain_order(path: Path, names: list[str], axes: list[str]) -> None:
+    """A warning that the first three columns are taken; InputError if their names say otherwise, or say
+    nothing where there are more than three.
+    """
+    told = f"{path}: its header ({examples(names, 8)}) names no x, y and z"
+    if DEGREES & set(names):
+        raise InputError(f"{told}, but degrees: convert it to a projected CRS first")
+    in_place = [not axis or names.index(axis) == place for place, axis in enumerate(axes)]
+    if not all(in_place) or len(names) > 3 and not any(axes):
+        raise InputError(f"{told}: name those columns x y z")
+    logger.warning("%s: the first three columns are taken", told)
 
 
 def _unnamed(path: Path, table: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns by what their values look like: x y z, then three colors or normals."""
+    """Columns by what their values look like, or by the suffix: x y z, then colors and normals in threes,
+    and others between them, which are left out.
+    """
     columns = dict(zip("xyz", table[:, :3].T, strict=True))
+    given = {".xyzn": NORMALS[2], ".xyzrgb": COLORS}.get(path.suffix.lower())
     # PTS has the intensity in front of the colors
-    start = 4 if path.suffix.lower() == ".pts" and table.shape[1] >= 7 else 3
-    kinds = []
-    for first in range(start, table.shape[1] - 2, 3):
-        part = table[:, first : first + 3]
-        names = _kind(part)
-        if names is None or names in kinds:
-            break
-        kinds.append(names)
+    place = 4 if path.suffix.lower() == ".pts" and table.shape[1] >= 7 else 3
+    while place + 3 <= table.shape[1]:
+        part = table[:, place : place + 3]
+        names = given if given is not None and given[0] not in columns else _kind(part)
+        if names == COLORS and given is None and _intensity_first(path, table, place):
+            place += 1
+            continue
+        if names is None or names[0] in columns:
+            place += 1
+            continue
         columns |= dict(zip(names, part.T, strict=True))
-    used = start + 3 * len(kinds)
-    if used < table.shape[1]:
+        place += 3
+    if len(columns) < table.shape[1]:
         logger.warning(
             "%s: %d of its %d columns have no names and are left out",
             path,
-            table.shape[1] - used + start - 3,
+            table.shape[1] - len(columns),
             table.shape[1],
         )
     return columns
+
+
+def _intensity_first(path: Path, table: np.ndarray, place: int) -> bool:
+    """Whether the first of four columns that may be colors is none, as it goes with its neighbor far less
+    than the last with its own; a warning where nothing tells.
+    """
+    four = table[:, place : place + 4]
+    rest = table.shape[1] - place
+    if path.suffix.lower() == ".pts" or rest % 3 == 0 or four.shape[1] < 4 or _kind(four[:, 1:]) != COLORS:
+        return False
+    if len(four) >= FEW and (np.ptp(four, axis=0) > 0).all():
+        likeness = np.corrcoef(four.T)
+        first, last = likeness[0, 1], likeness[3, 2]
+        is_first, is_last = first < last - UNLIKE, last < first - UNLIKE
+    else:
+        first, last = (np.abs(four[:, a] - four[:, b]).mean() for a, b in ((0, 1), (3, 2)))
+        is_first, is_last = first > RATIO * last, last > RATIO * first
+    if not is_last:
+        logger.warning(
+            "%s: its columns may be r g b and another one, or the other way round; columns %d to %d are taken as the"
+            " colors: give it a header (x y z intensity r g b)",
+            path,
+            place + 1 + is_first,
+            place + 3 + is_first,
+        )
+    return bool(is_first)
 
 
 def _kind(part: np.ndarray) -> tuple[str, str, str] | None:
     """Names of three columns (N, 3): normals, colors or None."""
     whole, low, high = bool((part == np.rint(part)).all()), part.min(), part.max()
     if (not whole or low < 0) and np.allclose(np.linalg.norm(part, axis=1), 1, atol=0.05):
-        return NORMALS[0]
+        return NORMALS[2]
     if low >= 0 and (high <= 1 or whole and high <= 65535):
         return COLORS
     return None

@@ -186,7 +186,9 @@ def _read_header(data: mmap.mmap) -> LasHeader:
         raise DamagedFileError(f"has points of an impossible format ({form & 63}, {record} bytes)")
     scales = struct.unpack_from("<6d", data, 131)
     if not all(math.isfinite(value) for value in scales) or not all(scales[:3]):
-        raise DamagedFileError(f"has a scale of 0, or none that is finite ({scales[0]:g} {scales[1]:g} {scales[2]:g})")
+        raise DamagedFileError(
+            f"has a scale of 0, or none that is finite ({scales[0]:g} {scales[1]:g} {scales[2]:g})"
+        )
     return LasHeader(size, offset, num_vlrs, form, record, count, evlrs)
 
 

@@ -49,7 +49,9 @@ class PcdHeader(NamedTuple):
     @property
     def record(self) -> np.dtype:
         """Of a point of a binary file, its fields named by their place."""
-        return np.dtype([(str(place), f"<{code}", count) for place, (_, code, count) in enumerate(self.fields)])
+        return np.dtype(
+            [(str(place), f"<{code}", count) for place, (_, code, count) in enumerate(self.fields)]
+        )
 
 
 def check_pcd(path: Path) -> PcdHeader:
