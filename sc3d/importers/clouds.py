@@ -5,6 +5,7 @@ classes and whatever else they hold.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -235,11 +236,11 @@ def _read_obj(path: Path) -> Geometry:
     vertices, faces = [], []
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
-            for line in file:
-                if line.startswith("v "):
-                    vertices.append([float(word) for word in line.split()[1:]])
-                elif line.startswith("f "):
-                    corners = [int(word.split("/")[0]) for word in line.split()[1:]]
+            for kind, *words in _obj_lines(file):
+                if kind == "v":
+                    vertices.append([float(word) for word in words])
+                elif kind == "f":
+                    corners = [int(word.split("/")[0]) for word in words]
                     corners = [corner - 1 if corner > 0 else len(vertices) + corner for corner in corners]
                     faces += [
                         [corners[0], corners[place], corners[place + 1]]
@@ -252,6 +253,19 @@ def _read_obj(path: Path) -> Geometry:
         raise InputError(f"{path} holds no triangles, or triangles of vertices that it does not hold")
     colors = to_bytes(table[:, 3:6], path) if table.shape[1] >= 6 else None
     return Geometry(table[:, :3], colors, {}, triangles)
+
+
+def _obj_lines(file: Iterable[str]) -> Iterator[list[str]]:
+    """Words of each line, without comments; a backslash at the end continues a line."""
+    before = ""
+    for line in file:
+        line = before + line.partition("#")[0].rstrip()
+        if line.endswith("\\"):
+            before = line[:-1] + " "
+            continue
+        before = ""
+        if words := line.split():
+            yield words
 
 
 def _read_text(path: Path) -> Geometry:

@@ -42,14 +42,15 @@ def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported 
     """
     if path.suffix.lower() == ".ply" and path.is_file() and is_splat_ply(read_header(path)):
         raise InputError(f"{path} {SPLATS}")
-    cloud = _read_pcd(path) if path.suffix.lower() == ".pcd" and path.is_file() else None
+    own = {".pcd": _read_pcd, ".ply": _read_capitals}.get(path.suffix.lower())
+    cloud = own(path) if own is not None and path.is_file() else None
     if cloud is None:
         cloud = _read_geometry(path, "read_point_cloud", {".ply", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts"})
+        if path.suffix.lower() == ".ply":
+            _add_columns(cloud, path)
     if "positions" not in cloud.point or not len(cloud.point.positions):
         raise InputError(f"{path} holds no points")
     _check_positions(path, cloud.point.positions.numpy(), "remove those points first")
-    if path.suffix.lower() == ".ply":
-        _add_columns(cloud, path)
     _unify_colors(cloud, path)
     return cloud
 
@@ -97,6 +98,29 @@ def _read_pcd(path: Path):
         cloud.point[f"{name}_" if name in RESERVED - {"colors"} else name] = o3d.core.Tensor(
             np.ascontiguousarray(_widened(values))
         )
+    return cloud
+
+
+def _read_capitals(path: Path):
+    """A PLY whose positions are called X Y Z, which Open3D does not know; None for any other."""
+    import open3d as o3d
+
+    header = read_header(path)
+    vertex = header.element("vertex")
+    kinds = {entry.name: entry.dtype for entry in vertex.properties if not entry.length} if vertex else {}
+    if "x" in kinds or not set("XYZ") <= kinds.keys():
+        return None
+    found = read_columns(path, check_ply(path), list(kinds))
+    if found is None:
+        raise InputError(f"{path} has its positions as X Y Z, and vertices with lists: name them x y z")
+    columns = {name: column.astype(kinds[name])[:, None] for name, column in zip(kinds, found.T, strict=True)}
+    cloud = o3d.t.geometry.PointCloud()
+    for attribute, group in (("positions", "XYZ"), ("normals", ("NX", "NY", "NZ"))):
+        if set(group) <= columns.keys():
+            values = np.concatenate([columns.pop(name) for name in group], axis=1)
+            cloud.point[attribute] = o3d.core.Tensor(np.ascontiguousarray(values))
+    for name, values in columns.items():
+        cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(_widened(values)))
     return cloud
 
 
