@@ -56,7 +56,9 @@ class CloudFile:
         if is_splat_ply(header):
             raise InputError(f"{path} {SPLATS}")
         cloud = cls(path, _with_bytes(record), header.elements[0].rows, header.size, record)
-        if not cloud.num_points or not {"x", "y", "z"} <= set(cloud.names):
+        if not {"x", "y", "z"} <= set(cloud.names):
+            raise InputError(f"{path} has no properties x, y and z: name its positions so")
+        if not cloud.num_points:
             raise InputError(f"{path} holds no points")
         return cloud
 
