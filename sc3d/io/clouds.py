@@ -59,6 +59,8 @@ def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
     """Read a triangle mesh; InputError if it is damaged, empty or has vertices that are not finite or too far
     away, or triangles of other vertices.
     """
+    if path.is_file() and _has_capitals(read_header(path)):
+        raise InputError(f"{path} has its positions as X Y Z: name these properties of the mesh x y z")
     mesh = _read_geometry(path, "read_triangle_mesh", {".ply"})
     if "positions" not in mesh.vertex or "indices" not in mesh.triangle or not len(mesh.triangle.indices):
         raise InputError(f"{path} holds no triangles")
@@ -101,15 +103,21 @@ def _read_pcd(path: Path):
     return cloud
 
 
+def _has_capitals(header: Header) -> bool:
+    vertex = header.element("vertex")
+    names = {entry.name for entry in vertex.properties} if vertex is not None else set()
+    return "x" not in names and set("XYZ") <= names
+
+
 def _read_capitals(path: Path):
     """A PLY whose positions are called X Y Z, which Open3D does not know; None for any other."""
     import open3d as o3d
 
     header = read_header(path)
     vertex = header.element("vertex")
-    kinds = {entry.name: entry.dtype for entry in vertex.properties if not entry.length} if vertex else {}
-    if "x" in kinds or not set("XYZ") <= kinds.keys():
+    if vertex is None or not _has_capitals(header):
         return None
+    kinds = {entry.name: entry.dtype for entry in vertex.properties if not entry.length}
     found = read_columns(path, check_ply(path), list(kinds))
     if found is None:
         raise InputError(f"{path} has its positions as X Y Z, and vertices with lists: name them x y z")

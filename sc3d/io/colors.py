@@ -23,6 +23,9 @@ NAMES = (
     ("R", "G", "B"),
     ("scalar_R", "scalar_G", "scalar_B"),
     ("scalar_Red", "scalar_Green", "scalar_Blue"),
+    ("rot", "gr\u00fcn", "blau"),
+    ("rot", "gruen", "blau"),
+    ("rouge", "vert", "bleu"),
 )
 FRACTION = 2.0  # floats up to here are fractions of 1, some of them a little brighter than white
 BYTE = 255

@@ -56,6 +56,9 @@ DEGREES = {
     "l\u00e4ngengrad",
 }
 UNIT = re.compile(r"\s*[\[(][^\])]*[\])]\s*$|_?\b(utm|gk|lv95)\b|_(utm|gk|m)$")
+WORD = r"(?:points?|pos|position|coords?|coordinates?|koord|koordinate)"
+AFFIX = re.compile(rf"^{WORD}[ _-]?(?=[xyzenh]$)|(?<=^[xyzenh])[ _-]?{WORD}$")  # as ArcGIS: POINT_X
+HEAD = 1 << 16  # bytes that tell an encoding
 # first words of rasters as text: ESRI, Surfer, GRASS
 GRIDS = {"ncols", "nrows", "xllcorner", "xllcenter", "cellsize", "dsaa", "north:", "south:", "cols:", "rows:"}
 
@@ -79,9 +82,11 @@ class _Dialect(NamedTuple):
     trailing: bool = True
 
     def split(self, line: str) -> list[str]:
-        line = _unquoted(line).strip(" \r\n\ufeff" if self.is_exact else " ,;|\t\r\n\ufeff")
-        if not line:
+        line = _unquoted(line)
+        inner = line.strip(" ,;|\t\r\n\ufeff")
+        if not inner:
             return []
+        line = line.strip(" \r\n\ufeff") if self.is_exact else inner
         words = self.between.split(line)
         if self.is_exact and self.trailing and not words[-1].strip():
             words.pop()
@@ -107,8 +112,7 @@ def read_table(path: Path) -> tuple[list[str], np.ndarray]:
     """Names of the columns in small letters, [] if there is no header of as many, and (N, K) float64
     values, K >= 3. InputError for what is no table of numbers.
     """
-    with path.open("rb") as file:
-        encoding = "utf-16" if file.read(2) in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    encoding = _encoding(path)
     with path.open(encoding=encoding, errors="replace") as file:
         sample = list(islice(file, LOOKED_AT))
     _refuse_grid(path, sample)
@@ -133,9 +137,24 @@ def read_table(path: Path) -> tuple[list[str], np.ndarray]:
     return _names(path, heads, dialect, width), np.array(rows)
 
 
+def _encoding(path: Path) -> str:
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16"
+    try:
+        head.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        if error.start < len(head) - 4:  # no character that is cut
+            return "cp1252"
+    return "utf-8-sig"
+
+
 def axes_of(names: list[str]) -> list[str]:
     """Which of the columns are x, y and z; "" for an axis that none is."""
-    plain = {UNIT.sub("", name).strip(): name for name in reversed(names)} | dict(zip(names, names))
+    plain = {AFFIX.sub("", UNIT.sub("", name)).strip(): name for name in reversed(names)} | dict(
+        zip(names, names)
+    )
     return [next((plain[known] for known in axis if known in plain), "") for axis in AXES]
 
 

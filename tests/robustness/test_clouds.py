@@ -303,6 +303,8 @@ HEADERS = {
     "German": "Nr;Hochwert;Rechtswert;H\u00f6he\n"
     + commas("".join(f"{n};{y};{x};{z}\n" for n, (x, y, z) in enumerate(POINTS))),
     "French": "No,Nord,Est,Altitude\n" + "".join(f"{n},{y},{x},{z}\n" for n, (x, y, z) in enumerate(POINTS)),
+    "ArcGIS": "OID_,POINT_X,POINT_Y,POINT_Z\n" + NUMBERED,
+    "empty lines of a spreadsheet": "No;X;Y;Z\n" + NUMBERED.replace(",", ";") + ";;;\n;;;\n",
     "an empty column": "No,Code,X,Y,Z\n" + "".join(f"1,,{x},{y},{z}\n" for x, y, z in POINTS),
     "own coordinates beside those of a CRS": "x_utm,y_utm,z_utm,x,y,z\n" + lines("1,2,3,{},{},{}"),
     "decimal commas with a comma and a blank between": commas(lines("{}; {}; {}")).replace(";", ","),
@@ -315,6 +317,11 @@ HEADERS = {
 @pytest.mark.parametrize("name", HEADERS)
 def test_columns_are_found_by_their_header(tmp_path, name):
     np.testing.assert_array_equal(read_text(tmp_path, HEADERS[name], ".csv").positions, POINTS)
+
+
+def test_a_header_in_a_western_encoding(tmp_path):
+    (tmp_path / "a.csv").write_bytes(HEADERS["German"].encode("cp1252"))
+    np.testing.assert_array_equal(read_geometry(tmp_path / "a.csv").positions, POINTS)
 
 
 @pytest.mark.parametrize(
@@ -508,6 +515,14 @@ def test_ply_with_capitals(tmp_path, form):
     found = read_geometry(path)
     np.testing.assert_array_equal(found.positions, small())
     assert (found.attributes["q"] == 5).all()
+
+
+def test_mesh_with_capitals_is_refused(tmp_path):
+    path = write_ply(tmp_path / "a.ply", small(), {}, faces=[(0, 1, 2)])
+    for axis in b"xyz":
+        path.write_bytes(path.read_bytes().replace(b"double %c\n" % axis, b"double %c\n" % (axis - 32)))
+    with pytest.raises(InputError, match="as X Y Z"):
+        read_geometry(path)
 
 
 def test_ply_with_blanks_in_a_name_says_which_line(tmp_path):
