@@ -308,8 +308,9 @@ def _unnamed(path: Path, table: np.ndarray) -> dict[str, np.ndarray]:
     """
     columns = dict(zip("xyz", table[:, :3].T, strict=True))
     given = {".xyzn": NORMALS[2], ".xyzrgb": COLORS}.get(path.suffix.lower())
-    # PTS has the intensity in front of the colors
-    place = 4 if path.suffix.lower() == ".pts" and table.shape[1] >= 7 else 3
+    # PTS has the intensity in front of the colors, if it has one
+    with_intensity = path.suffix.lower() == ".pts" and table.shape[1] >= 7 and table.shape[1] % 3 != 0
+    place = 4 if with_intensity else 3
     while place + 3 <= table.shape[1]:
         part = table[:, place : place + 3]
         names = given if given is not None and given[0] not in columns else _kind(part)
