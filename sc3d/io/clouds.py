@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.io.atomic import atomic_path
 from sc3d.io.colors import COLORS, color_names, to_bytes
 from sc3d.io.limits import FARTHEST
@@ -141,6 +141,9 @@ def _add_columns(cloud, path: Path) -> None:
     header = read_header(path)
     vertex = header.element("vertex")
     kinds = {entry.name: entry.dtype for entry in vertex.properties if not entry.length} if vertex else {}
+    lists = [entry.name for entry in vertex.properties if entry.length] if vertex else []
+    if lists:
+        logger.warning("%s: lists of its points are left out: %s", path, examples(lists))
     known = set(cloud.point)
     for group, attribute in zip(TOGETHER, ("positions", "normals", "colors"), strict=True):
         known |= set(group) if attribute in known else set()

@@ -5,6 +5,7 @@ Layout: https://pointclouds.org/documentation/tutorials/pcd_file_format.html.
 
 from __future__ import annotations
 
+import logging
 import struct
 import warnings
 from pathlib import Path
@@ -13,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sc3d.errors import InputError
+
+logger = logging.getLogger(__name__)
 
 MAX_HEADER = 1 << 16  # bytes
 RATIO, SLACK = 300, 1 << 20  # LZF cannot expand by more than 88
@@ -106,6 +109,13 @@ def _check_body(path: Path, header: PcdHeader, start: bytes) -> None:
     elif header.kind not in ("ascii", "binary") or needed > body:
         raise InputError(
             f"{path} is truncated: {header.num_points} points are announced in {body} bytes; write or copy it again"
+        )
+    elif header.kind == "binary" and body - needed >= max(least, 1):
+        logger.warning(
+            "%s announces %d points, but there is room for %d more behind them, which are not read: write it again if they are points",
+            path,
+            header.num_points,
+            (body - needed) // max(least, 1),
         )
 
 

@@ -17,6 +17,7 @@ logger = logging.getLogger(__name__)
 BODY = (0.01, 0.99)  # shares of the points between which a box lies: strays do not count
 REACH = 1.0  # extents of cameras and sparse points that a scene may go on around them
 FAR = 20.0  # the same, in extents of the cameras, where there are no sparse points
+ALONE = 50.0  # taken for the extent of a camera alone, world units
 NEAR, LEAST_NEAR = 0.05, 0.25  # of the spread of the sparse points; share of them that have something so near
 FEW, PROBES = 50, 2000  # points that tell a scale; sparse points that are asked
 SMALLER = 20.0  # times the spread of the cameras is larger than that of points of another scale
@@ -36,7 +37,7 @@ def scene_box(views: list[View], points: np.ndarray) -> Box:
     """Box within which something of the scene must lie. points: (P, 3) sparse points, perhaps none."""
     centers = np.array([view.center for view in views])
     low, high = centers.min(axis=0), centers.max(axis=0)
-    extent, reach = max(float(np.linalg.norm(high - low)), 1.0), FAR
+    extent, reach = max(float(np.linalg.norm(high - low)), 1.0 if len(views) > 1 else ALONE), FAR
     if len(points):
         body = box_of(points)
         low, high = np.minimum(low, body[0]), np.maximum(high, body[1])
@@ -57,10 +58,7 @@ def describe(box: Box) -> str:
 def check_frame(path: Path, points: np.ndarray, views: list[View], sparse_points: np.ndarray) -> bool:
     """Whether (N, 3) world points of a file may lie where the scene is; else a warning with both boxes."""
     box = box_of(points)
-    # one camera alone tells no extent
-    if not views or len(views) == 1 and not len(sparse_points):
-        return True
-    if not apart(box, scene_box(views, sparse_points)):
+    if not views or not apart(box, scene_box(views, sparse_points)):
         return True
     logger.warning(
         "%s lies elsewhere than the cameras, so it seems to be in another frame: its points are at %s;"

@@ -491,7 +491,20 @@ def test_compressed_pcd_with_padding_is_refused(tmp_path):
         read_geometry(path)
 
 
+def test_binary_pcd_with_more_points_than_announced_is_told(tmp_path, caplog):
+    path = write_pcd(tmp_path / "a.pcd", *PLAIN, np.ones((5, 3), "<f4").tobytes(), 3, "binary")
+    assert len(read_geometry(path).positions) == 3
+    assert "announces 3 points, but there is room for 2 more" in caplog.text
+
+
 # ---- PLY and OBJ dialects
+
+
+def test_lists_of_points_are_told(tmp_path, caplog):
+    head = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    (tmp_path / "a.ply").write_text(head + "property list uchar int ids\nend_header\n1 2 3 2 7 8\n")
+    assert len(read_geometry(tmp_path / "a.ply").positions) == 1
+    assert "lists of its points are left out: ids" in caplog.text
 
 
 def test_normals_named_as_pcl_does_turn_with_their_cloud(site, tmp_path):
