@@ -11,7 +11,7 @@ from sc3d.geometry.cameras import View, in_image, project
 from sc3d.importers.clouds import Geometry
 from sc3d.importers.project import Project
 from sc3d.io.colmap import build_model, registered_images, write_model
-from sc3d.io.images import link_photos
+from sc3d.io.photo_folder import link_photos
 from sc3d.scene.scene import Scene
 
 MAX_POINTS = 100_000  # sparse points that are made from a cloud

@@ -11,6 +11,7 @@ import numpy as np
 
 from sc3d.errors import InputError, examples
 from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
+from sc3d.georeferencing.up_direction import tell_tilt
 from sc3d.importers.clouds import CLOUDS, MESHES, UNREAD, is_mesh, read_geometry, to_open3d
 from sc3d.importers.frames import frame_of_scene, near_origin, place_geometries
 from sc3d.importers.model import write_project
@@ -18,7 +19,7 @@ from sc3d.importers.photos import locate_photos
 from sc3d.importers.project import Project, project_files, read_project, warn_of_left_out
 from sc3d.io.atomic import require_writable
 from sc3d.io.clouds import write_geometry
-from sc3d.io.images import find_photos, require_place
+from sc3d.io.photo_folder import find_photos, require_place
 from sc3d.runner import execute
 from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
@@ -95,6 +96,8 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
         georeference_path(scene).unlink(missing_ok=True)
     if georeference is not None:
         write_georeference(scene, georeference)
+    elif project is not None:
+        tell_tilt(scene)
     for geometry, _ in placed.values():
         write_geometry(scene.cloud if geometry.triangles is None else scene.mesh, to_open3d(geometry))
     figures |= {"epsg": georeference.epsg if georeference else None}

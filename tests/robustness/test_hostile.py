@@ -19,8 +19,10 @@ from PIL import Image
 import sc3d
 from sc3d.cli import main
 from sc3d.errors import InputError
-from sc3d.io.images import find_photos, image_size, read_image, read_index_image
+from sc3d.io.images import image_size, read_image
 from sc3d.io.json_files import read_json
+from sc3d.io.mask_images import read_index_image
+from sc3d.io.photo_folder import find_photos
 from sc3d.scene.class_table import read_classes
 from sc3d.scene.scene import match_masks, read_sparse_model
 from sc3d.settings.outputs import ViewCommand

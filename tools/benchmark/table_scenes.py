@@ -18,7 +18,8 @@ from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import Surface, first_surface, nearest_points
 from sc3d.io.atomic import atomic_path
 from sc3d.io.clouds import read_cloud
-from sc3d.io.images import read_index_image, write_image
+from sc3d.io.images import write_image
+from sc3d.io.mask_images import read_index_image
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.inputs import Masks, point_density
 from sc3d.metrics import Confusion, EvaluationPixels, depth_edge_band
@@ -74,7 +75,7 @@ def synthetic_scene(folder: Path, settings: Synthesize) -> Scene:
             synthesize(folder, settings, lambda share, _: bar.update(round(100 * share) - bar.n))
     views = scene.model.views
     found = len(views), views[0].width, len(read_cloud(folder / "truth.ply").point.positions)
-    wanted = settings.views, settings.width, settings.num_points
+    wanted = settings.num_views, settings.width, settings.num_points
     if found != wanted:
         raise InputError(
             f"{folder} has {found[0]} views of {found[1]} px and {found[2]} points, not {wanted}: choose another working folder, or its options"
