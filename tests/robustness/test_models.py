@@ -14,6 +14,7 @@ import pytest
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.georeferencing.georeference import from_origin, read_georeference, write_georeference
+from sc3d.georeferencing.gps import read_flight
 from sc3d.importers.metashape import largest_correction
 from sc3d.importers.photos import locate_photos
 from sc3d.importers.project import Project, read_project
@@ -34,6 +35,7 @@ from tests.importers.test_importers import (
     same_projections,
     write_photos,
 )
+from tests.robustness.test_positions import write_photo
 
 SMALL = (64, 48)
 BLANK = "2026-11-29 10-15-00 Straße {}.jpg"
@@ -604,6 +606,14 @@ class TestMetashape:
 
 
 class TestFrames:
+    def test_gps_of_all_of_two_photos(self, tmp_path, caplog):
+        """All have it, and still it is too little: it says how many are needed."""
+        for row in range(2):
+            write_photo(tmp_path / f"{row}.jpg", (-37.8, 144.96 + row / 1e4, 50.0))
+        with caplog.at_level("WARNING"):
+            assert read_flight(tmp_path, ["0.jpg", "1.jpg"]) is None
+        assert "2 of 2 photos have GPS, 3 are needed" in caplog.text and "only 2 of 2" not in caplog.text
+
     def opensfm(self, folder: Path, reference: tuple, **shot) -> Project:
         content = opensfm_json(fly(), probe(3), reference)
         for view in content[1]["shots"].values():
