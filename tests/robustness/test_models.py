@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pyproj
 import pytest
+from PIL import Image
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
@@ -21,6 +22,7 @@ from sc3d.importers.project import Project, read_project
 from sc3d.io.colmap import build_model, load_model
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import
+from sc3d.synthetic.exif import photo_exif
 from tests.importers.test_importers import (
     PLACE,
     SIZE,
@@ -35,7 +37,6 @@ from tests.importers.test_importers import (
     same_projections,
     write_photos,
 )
-from tests.robustness.test_positions import write_photo
 
 SMALL = (64, 48)
 BLANK = "2026-11-29 10-15-00 Straße {}.jpg"
@@ -609,7 +610,8 @@ class TestFrames:
     def test_gps_of_all_of_two_photos(self, tmp_path, caplog):
         """All have it, and still it is too little: it says how many are needed."""
         for row in range(2):
-            write_photo(tmp_path / f"{row}.jpg", (-37.8, 144.96 + row / 1e4, 50.0))
+            exif = photo_exif(row, np.array([-37.8, 144.96 + row / 1e4, 50.0]))
+            Image.new("RGB", SMALL).save(tmp_path / f"{row}.jpg", exif=exif)
         with caplog.at_level("WARNING"):
             assert read_flight(tmp_path, ["0.jpg", "1.jpg"]) is None
         assert "2 of 2 photos have GPS, 3 are needed" in caplog.text and "only 2 of 2" not in caplog.text
