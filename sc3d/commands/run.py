@@ -33,6 +33,7 @@ def main(command: Run) -> None:
         with atomic_path(scene.classes) as temporary:
             shutil.copyfile(command.classes, temporary)
     stages = [
+        ("depth", command.depth),
         ("train", command.train),
         ("extract", command.extract),
         ("segment", replace(segment, refine=False)),

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from sc3d.settings.labels import Label, Propagate, Segment
-from sc3d.settings.reconstruction import Extract, Reconstruct
+from sc3d.settings.reconstruction import Depth, Extract, Reconstruct
 from sc3d.settings.train import Train
 
 
@@ -128,6 +128,7 @@ class Run:
     truth: Path | None = None
     """Folder of truth masks; evaluates at the end."""
     reconstruct: Reconstruct = Reconstruct()
+    depth: Depth = Depth()
     train: Train = Train()
     extract: Extract = Extract()
     segment: Segment = Segment()

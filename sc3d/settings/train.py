@@ -50,6 +50,10 @@ class TrainSettings:
     """weight of the depth agreement between neighboring views"""
     photometric_weight: float = 0.15
     """weight of the patch similarity (NCC) between neighboring views"""
+    stereo_weight: float = 1.0
+    """weight of the relative difference to confirmed depth of stereo, which falls to 0 over the run"""
+    sky_weight: float = 0.5
+    """weight of what is opaque where stereo found sky"""
     surface_from: float = 0.25
     """when normal and multi-view terms begin, fraction of the run"""
     depth_mode: DepthMode = "blended"
@@ -62,8 +66,9 @@ class TrainSettings:
     """7x7 patches compared per step"""
 
     fill: bool = True
-    """also start from points between the sparse ones, at the depth where the photos' patches agree, or an
-    interpolated one
+    """also start on the depth maps of `sc3d depth` if there are some, keep to what they confirm, and leave their sky
+    empty; and between, at the depth where the photos' patches agree, or an interpolated one. False = from the sparse
+    points alone
     """
     random_background: bool = True
     """render before a random color, so that dark surfaces become opaque; False = black"""

@@ -170,6 +170,7 @@ def restrict(data: TrainingData, block: Block, views: list[int]) -> TrainingData
         data.colors[near],
         [position[rows[near[rows]]] for rows in seen],
         mask,
+        None if data.depth_maps is None else lambda row: data.depth_map(views[row]),
     )
 
 

@@ -12,6 +12,7 @@ import torch
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, local_origin, project, resample, undistorted
+from sc3d.scene.depth_map import DepthMap, depth_file, read_depth_map
 from sc3d.scene.scene import Scene
 from sc3d.scene.splats import read_scene_splats
 from sc3d.settings.train import TrainSettings
@@ -30,6 +31,7 @@ class TrainingData:
     points, colors: (N, 3) sparse points; (N, 3) uint8 RGB
     tracks: per view the row indices of the sparse points it sees; None = unknown
     masks: per view (H, W) bool, False = ignored; sequence, function (may return None) or None
+    depth_maps: per view its map by stereo, of any size; a function (may return None) or None
     """
 
     views: list[View]
@@ -38,6 +40,7 @@ class TrainingData:
     colors: np.ndarray
     tracks: list[np.ndarray] | None = None
     masks: Sequence[np.ndarray] | Callable[[int], np.ndarray | None] | None = None
+    depth_maps: Callable[[int], DepthMap | None] | None = None
 
     def image(self, index: int) -> np.ndarray:
         """(H, W, 3) uint8 photo of a view. Raises InputError if its size is not the view's."""
@@ -48,6 +51,24 @@ class TrainingData:
         """(H, W) bool mask of a view, if there is one. Raises InputError if its size is not the view's."""
         mask = self._raw_mask(index)
         return None if mask is None else self._checked(mask, index, "mask").astype(bool)
+
+    def depth_map(self, index: int) -> DepthMap | None:
+        """The map of a view by stereo, of the view's size, if there is one."""
+        found = None if self.depth_maps is None else self.depth_maps(index)
+        view = self.views[index]
+        return None if found is None else found.resized((view.height, view.width))
+
+    def stereo(
+        self, index: int, halved: bool = False, device: torch.device | str = "cpu"
+    ) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """(H, W) depth that other views confirm, 0 = none, and (H, W) bool sky, at full or half size."""
+        found = self.depth_map(index)
+        if found is None:
+            return None
+        view = self.views[index]
+        if halved:
+            found = found.resized((max(1, view.height // 2), max(1, view.width // 2)))
+        return torch.from_numpy(found.confirmed(1)).to(device), torch.from_numpy(found.sky).to(device)
 
     def photo(
         self, index: int, halved: bool = False, device: torch.device | str = "cpu"
@@ -73,6 +94,7 @@ class TrainingData:
             self.colors,
             None if self.tracks is None else [self.tracks[index] for index in indices],
             lambda row: self._raw_mask(indices[row]),
+            None if self.depth_maps is None else lambda row: self.depth_map(indices[row]),
         )
 
     def seen(self, index: int) -> np.ndarray:
@@ -115,7 +137,13 @@ def scene_data(scene: Scene, settings: TrainSettings) -> tuple[TrainingData, np.
     def opaque(index: int) -> np.ndarray | None:
         return scene.opaque_pixels(local[index], views[index])
 
-    data = TrainingData(views, image, model.points - origin, model.colors, model.tracks, opaque)
+    @cached
+    def depth(index: int) -> DepthMap | None:
+        file = depth_file(scene.depth, model.views[index].name)
+        return read_depth_map(file) if file.exists() else None
+
+    depth_maps = depth if settings.fill and scene.depth.exists() else None
+    data = TrainingData(views, image, model.points - origin, model.colors, model.tracks, opaque, depth_maps)
     return data, origin
 
 

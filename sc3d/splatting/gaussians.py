@@ -14,6 +14,9 @@ from sc3d.errors import InputError
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic Y_0."""
 
+FLAT = 0.1  # thickness of a Gaussian on a known surface, relative to its width
+KNOWN = 0.5  # its opacity at the start
+
 
 @dataclass
 class Gaussians:
@@ -44,7 +47,12 @@ class Gaussians:
 
     @classmethod
     def from_points(
-        cls, points: np.ndarray, colors: np.ndarray, sh_degree: int = 0, opacity: float = 0.1
+        cls,
+        points: np.ndarray,
+        colors: np.ndarray,
+        sh_degree: int = 0,
+        opacity: float = 0.1,
+        normals: np.ndarray | None = None,
     ) -> Gaussians:
         """One isotropic Gaussian per sparse point; its scale is the rms distance to the 3 nearest neighbors.
 
@@ -52,6 +60,7 @@ class Gaussians:
         flattens it first.
 
         points: (N, 3) local world frame, N >= 2; colors: (N, 3) uint8 RGB; opacity: of all, in (0, 1)
+        normals: (N, 3) of surfaces that are known, 0 = unknown: those become flat discs of opacity KNOWN
         Duplicate and far points get a scale within 1/100 to 20 times the median. Raises InputError for fewer
         than two points.
         """
@@ -65,11 +74,22 @@ class Gaussians:
         scales = np.sqrt((distances[:, 1:4] ** 2).mean(1))
         median = np.median(scales[scales > 0]) if (scales > 0).any() else 1.0
         log_scales = torch.from_numpy(np.log(np.clip(scales, 0.01 * median, 20 * median))).float()
+        log_scales = log_scales[:, None].repeat(1, 3)
+        axes, logits = (
+            _plane_normals(points[near]),
+            torch.full((size,), float(np.log(opacity / (1 - opacity)))),
+        )
+        if normals is not None:
+            length = np.linalg.norm(normals, axis=1)
+            known = length > 0.5
+            axes[known] = normals[known] / length[known, None]
+            log_scales[torch.from_numpy(known), 0] += float(np.log(FLAT))
+            logits[torch.from_numpy(known)] = float(np.log(KNOWN / (1 - KNOWN)))
         return cls(
             torch.from_numpy(points).float(),
-            log_scales[:, None].repeat(1, 3),
-            _first_axis_along(_plane_normals(points[near])),
-            torch.full((size,), float(np.log(opacity / (1 - opacity)))),
+            log_scales,
+            _first_axis_along(axes),
+            logits,
             (torch.from_numpy(np.asarray(colors, np.float32)) / 255 - 0.5) / SH_C0,
             torch.zeros(size, (sh_degree + 1) ** 2 - 1, 3),
         )

@@ -20,6 +20,7 @@ from sc3d.splatting.gpu import losses as gpu_losses
 from sc3d.splatting.rendered_view import Rendering
 
 GRAY = (0.299, 0.587, 0.114)
+FAR_OFF = 0.1  # relative depth error that counts no more: one of the two is wrong
 PIXELS_PER_PATCH = 4
 """the geometric term looks at this many times more pixels than the photometric one"""
 
@@ -161,6 +162,17 @@ def patch_dissimilarity(
     pose = [part.numpy().ravel() for part in relative_pose(source[1], other[1])]
     cameras = np.concatenate([pinhole(source[1]), pinhole(other[1]), *pose])
     return kernels.patch_dissimilarity(*planes, pixels, (source[0], other[0]), cameras)
+
+
+def depth_loss(depth: torch.Tensor, alpha: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    """Mean of |log depth - log known|, at most FAR_OFF, over the pixels that show both.
+
+    depth, alpha: (H, W) of a rendering; known: (H, W), 0 = none, not differentiated
+    """
+    used = (alpha > 0.5) & (depth > 0) & (known > 0)
+    if not used.any():
+        return depth.sum() * 0
+    return (depth[used] / known[used]).log().abs().clamp_max(FAR_OFF).mean()
 
 
 def image_edges(image: torch.Tensor) -> torch.Tensor:

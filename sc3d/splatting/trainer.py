@@ -140,14 +140,22 @@ class Trainer:
         if settings.exposure:
             exposure = torch.nn.functional.embedding(torch.tensor(index), self.exposures, sparse=True)
             image = losses.apply_exposure(image, exposure)
+        stereo = self.data.stereo(index, settings.coarse(iteration), self.device) if settings.fill else None
+        if stereo is not None:
+            mask = ~stereo[1] if mask is None else mask & ~stereo[1]
         if mask is not None:
             image = torch.where(mask[..., None], image, target)
         loss = losses.image_loss(image, target, settings.ssim_weight)
         if settings.flatten_weight:
             flatness = losses.flatten_loss(gaussians.log_scales, rendering.radii > 0, self.extent)
             loss = loss + settings.flatten_weight * flatness
+        if stereo is not None and settings.sky_weight and stereo[1].any():
+            loss = loss + settings.sky_weight * (rendering.alpha * stereo[1]).mean()
         if shapes_surface:
             depth = surface_depth(rendering, view)
+            if stereo is not None:
+                weight = settings.stereo_weight * (1 - iteration / settings.iterations)
+                loss = loss + weight * losses.depth_loss(depth, rendering.alpha, stereo[0])
             depth = depth if mask is None else torch.where(mask, depth, 0)
             loss = loss + self._surface_terms(index, target, rendering, depth)
         loss.backward()

@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 
 def inputs(scene: Scene, settings: Train) -> list[Path]:
-    return [scene.images, scene.sparse]
+    return [scene.images, scene.sparse, *([scene.depth] if settings.fill and scene.depth.exists() else [])]
 
 
 def outputs(scene: Scene, settings: Train) -> list[Path]:
@@ -100,7 +100,7 @@ def _unfinished(scene: Scene, settings: Train) -> Path:
     cameras are removed.
     """
     blocks = settings.blocks if settings.blocks > 1 else 0
-    state = repr((settings.training, blocks, digest(scene.images), digest(scene.sparse)))
+    state = repr((settings.training, blocks, *map(digest, inputs(scene, settings))))
     mine = (
         scene.path
         / f"train.{hashlib.blake2b(state.encode(), digest_size=8).hexdigest()}.{'blocks' if blocks else 'checkpoint'}"
