@@ -11,12 +11,13 @@ import numpy as np
 import open3d as o3d
 from tqdm import tqdm
 
-from sc3d.errors import Sc3dError, left_out
+from sc3d.errors import Sc3dError
 from sc3d.extraction.evidence import DepthViews, EvidenceStore
 from sc3d.extraction.free_space import MARGIN, count_opposed, farthest_free
 from sc3d.geometry.cameras import View
 from sc3d.geometry.raycast import Surface, first_surface
 from sc3d.geometry.tsdf import DepthFusion, Part, cloud_in_order, drop_small_parts, near_mesh, pixel_squares
+from sc3d.scene.depth_map import hardly_confirmed
 from sc3d.settings.reconstruction import Fill
 from sc3d.stereo.completion import nearest_by_color
 
@@ -79,22 +80,21 @@ def fuse_views(data: DepthViews, store: EvidenceStore, voxel_size: float, fill: 
 
 
 def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[DepthFusion, float]:
-    """The field of all confirmed depth, and its share of all pixels."""
-    fusion, num_known, empty = DepthFusion(voxel_size), 0, list[str]()
+    """The field of all confirmed depth in range, and its share of all pixels."""
+    fusion, shares = DepthFusion(voxel_size), list[float]()
     for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
         known = store.read(row, "confirmed")
-        if not (known > 0).any():
-            empty.append(view.name)
-            continue
-        fusion.integrate(view, known, data.image(row), data.depth_range[1])
-        num_known += int((known > 0).sum())
-    if not num_known:
+        known[known >= data.depth_range[1]] = 0
+        added = fusion.integrate(view, known, data.image(row), data.depth_range[1])
+        shares.append(float((known > 0).mean()) if added else 0.0)
+    if not any(shares):
         raise Sc3dError(
             "no depth is confirmed by other photos: more overlap is needed, or longer training, or --min-views 1"
         )
-    if empty:
-        logger.warning(left_out(empty, len(data.views), "photos show no confirmed surface and are not fused"))
-    return fusion, num_known / sum(view.width * view.height for view in data.views)
+    if few := hardly_confirmed([view.name for view in data.views], shares):
+        logger.warning(few)
+    sizes = [view.width * view.height for view in data.views]
+    return fusion, float(np.average(shares, weights=sizes))
 
 
 def _part(fusion: DepthFusion) -> Part:
