@@ -153,7 +153,10 @@ def fit_ground(points: np.ndarray, centers: np.ndarray, up: np.ndarray) -> Groun
     normal *= np.sign(normal @ up)
     heights = (chosen - middle) @ normal
     clearance = float(np.median((centers - middle) @ normal))
-    return _with_relief(normal, float(middle @ normal), chosen[np.abs(heights) < CLEARANCE * clearance])
+    close = chosen[np.abs(heights) < CLEARANCE * clearance]
+    if len(close) < MIN_GROUND:  # the plane passes the cameras: a strip of a wall
+        return None
+    return _with_relief(normal, float(middle @ normal), close)
 
 
 def _with_relief(up: np.ndarray, height: float, points: np.ndarray) -> Ground:
