@@ -176,7 +176,8 @@ def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
     if opaque is not None:
         empty &= opaque
     known = store.read(row, "known")
-    covered = _unlike_surface(data, store, row, (known > 0) & (np.abs(known / hit - 1) < MARGIN))
+    as_known = np.abs(known / np.where(np.isfinite(hit), hit, 1) - 1) < MARGIN
+    covered = _unlike_surface(data, store, row, (known > 0) & np.isfinite(hit) & as_known)
     far = np.where(covered, (1 - MARGIN) * hit, np.where(empty, data.depth_range[1], 0)).astype(np.float32)
     others, nearest = _others(data, store, row), NEAREST * data.depth_range[0]
     depth = farthest_free(far, nearest, view, *others)

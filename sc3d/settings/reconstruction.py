@@ -104,8 +104,7 @@ class Extract:
 
     method: Annotated[Literal["tsdf", "depth", "centers"], arg(name="from")] = "tsdf"
     """Fuse depth into a truncated signed distance field: that which the Gaussians render, or that of `sc3d
-    depth`, which needs no training and adds nothing that one photo alone says. Or take the Gaussians' centers
-    as the cloud.
+    depth`, which needs no training. Or take the Gaussians' centers as the cloud.
     """
     depth_mode: DepthMode = "blended"
     """Depth that the Gaussians render: of the alpha-blended planes, or where half of the light is gone

@@ -68,7 +68,7 @@ def test_a_slanted_plane_is_found_everywhere(slanted):
     job, depths = slanted
     found = result(job, 0)
     inner = np.s_[8:-8, 8:-8]
-    disparity = np.abs(0.5 * WIDTH * (1 / found.depth - 1 / depths[0]))[inner]  # px, between neighbors
+    disparity = np.abs(0.5 * WIDTH * (1 / found.depth[inner] - 1 / depths[0][inner]))  # px, between neighbors
     assert np.median(disparity) < 0.03 and np.quantile(disparity, 0.95) < 0.1
     assert (found.num_views[inner] >= 2).mean() > 0.95
 
@@ -293,6 +293,25 @@ def test_of_two_sources_one_is_enough_where_the_other_sees_nothing():
     )
     patch_match.evaluate(alone, true, wrong)
     np.testing.assert_allclose(right[lonely], wrong[lonely] + patch_match.LONELY, atol=1e-4)
+
+
+def test_three_photos_of_a_strip_are_right_where_one_other_sees_them(tmp_path):
+    """The two outer ones share next to nothing."""
+    pairs = [
+        textured_view(np.array([x, 0.0, 0.0]), np.array([x, 0.0, 5.0]), [SLANTED], name=f"{number}.png")
+        for number, x in enumerate((0.0, 1.8, 3.6))
+    ]
+    job = job_of(tmp_path, [pair[0] for pair in pairs], [pair[1] for pair in pairs])
+    estimate_depths(job, SerialExecutor())
+    found, depth = result(job, 0), pairs[0][1]
+    shift = FOCAL * 1.8 / depth  # px, to the middle one
+    columns = 0.5 + np.arange(WIDTH) * np.ones((HEIGHT, 1))
+    lonely = (columns - shift > 8) & (columns - 2 * shift < 0) & (columns < WIDTH - 8)
+    lonely[:8] = lonely[-8:] = False
+    assert lonely.mean() > 0.15
+    error = np.abs(found.depth / depth - 1)[lonely]
+    assert (error < 0.01).mean() > 0.95 and np.quantile(error, 0.98) < 0.05
+    assert (found.num_views[lonely] == 1).mean() > 0.9
 
 
 def agrees(
