@@ -40,9 +40,9 @@ logger = logging.getLogger(__name__)
 class Surfaces:
     """mesh, cloud: in the views' local world; voxel_size: world units.
 
-    Shares of all pixels. confirmed: depth confirmed by other views; continued: added as it continues confirmed
-    surface; occluders: added before it at the farthest depth that no other view looks through; sky; coverage:
-    ray hits the mesh
+    Shares of all pixels. confirmed: depth confirmed by other views; continued: added as it continues
+    confirmed surface; occluders: added before it at the farthest depth that no other view looks through; sky;
+    coverage: ray hits the mesh
     """
 
     mesh: o3d.t.geometry.TriangleMesh
@@ -141,7 +141,8 @@ def _others(data: DepthViews, store: EvidenceStore, row: int) -> tuple[list[np.n
 def _added(
     data: DepthViews, store: EvidenceStore, surface: Surface, row: int, step: Step, voxel_size: float
 ) -> tuple[Part, float]:
-    """Squares where a view has a depth by `step` and sees nothing of the surface there; their share of its pixels.
+    """Squares where a view has a depth by `step` and sees nothing of the surface there; their share of its
+    pixels.
 
     Each view's own: where views disagree, as in tree crowns, their average would be no surface at all.
     """
@@ -168,8 +169,8 @@ def _continued(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
 
 
 def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray) -> Filled:
-    """Depth of what stands before the surface, or where no surface and no sky is: as far as no other view looks
-    through it; where nothing bounds it, that of the most alike pixel nearby.
+    """Depth of what stands before the surface, or where no surface and no sky is: as far as no other view
+    looks through it; where nothing bounds it, that of the most alike pixel nearby.
     """
     view, empty = data.views[row], ~np.isfinite(hit) & ~store.read(row, "sky")
     opaque = data.opaque(row)
@@ -187,7 +188,9 @@ def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
 
 
 def _spread(depth: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """(H, W) depth of the pixel with a depth that is reached with the least change of color, up to BESIDE away."""
+    """(H, W) depth of the pixel with a depth that is reached with the least change of color, up to BESIDE
+    away.
+    """
     source, _ = nearest_by_color(image, depth > 0)
     rows, columns = np.divmod(source, depth.shape[1])
     gap = np.hypot(np.arange(depth.shape[0])[:, None] - rows, np.arange(depth.shape[1]) - columns)
@@ -241,6 +244,8 @@ def _surface(mesh: o3d.t.geometry.TriangleMesh) -> Surface:
 
 
 def default_voxel_size(points: np.ndarray, footprint: float) -> float:
-    """1.5 times the size of a pixel on the surface, but at most 2048 voxels along the box of the (N, 3) points."""
+    """1.5 times the size of a pixel on the surface, but at most 2048 voxels along the box of the (N, 3)
+    points.
+    """
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     return max(1.5 * footprint, float((high - low).max()) / 2048)

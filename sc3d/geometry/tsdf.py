@@ -35,8 +35,8 @@ class DepthFusion:
         )
 
     def integrate(self, view: View, depth: np.ndarray, color: np.ndarray, depth_max: float) -> bool:
-        """Add one view; returns whether it adds anything: Open3D finds the blocks that a view touches by a sample of its
-        pixels, so a view with a depth in range at a few only may add nothing.
+        """Add one view; returns whether it adds anything: Open3D finds the blocks that a view touches by a
+        sample of its pixels, so a view with a depth in range at a few only may add nothing.
 
         depth: (H, W) float32 z, world units, 0 = no surface known; color: (H, W, 3) uint8 RGB; depth_max:
             farther depths are ignored
@@ -123,16 +123,17 @@ def mesh_in_order(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleM
 def pixel_squares(
     view: View, depth: np.ndarray, color: np.ndarray, wanted: np.ndarray, normals: np.ndarray | None = None
 ) -> Part:
-    """The surface that a single depth map shows, where nothing better is known: a quadrilateral over each pixel.
+    """The surface that a single depth map shows, where nothing better is known: a quadrilateral over each
+    pixel.
 
-    Quadrilaterals, not a connected sheet: between leaves, a sheet would hang in the air along the view's rays and
-    hide things from other views. They overlap a little, so that other views do not look between them.
+    Quadrilaterals, not a connected sheet: between leaves, a sheet would hang in the air along the view's rays
+    and hide things from other views. They overlap a little, so that other views do not look between them.
 
     view: pinhole; depth: (H, W) z, world units, 0 = none; color: (H, W, 3) uint8; wanted: (H, W) bool
-    normals: (H, W, 3) any numbers, of any length, camera frame, of the surface in which each lies; 0 or None: it
-        faces the camera
-    returns: mesh with vertex colors and normals, and cloud of the middles with colors uint8 and normals; both may
-        be empty
+    normals: (H, W, 3) any numbers, of any length, camera frame, of the surface in which each lies; 0 or None:
+        it faces the camera
+    returns: mesh with vertex colors and normals, and cloud of the middles with colors uint8 and normals; both
+        may be empty
     """
     rows, columns = np.nonzero(wanted & (depth > 0))
     z, rotation = depth[rows, columns].astype(np.float64)[:, None], view.cam_from_world[:3, :3]
