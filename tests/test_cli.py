@@ -253,6 +253,17 @@ def test_old_spellings_reach_the_records(tmp_path):
     assert parse("run", current(["a", "b", "--label.incidence"])).label.mechanisms.incidence
 
 
+@pytest.mark.parametrize(
+    "share, fill", [("0", "nothing"), ("0.0", "nothing"), ("0.97", "occluders"), ("None", "occluders")]
+)
+def test_coverage_is_told_what_it_is_now(tmp_path, caplog, share, fill):
+    for arguments in (["--coverage", share], [f"--coverage={share}"]):
+        caplog.clear()
+        assert parse("extract", current([str(tmp_path), *arguments])).settings.fill == fill
+        assert f"--coverage {share} is --fill {fill} now" in caplog.text
+    assert parse("run", current(["a", "b", "--extract.coverage", share])).extract.fill == fill
+
+
 def test_commands_that_became_tools_say_where_they_are(capsys):
     assert "python -m tools.benchmark speed --repeats 2" in fails(
         capsys, "benchmark", "speed", "--repeats", "2"

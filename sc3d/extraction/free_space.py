@@ -20,9 +20,11 @@ STEPS = 64  # depths tried along a ray
 def count_opposed(
     depth: np.ndarray, normals: np.ndarray, view: View, others: list[np.ndarray], views: list[View]
 ) -> np.ndarray:
-    """(H, W) uint8: how many other views look through a pixel's point, as they know a surface, or sky, behind it.
+    """(H, W) uint8: how many other views look through a pixel's point, as they know a surface, or sky, behind
+    it.
 
-    depth: (H, W) float32, 0 = none; normals: (H, W, 3) of any length, camera frame: seen flat, depth is less sure
+    depth: (H, W) float32, 0 = none; normals: (H, W, 3) of any length, camera frame: seen flat, depth is less
+        sure
     others: (h, w) float32 depth of the other `views`, 0 = unknown, inf = sky
     """
     counts = np.zeros(depth.shape, np.uint8)
@@ -43,11 +45,11 @@ def farthest_free(
     views: list[View],
     bounded: bool = False,
 ) -> np.ndarray:
-    """(H, W) float32: the farthest depth up to `far` through which no other view looks; 0 where everything is looked
-    through, or, unless `bounded`, where nothing is behind it, so that nothing tells how far it is.
+    """(H, W) float32: the farthest depth up to `far` through which no other view looks; 0 where everything is
+    looked through, or, unless `bounded`, where nothing is behind it, so that nothing tells how far it is.
 
-    far: (H, W) float32 depth from which to look, 0 = nowhere; nearest: depth, world units; others, views: as in
-        `count_opposed`
+    far: (H, W) float32 depth from which to look, 0 = nowhere; nearest: depth, world units; others, views: as
+        in `count_opposed`
     """
     depth = np.zeros(far.shape, np.float32)
     if others:

@@ -11,12 +11,13 @@ import numpy as np
 import open3d as o3d
 from tqdm import tqdm
 
-from sc3d.errors import Sc3dError, left_out
+from sc3d.errors import Sc3dError
 from sc3d.extraction.evidence import DepthViews, EvidenceStore
 from sc3d.extraction.free_space import MARGIN, count_opposed, farthest_free
 from sc3d.geometry.cameras import View
 from sc3d.geometry.raycast import Surface, first_surface
 from sc3d.geometry.tsdf import DepthFusion, Part, cloud_in_order, drop_small_parts, near_mesh, pixel_squares
+from sc3d.scene.depth_map import hardly_confirmed
 from sc3d.settings.reconstruction import Fill
 from sc3d.stereo.completion import nearest_by_color
 
@@ -39,9 +40,9 @@ logger = logging.getLogger(__name__)
 class Surfaces:
     """mesh, cloud: in the views' local world; voxel_size: world units.
 
-    Shares of all pixels. confirmed: depth confirmed by other views; continued: added as it continues confirmed
-    surface; occluders: added before it at the farthest depth that no other view looks through; sky; coverage:
-    ray hits the mesh
+    Shares of all pixels. confirmed: depth confirmed by other views; continued: added as it continues
+    confirmed surface; occluders: added before it at the farthest depth that no other view looks through; sky;
+    coverage: ray hits the mesh
     """
 
     mesh: o3d.t.geometry.TriangleMesh
@@ -79,22 +80,21 @@ def fuse_views(data: DepthViews, store: EvidenceStore, voxel_size: float, fill: 
 
 
 def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[DepthFusion, float]:
-    """The field of all confirmed depth, and its share of all pixels."""
-    fusion, num_known, empty = DepthFusion(voxel_size), 0, list[str]()
+    """The field of all confirmed depth in range, and its share of all pixels."""
+    fusion, shares = DepthFusion(voxel_size), list[float]()
     for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
         known = store.read(row, "confirmed")
-        if not (known > 0).any():
-            empty.append(view.name)
-            continue
-        fusion.integrate(view, known, data.image(row), data.depth_range[1])
-        num_known += int((known > 0).sum())
-    if not num_known:
+        known[known >= data.depth_range[1]] = 0
+        added = fusion.integrate(view, known, data.image(row), data.depth_range[1])
+        shares.append(float((known > 0).mean()) if added else 0.0)
+    if not any(shares):
         raise Sc3dError(
             "no depth is confirmed by other photos: more overlap is needed, or longer training, or --min-views 1"
         )
-    if empty:
-        logger.warning(left_out(empty, len(data.views), "photos show no confirmed surface and are not fused"))
-    return fusion, num_known / sum(view.width * view.height for view in data.views)
+    if few := hardly_confirmed([view.name for view in data.views], shares):
+        logger.warning(few)
+    sizes = [view.width * view.height for view in data.views]
+    return fusion, float(np.average(shares, weights=sizes))
 
 
 def _part(fusion: DepthFusion) -> Part:
@@ -141,7 +141,8 @@ def _others(data: DepthViews, store: EvidenceStore, row: int) -> tuple[list[np.n
 def _added(
     data: DepthViews, store: EvidenceStore, surface: Surface, row: int, step: Step, voxel_size: float
 ) -> tuple[Part, float]:
-    """Squares where a view has a depth by `step` and sees nothing of the surface there; their share of its pixels.
+    """Squares where a view has a depth by `step` and sees nothing of the surface there; their share of its
+    pixels.
 
     Each view's own: where views disagree, as in tree crowns, their average would be no surface at all.
     """
@@ -168,15 +169,16 @@ def _continued(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
 
 
 def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray) -> Filled:
-    """Depth of what stands before the surface, or where no surface and no sky is: as far as no other view looks
-    through it; where nothing bounds it, that of the most alike pixel nearby.
+    """Depth of what stands before the surface, or where no surface and no sky is: as far as no other view
+    looks through it; where nothing bounds it, that of the most alike pixel nearby.
     """
     view, empty = data.views[row], ~np.isfinite(hit) & ~store.read(row, "sky")
     opaque = data.opaque(row)
     if opaque is not None:
         empty &= opaque
     known = store.read(row, "known")
-    covered = _unlike_surface(data, store, row, (known > 0) & (np.abs(known / hit - 1) < MARGIN))
+    as_known = np.abs(known / np.where(np.isfinite(hit), hit, 1) - 1) < MARGIN
+    covered = _unlike_surface(data, store, row, (known > 0) & np.isfinite(hit) & as_known)
     far = np.where(covered, (1 - MARGIN) * hit, np.where(empty, data.depth_range[1], 0)).astype(np.float32)
     others, nearest = _others(data, store, row), NEAREST * data.depth_range[0]
     depth = farthest_free(far, nearest, view, *others)
@@ -186,7 +188,9 @@ def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
 
 
 def _spread(depth: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """(H, W) depth of the pixel with a depth that is reached with the least change of color, up to BESIDE away."""
+    """(H, W) depth of the pixel with a depth that is reached with the least change of color, up to BESIDE
+    away.
+    """
     source, _ = nearest_by_color(image, depth > 0)
     rows, columns = np.divmod(source, depth.shape[1])
     gap = np.hypot(np.arange(depth.shape[0])[:, None] - rows, np.arange(depth.shape[1]) - columns)
@@ -240,6 +244,8 @@ def _surface(mesh: o3d.t.geometry.TriangleMesh) -> Surface:
 
 
 def default_voxel_size(points: np.ndarray, footprint: float) -> float:
-    """1.5 times the size of a pixel on the surface, but at most 2048 voxels along the box of the (N, 3) points."""
+    """1.5 times the size of a pixel on the surface, but at most 2048 voxels along the box of the (N, 3)
+    points.
+    """
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     return max(1.5 * footprint, float((high - low).max()) / 2048)

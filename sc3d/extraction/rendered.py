@@ -26,8 +26,8 @@ logger = logging.getLogger(__name__)
 def write_rendered(
     gaussians: Gaussians, data: DepthViews, store: EvidenceStore, min_views: int, mode: DepthMode
 ) -> float:
-    """Write the evidence of all views, after that of stereo if the store holds some; returns the median size of a
-    pixel on the surface, world units.
+    """Write the evidence of all views, after that of stereo if the store holds some; returns the median size
+    of a pixel on the surface, world units.
     """
     footprint = _render(gaussians, data, store, mode)
     for row in range(len(data.views)):

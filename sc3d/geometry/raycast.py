@@ -65,7 +65,9 @@ class Surface:
         return cls(cls.from_mesh(vertices, triangles, np.zeros(3)).scene, np.asarray(origin, np.float64))
 
     def triangles(self, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W) int64 triangle that each pixel hits first, -1 = none, and (H, W, 2) float32 barycentric u, v."""
+        """(H, W) int64 triangle that each pixel hits first, -1 = none, and (H, W, 2) float32
+        barycentric u, v.
+        """
         directions = camera_rays(view.camera)
         bundle = np.empty((len(directions), 6), np.float32)
         _aim(directions, view.cam_from_world, (view.center - self.origin).astype(np.float32), bundle)

@@ -34,8 +34,9 @@ class DepthFusion:
             CPU,
         )
 
-    def integrate(self, view: View, depth: np.ndarray, color: np.ndarray, depth_max: float) -> None:
-        """Add one view.
+    def integrate(self, view: View, depth: np.ndarray, color: np.ndarray, depth_max: float) -> bool:
+        """Add one view; returns whether it adds anything: Open3D finds the blocks that a view touches by a
+        sample of its pixels, so a view with a depth in range at a few only may add nothing.
 
         depth: (H, W) float32 z, world units, 0 = no surface known; color: (H, W, 3) uint8 RGB; depth_max:
             farther depths are ignored
@@ -43,7 +44,7 @@ class DepthFusion:
         if not view.camera.is_undistorted():
             raise ValueError("depth fusion needs a pinhole view: use cameras.undistorted")
         if not ((depth > 0) & (depth < depth_max)).any():
-            return
+            return False
         matrix = view.matrix.copy()
         matrix[:2, 2] -= 0.5  # Open3D counts pixel centers as whole numbers
         intrinsic, extrinsic = o3d.core.Tensor(matrix), o3d.core.Tensor(view.cam_from_world)
@@ -53,12 +54,18 @@ class DepthFusion:
         color_image = o3d.t.geometry.Image(
             o3d.core.Tensor(np.ascontiguousarray(color, np.float32) / np.float32(255))
         )
-        blocks = self._grid.compute_unique_block_coordinates(
-            depth_image, intrinsic, extrinsic, 1.0, depth_max, TRUNCATION
-        )
+        try:
+            blocks = self._grid.compute_unique_block_coordinates(
+                depth_image, intrinsic, extrinsic, 1.0, depth_max, TRUNCATION
+            )
+        except RuntimeError as error:
+            if "No block is touched" not in str(error):
+                raise
+            return False
         self._grid.integrate(
             blocks, depth_image, color_image, intrinsic, extrinsic, 1.0, depth_max, TRUNCATION
         )
+        return True
 
     def mesh(self, min_weight: float = 0.5) -> o3d.t.geometry.TriangleMesh:
         """Triangles of the zero level set seen by more than `min_weight` views."""
@@ -116,16 +123,17 @@ def mesh_in_order(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleM
 def pixel_squares(
     view: View, depth: np.ndarray, color: np.ndarray, wanted: np.ndarray, normals: np.ndarray | None = None
 ) -> Part:
-    """The surface that a single depth map shows, where nothing better is known: a quadrilateral over each pixel.
+    """The surface that a single depth map shows, where nothing better is known: a quadrilateral over each
+    pixel.
 
-    Quadrilaterals, not a connected sheet: between leaves, a sheet would hang in the air along the view's rays and
-    hide things from other views. They overlap a little, so that other views do not look between them.
+    Quadrilaterals, not a connected sheet: between leaves, a sheet would hang in the air along the view's rays
+    and hide things from other views. They overlap a little, so that other views do not look between them.
 
     view: pinhole; depth: (H, W) z, world units, 0 = none; color: (H, W, 3) uint8; wanted: (H, W) bool
-    normals: (H, W, 3) any numbers, of any length, camera frame, of the surface in which each lies; 0 or None: it
-        faces the camera
-    returns: mesh with vertex colors and normals, and cloud of the middles with colors uint8 and normals; both may
-        be empty
+    normals: (H, W, 3) any numbers, of any length, camera frame, of the surface in which each lies; 0 or None:
+        it faces the camera
+    returns: mesh with vertex colors and normals, and cloud of the middles with colors uint8 and normals; both
+        may be empty
     """
     rows, columns = np.nonzero(wanted & (depth > 0))
     z, rotation = depth[rows, columns].astype(np.float64)[:, None], view.cam_from_world[:3, :3]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, left_out
 from sc3d.io.atomic import atomic_path
+
+FEW = 0.05  # of a photo's pixels; with fewer confirmed ones it hardly counts
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,12 @@ class DepthMap:
         columns = (np.arange(shape[1]) + 0.5) * width // shape[1]
         chosen = np.ix_(rows.astype(int), columns.astype(int))
         return DepthMap(*(values[chosen] for values in vars(self).values()))
+
+
+def hardly_confirmed(names: Sequence[str], shares: Sequence[float]) -> str:
+    """One line about photos with a share of confirmed pixels below FEW; empty if there are none."""
+    found = [name for name, share in zip(names, shares, strict=True) if share < FEW]
+    return left_out(found, len(names), f"photos have under {FEW:.0%} confirmed depth") if found else ""
 
 
 def depth_file(folder: Path, photo: str) -> Path:

@@ -75,8 +75,8 @@ class GeoreferenceOptions:
     from_gps: bool = False
     """Replace the present georeference by one from GPS."""
     gcp: Path | None = None
-    """Replace it by one from ground control points, in ODM's gcp_list.txt format; cameras and all that was made
-    from them stay as they are.
+    """Replace it by one from ground control points, in ODM's gcp_list.txt format; cameras and all that was
+    made from them stay as they are.
     """
     gcp_accuracy: tuple[float, float] | None = None
     """Standard deviations of the ground control points, m: horizontal, vertical. None = estimated from how
@@ -104,8 +104,7 @@ class Extract:
 
     method: Annotated[Literal["tsdf", "depth", "centers"], arg(name="from")] = "tsdf"
     """Fuse depth into a truncated signed distance field: that which the Gaussians render, or that of `sc3d
-    depth`, which needs no training and adds nothing that one photo alone says. Or take the Gaussians' centers
-    as the cloud.
+    depth`, which needs no training. Or take the Gaussians' centers as the cloud.
     """
     depth_mode: DepthMode = "blended"
     """Depth that the Gaussians render: of the alpha-blended planes, or where half of the light is gone
@@ -118,9 +117,10 @@ class Extract:
     min_views: int = 1
     """Neighbor views that must confirm a depth (within 1 px)."""
     fill: Fill = "occluders"
-    """What is added to the confirmed surface, which labels need: nothing; continued: what only one photo shows, where
-    it continues confirmed surface; occluders: also what stands before it, or before the sky of others, seen by one
-    photo (leaves before the camera), at the farthest depth that no other photo looks through.
+    """What is added to the confirmed surface, which labels need: nothing; continued: what only one photo
+    shows, where it continues confirmed surface; occluders: also what stands before it, or before the sky of
+    others, seen by one photo (leaves before the camera), at the farthest depth that no other photo looks
+    through.
     """
     min_opacity: float = 0.3
     """Smallest opacity of a Gaussian whose center becomes a point (centers)."""

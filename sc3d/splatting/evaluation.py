@@ -116,8 +116,8 @@ def depth_map(
 def facing_depth(
     gaussians: Gaussians, view: View, max_angle: float, mode: DepthMode
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) float32 depth of `depth_map`, 0 where ray and normal are more than `max_angle` degrees apart, and
-    (H, W, 3) its normals.
+    """(H, W) float32 depth of `depth_map`, 0 where ray and normal are more than `max_angle` degrees apart,
+    and (H, W, 3) its normals.
     """
     depth, _, normals_cam = depth_map(gaussians, view, mode)
     rays_cam = torch.nn.functional.normalize(pixel_rays(view), dim=2).numpy()

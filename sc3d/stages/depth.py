@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,11 +14,14 @@ from sc3d.geometry.view_selection import neighbor_views
 from sc3d.georeferencing.georeference import georeference_path
 from sc3d.georeferencing.up_direction import find_up, view_poses
 from sc3d.io.atomic import atomic_path
+from sc3d.scene.depth_map import hardly_confirmed
 from sc3d.scene.scene import Scene, SparseModel, check_photos
 from sc3d.settings.reconstruction import Depth
 from sc3d.stereo.multi_view import MIN_SPARSE, StereoJob, estimate_depths, inverse_range, sparse_seeds
 from sc3d.tiling.executor import open_executor
 from sc3d.tiling.work_folder import WorkFolder
+
+logger = logging.getLogger(__name__)
 
 
 def inputs(scene: Scene, settings: Depth) -> list[Path]:
@@ -35,9 +39,15 @@ def run(scene: Scene, settings: Depth) -> dict[str, object]:
     job, left_out = _job(scene, settings, work)
     with open_executor(settings) as tasks, atomic_path(scene.depth) as folder:
         folder.mkdir()
-        shares = estimate_depths(replace(job, output=folder), tasks)
+        shares = np.array(estimate_depths(replace(job, output=folder), tasks))
+        if not shares[:, 0].any():
+            raise InputError(
+                f"no depth of the {len(job.views)} photos is confirmed by another one: check that the cameras fit the photos, or take photos that overlap more"
+            )
     work.remove()
-    one, two, known, sky = np.mean(shares, axis=0)
+    if few := hardly_confirmed([view.name for view in job.views], shares[:, 0].tolist()):
+        logger.warning(few)
+    one, two, known, sky = shares.mean(axis=0)
     return {
         "photos": len(job.views),
         **({"left_out": left_out} if left_out else {}),

@@ -56,7 +56,9 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
 
 
 def _from_gaussians(scene: Scene, settings: Extract, store: EvidenceStore) -> tuple[Surfaces, np.ndarray]:
-    """Surface of the Gaussians, after what the maps of `sc3d depth` confirm, and the world position of its origin."""
+    """Surface of the Gaussians, after what the maps of `sc3d depth` confirm, and the world position of its
+    origin.
+    """
     gaussians, origin = load_gaussians(scene)
     check_photos(scene, [view.name for view in scene.model.views])
     points = gaussians.means.detach().numpy()
@@ -155,9 +157,9 @@ def _figures(surfaces: Surfaces) -> dict[str, object]:
 
 
 def _depth_range(model: SparseModel, means: np.ndarray) -> tuple[float, float]:
-    """0.7 times the 1st and 1.2 times the 99th percentile of the sparse points' depths, in the photos that see
-    them; of all that lie in a photo, if the model does not tell; of the Gaussians' means (N, 3), world, if there
-    are no sparse points.
+    """0.7 times the 1st and 1.2 times the 99th percentile of the sparse points' depths, in the photos that
+    see them; of all that lie in a photo, if the model does not tell; of the Gaussians' means (N, 3), world,
+    if there are no sparse points.
     """
     tracked = any(len(track) for track in model.tracks)
     points = model.points if len(model.points) else means

@@ -22,8 +22,9 @@ def count_agreements(
     """(H, W) uint8: how many other views land back within TOLERANCE px of a pixel, at the same depth within
     RELATIVE; both times `looseness`.
 
-    inverse: (H, W) float32 inverse depths of `view`, 0 = none; others: (h, w, 3+) float32 planes q, a, b of the
-        other views, any sizes: between pixel centers a plane goes on, which matters on ground at grazing angles
+    inverse: (H, W) float32 inverse depths of `view`, 0 = none; others: (h, w, 3+) float32 planes q, a, b of
+        the other views, any sizes: between pixel centers a plane goes on, which matters on ground at
+        grazing angles
     """
     counts = np.zeros(inverse.shape, np.uint8)
     if others:

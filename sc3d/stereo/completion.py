@@ -1,7 +1,8 @@
 """What no other view confirms: continued from confirmed surface around it, or sky, or nothing.
 
 A pixel continues the confirmed pixel that it reaches with the least change of color. Level ground before the
-cameras goes on as such, however far, as it is seen too flat for patches to match; anything else a few pixels only.
+cameras goes on as such, however far, as it is seen too flat for patches to match; anything else a few pixels
+only.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ SKY_SIZE = 480  # px, longest side of the image in which sky is looked for
 class Ground:
     """Level ground below the cameras, nearly a plane: up . X = height + relief(X).
 
-    up: (3,) unit, world; axes: (2, 3) unit, across it; start: (2,) corner and size of the cells of a map along axes
+    up: (3,) unit, world; axes: (2, 3) unit, across it; start: (2,) corner and size of the cells of a map
+        along axes
     relief: (CELLS, CELLS) height above the plane at the corners of the map's cells, world units
     """
 
@@ -56,7 +58,9 @@ class Ground:
     relief: np.ndarray
 
     def relief_at(self, points: np.ndarray) -> np.ndarray:
-        """(...) height above the plane of the ground at (..., 3) points, bilinear; off the map that of its border."""
+        """(...) height above the plane of the ground at (..., 3) points, bilinear; off the map that of its
+        border.
+        """
         place = (points @ self.axes.T - self.start) / self.size
         x, y = np.moveaxis(place.astype(np.float32), -1, 0)
         flat = cv2.remap(
@@ -72,7 +76,8 @@ class Ground:
 def without_speckles(inverse: np.ndarray, confirmed: np.ndarray, share: float = SPECKLE) -> np.ndarray:
     """(H, W) bool: confirmed pixels without patches of a coherent depth that are smaller: chance.
 
-    inverse: (H, W) float32 inverse depths; confirmed: (H, W) bool; share: of the pixels, of the smallest patch kept
+    inverse: (H, W) float32 inverse depths; confirmed: (H, W) bool; share: of the pixels, of the smallest
+        patch kept
     """
     step = np.log1p(COHERENT) / 8
     with np.errstate(divide="ignore"):
@@ -87,8 +92,8 @@ def without_speckles(inverse: np.ndarray, confirmed: np.ndarray, share: float = 
 
 @numba.njit(cache=True)
 def nearest_by_color(image, seeds):
-    """(H, W) int64 flat index of the seed that each pixel reaches with the least change of color, -1 without seeds;
-    (H, W) float32 length of that way, px, changes of color included.
+    """(H, W) int64 flat index of the seed that each pixel reaches with the least change of color, -1 without
+    seeds; (H, W) float32 length of that way, px, changes of color included.
 
     image: (H, W, 3) uint8; seeds: (H, W) bool. Raster scans forth and back (chamfer distance), three times.
     """
@@ -125,8 +130,8 @@ def nearest_by_color(image, seeds):
 
 
 def fit_ground(points: np.ndarray, centers: np.ndarray, up: np.ndarray) -> Ground | None:
-    """The nearly level plane below all cameras with most points on it and least below it, by RANSAC; None where
-    they are few. Not by normals: those of ground are poor where it is seen flat.
+    """The nearly level plane below all cameras with most points on it and least below it, by RANSAC; None
+    where they are few. Not by normals: those of ground are poor where it is seen flat.
 
     points: (N, 3) confirmed, world; centers: (V, 3) cameras; up: (3,) unit
     """
@@ -153,12 +158,15 @@ def fit_ground(points: np.ndarray, centers: np.ndarray, up: np.ndarray) -> Groun
     normal *= np.sign(normal @ up)
     heights = (chosen - middle) @ normal
     clearance = float(np.median((centers - middle) @ normal))
-    return _with_relief(normal, float(middle @ normal), chosen[np.abs(heights) < CLEARANCE * clearance])
+    close = chosen[np.abs(heights) < CLEARANCE * clearance]
+    if len(close) < MIN_GROUND:  # the plane passes the cameras: a strip of a wall
+        return None
+    return _with_relief(normal, float(middle @ normal), close)
 
 
 def _with_relief(up: np.ndarray, height: float, points: np.ndarray) -> Ground:
-    """Relief of (N, 3) points close to a plane: least squares with small second differences, reweighted thrice
-    against what stands on the ground (Cauchy weights).
+    """Relief of (N, 3) points close to a plane: least squares with small second differences, reweighted
+    thrice against what stands on the ground (Cauchy weights).
     """
     axes = np.linalg.svd(up[None])[2][1:]
     placed, heights = points @ axes.T, points @ up - height
@@ -210,11 +218,11 @@ def horizon(view: View, up: np.ndarray) -> np.ndarray:
 
 
 def find_sky(image: np.ndarray, confirmed: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """(H, W) bool: above the horizon, bright or blue, even up to the border of the image, and not confirmed, but
-    for the fringe of confirmed surface: patches carry it over its outline.
+    """(H, W) bool: above the horizon, bright or blue, even up to the border of the image, and not confirmed,
+    but for the fringe of confirmed surface: patches carry it over its outline.
 
-    What is even and reaches the border is sure, and so is what has its colors; what lies between goes to sky or
-    to the rest, whichever it reaches with less change of color.
+    What is even and reaches the border is sure, and so is what has its colors; what lies between goes to sky
+    or to the rest, whichever it reaches with less change of color.
     image: (H, W, 3) uint8 RGB; confirmed: (H, W) bool; elevation: (H, W) sine of `horizon`
     """
     height, width = confirmed.shape
@@ -316,8 +324,8 @@ def _continue_ground(
 
 def _ground_planes(view: View, ground: Ground) -> np.ndarray:
     """(H, W, 3) planes of the ground in a view: with X = ray / q, up . (R^T (X - t)) = height gives
-    q = (R up) . ray / (height - up . center), linear in the pixel; relief r at X makes it q h / (h - r), with h the
-    height of the camera.
+    q = (R up) . ray / (height - up . center), linear in the pixel; relief r at X makes it q h / (h - r), with
+    h the height of the camera.
     """
     above = ground.up @ view.center - ground.height
     if above <= 0:

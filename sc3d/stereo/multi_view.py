@@ -1,9 +1,9 @@
 """Depth of all views of a scene, from coarse to fine.
 
-A pass works on every view by itself and reads what the pass before found for it and its sources, so passes run
-on any number of workers and an interrupted one goes on photo by photo. The first pass compares photos only; in
-the others a source whose own depth contradicts adds to the cost (Xu and Tao, Multi-Scale Geometric Consistency
-Guided Multi-View Stereo, 2019), which settles what little texture leaves open.
+A pass works on every view by itself and reads what the pass before found for it and its sources, so passes
+run on any number of workers and an interrupted one goes on photo by photo. The first pass compares photos
+only; in the others a source whose own depth contradicts adds to the cost (Xu and Tao, Multi-Scale Geometric
+Consistency Guided Multi-View Stereo, 2019), which settles what little texture leaves open.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ class StereoJob:
     scene: folder; photo_views: cameras of its photos, by whose names they are found
     views: the same, undistorted
     sources: per view, rows of those it is compared with
-    ranges: per view, farthest, usual nearest and nearest inverse depth; seeds: per view, (n, 3) column, row and inverse depth of
-        the sparse points that it sees
+    ranges: per view, farthest, usual nearest and nearest inverse depth; seeds: per view, (n, 3) column, row
+        and inverse depth of the sparse points that it sees
     longest: side of the maps, px; up: (3,) unit, world
     work: folder of what passes leave; output: folder of the depth maps
     """
@@ -134,8 +134,9 @@ def sparse_seeds(view: View, points: np.ndarray) -> np.ndarray | None:
 
 
 def inverse_range(seeds: np.ndarray, baseline: float) -> tuple[float, float, float]:
-    """Farthest inverse depth to look at; nearest around the (n, 3) seeds; nearest at all: leaves and ground before
-    the camera are nearer than what has sparse points. baseline: median distance to the sources, world units
+    """Farthest inverse depth to look at; nearest around the (n, 3) seeds; nearest at all: leaves and ground
+    before the camera are nearer than what has sparse points. baseline: median distance to the sources, world
+    units
     """
     far, near = np.quantile(seeds[:, 2], [0.01, 0.99]) / [FARTHEST, NEAR]
     nearest = min(1 / (NEAREST * baseline), BEYOND * near) if baseline > 0 else near
@@ -201,7 +202,9 @@ def run_pass(job: StereoJob, number: int, row: int) -> None:
 
 
 def _problem(job: StereoJob, number: int, row: int, geometric: bool) -> Stereo:
-    """The arrays of one view and its sources as large as in a pass; geometric: with what the pass before found."""
+    """The arrays of one view and its sources as large as in a pass; geometric: with what the pass before
+    found.
+    """
     own, views = job.view(number, row), [job.view(number, source) for source in job.sources[row]]
     grays = [
         job.gray(source).at(max(view.width, view.height)).gray
@@ -226,8 +229,8 @@ def _problem(job: StereoJob, number: int, row: int, geometric: bool) -> Stereo:
 
 
 def _start(stereo: Stereo, seeds: np.ndarray) -> np.ndarray:
-    """(H, W, 3) planes: most through the sparse points around the pixel, or facing the camera at the depth of the
-    nearest; the rest anywhere in the range.
+    """(H, W, 3) planes: most through the sparse points around the pixel, or facing the camera at the depth of
+    the nearest; the rest anywhere in the range.
     """
     height, width = stereo.gray.shape
     random = np.random.default_rng(0)
@@ -248,8 +251,8 @@ def _start(stereo: Stereo, seeds: np.ndarray) -> np.ndarray:
 
 
 def _planes_through(seeds: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(C, 3) least squares plane through the AROUND nearest seeds of each (C, 2) cell center, and (C, 3) that of
-    the nearest seed, which faces the camera.
+    """(C, 3) least squares plane through the AROUND nearest seeds of each (C, 2) cell center, and (C, 3) that
+    of the nearest seed, which faces the camera.
     """
     near = cKDTree(seeds[:, :2]).query(cells, k=min(AROUND, len(seeds)))[1]
     offsets = seeds[near, :2] - cells[:, None]
@@ -286,8 +289,8 @@ def upsampled(planes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 def check_view(job: StereoJob, row: int) -> np.ndarray:
     """Count the sources that confirm a view's depths; returns (n, 3) some of the confirmed points, world.
 
-    Views can also agree on chance, as they have looked at each other's maps, so the photos must agree too, and
-    a surface must be larger than a speckle.
+    Views can also agree on chance, as they have looked at each other's maps, so the photos must agree too,
+    and a surface must be larger than a speckle.
     """
     last = len(passes(job.longest)) - 1
     planes, view, sources = np.load(job.file(last, row)), job.view(last, row), job.sources[row]
@@ -314,8 +317,8 @@ def check_view(job: StereoJob, row: int) -> np.ndarray:
 
 
 def finish_view(job: StereoJob, ground: Ground | None, row: int) -> tuple[float, float, float, float]:
-    """Complete a view and write its depth map; returns the shares of its pixels that one and that two other views
-    confirm, that have a depth, and of sky.
+    """Complete a view and write its depth map; returns the shares of its pixels that one and that two other
+    views confirm, that have a depth, and of sky.
     """
     last = len(passes(job.longest)) - 1
     planes, view = np.load(job.file(last, row)), job.view(last, row)

@@ -1,13 +1,13 @@
 """PatchMatch stereo: a slanted plane for every pixel, found by trying the planes of the pixels around it.
 
 The inverse depth 1 / z of a plane is linear in the pixel, so a plane is (q, a, b): the inverse depth at the
-pixel and its slopes along columns and rows; it goes on at an offset (i, j) with q + i a + j b. A pixel p of the
-reference lands in a source at A (p, 1) + q(p) B, projected, A = K_s R K_r^-1 and B = K_s t. Its patch is compared
-by normalized cross-correlation (NCC), weighted with the color difference to the middle (bilateral weights), and
-warped by the derivative of that map, which is exact up to second order in the patch radius.
+pixel and its slopes along columns and rows; it goes on at an offset (i, j) with q + i a + j b. A pixel p of
+the reference lands in a source at A (p, 1) + q(p) B, projected, A = K_s R K_r^-1 and B = K_s t. Its patch is
+compared by normalized cross-correlation (NCC), weighted with the color difference to the middle (bilateral
+weights), and warped by the derivative of that map, which is exact up to second order in the patch radius.
 
-After Bleyer et al., PatchMatch Stereo (2011), with the red-black updates of Galliani et al., Massively Parallel
-Multiview Stereopsis (2015). Written from the papers.
+After Bleyer et al., PatchMatch Stereo (2011), with the red-black updates of Galliani et al., Massively
+Parallel Multiview Stereopsis (2015). Written from the papers.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ class Stereo(NamedTuple):
 
     gray: (H, W) float32, 0 to 1; sources: (S, h, w) float32, filled up with 0; sizes: (S, 2) width, height px
     A: (S, 3, 3), B: (S, 3) float32 of `pinhole_pairs.transfer`
-    farthest, nearest: inverse depths allowed, farthest <= q <= nearest; span: of which random changes are a share
+    farthest, nearest: inverse depths allowed, farthest <= q <= nearest; span: of which random changes are a
+        share
     others: (S, h, w, 3) float32 planes that the sources have found, q = 0: none; without any (S, 0, 0, 3)
     back_A, back_B: A and B from each source to the reference
     """
@@ -164,8 +165,8 @@ def _dissimilarity(stereo, flat, s, x, y, q, a, b, weights, values, variance):
 
 @numba.njit(cache=True, fastmath=True, inline="always")
 def _contradiction(stereo, s, x, y, q):
-    """Cost of a depth that the own map of source s contradicts: by how far the pixel lands from itself, there and
-    back.
+    """Cost of a depth that the own map of source s contradicts: by how far the pixel lands from itself, there
+    and back.
     """
     worst = np.float32(AGREEMENT * CONTRADICTION)
     u, v, w = moved(stereo.A, stereo.B, s, x, y, q)
@@ -217,8 +218,8 @@ def evaluate(stereo, planes, costs):
 
 @numba.njit(cache=True, fastmath=True, inline="always")
 def _surest(costs, row, column, arm, reach):
-    """Row and column of the pixel of least cost along one of four arms, at odd distances: those are of the other
-    color; -1 outside of the map.
+    """Row and column of the pixel of least cost along one of four arms, at odd distances: those are of the
+    other color; -1 outside of the map.
     """
     height, width = costs.shape
     chosen_row, chosen_column, surest = -1, -1, np.float32(1e9)

@@ -100,6 +100,61 @@ def test_empty_depth_adds_nothing_and_distorted_views_are_refused():
         fusion.integrate(radial, np.ones((10, 20), np.float32), np.zeros((10, 20, 3), np.uint8), 150.0)
 
 
+def test_a_view_without_depth_in_range_or_with_a_few_pixels_adds_nothing():
+    """Open3D raises "No block is touched" for these."""
+    fusion, color = DepthFusion(0.5, 10), np.zeros((30, 40, 3), np.uint8)
+    view = pinhole_view("a", (40, 30), (40, 40, 20, 15), np.eye(4))
+    assert not fusion.integrate(view, np.full((30, 40), 200, np.float32), color, 150.0)
+    dot = np.zeros((30, 40), np.float32)
+    dot[5, 5] = 3.0
+    assert not fusion.integrate(view, dot, color, 150.0)
+    assert len(fusion.mesh().triangle.indices) == 0
+    assert fusion.integrate(view, np.full((30, 40), 3, np.float32), color, 150.0)
+
+
+def test_pixel_squares_with_normals_tile_a_grazing_plane_without_gaps():
+    """Ground seen at 6 to 17 degrees: squares that lie in it are seen from above as one surface, those that face
+    the camera are not.
+    """
+    center = np.array([0.0, -10.0, 1.5])
+    view = pinhole_view("a", (80, 60), (200, 200, 40, 30), look_at(center, np.array([0.0, 0, 0.0])))
+    rays_cam = np.stack(
+        [*np.meshgrid((np.arange(80) - 39.5) / 200, (np.arange(60) - 29.5) / 200), np.ones((60, 80))], axis=2
+    )
+    down = rays_cam @ view.cam_from_world[:3, 2]
+    depth = np.where(down < -0.1, -1.5 / np.minimum(down, -0.1), 0).astype(np.float32)
+    depth[depth > 15] = 0
+    normals = np.tile(view.cam_from_world[:3, 2].astype(np.float32), (60, 80, 1))
+    above = pinhole_view(
+        "b", (60, 120), (100, 100, 30, 60), look_at(np.array([0.0, -4.0, 9.0]), np.array([0.0, -4.0, 0]))
+    )
+    hits = {}
+    for name, given in (("in it", normals), ("longer", 90 * normals), ("facing", None)):
+        mesh, cloud = pixel_squares(view, depth, np.zeros((60, 80, 3), np.uint8), depth > 0, given)
+        surface = Surface.from_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), np.zeros(3))
+        first = first_surface(surface, above)
+        hits[name] = np.isfinite(first.range)
+        if given is not None:
+            assert np.abs(mesh.vertex.positions.numpy()[:, 2]).max() < 1e-3
+            assert np.abs(cloud.point.positions.numpy()[:, 2]).max() < 1e-3
+            assert (cloud.point.normals.numpy()[:, 2] > 0.999).all()
+    columns, rows = np.meshgrid(np.arange(60), np.arange(120))
+    x, y = above_ground(above, columns + 0.5, rows + 0.5)
+    ahead = y + 10
+    inside = (ahead > 6) & (ahead < 10) & (np.abs(x) < 0.15 * ahead)
+    assert inside.sum() > 300
+    assert hits["in it"][inside].all() and (hits["longer"] == hits["in it"]).all()
+    assert hits["facing"][inside].mean() < 0.9
+
+
+def above_ground(view, columns, rows) -> tuple[np.ndarray, np.ndarray]:
+    """x and y where the rays of pixels meet z = 0."""
+    pixels = np.stack([columns, rows, np.ones_like(columns)], axis=-1)
+    directions = pixels @ np.linalg.inv(view.matrix).T @ view.cam_from_world[:3, :3]
+    points = view.center - directions * (view.center[2] / directions[..., 2:])
+    return points[..., 0], points[..., 1]
+
+
 def test_small_parts_are_dropped():
     large = o3d.t.geometry.TriangleMesh.create_sphere(2.0, 20)
     small = o3d.t.geometry.TriangleMesh.create_box().translate([10, 0, 0])

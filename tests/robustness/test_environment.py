@@ -23,7 +23,6 @@ from PIL import Image
 from sc3d import cli
 from sc3d.errors import InputError, Sc3dError
 from sc3d.exporters.packages import load
-from sc3d.extraction import extract_surface
 from sc3d.io import atomic, caches, requirements
 from sc3d.io.clouds import read_cloud, write_geometry
 from sc3d.runner import execute, sidecar
@@ -31,15 +30,14 @@ from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import read_votes, vote_channels
 from sc3d.scene.scene import Scene, SparseModel, require_views
 from sc3d.settings.labels import Evaluate, Label, Propagate
-from sc3d.settings.reconstruction import Extract
-from sc3d.stages.extract import _depth_range
+from sc3d.stages.extract import _depth_range, _require_room
 from sc3d.tiling import label as tiled_label
 from sc3d.tiling import propagate as tiled_propagate
 from sc3d.tiling.label_grid_file import write_field
 from sc3d.tiling.work_folder import WorkFolder
 from tests import builders
-from tests.test_extraction import data as five_views
-from tests.test_extraction import flat_square
+from tests.extraction.builders import data as five_views
+from tests.extraction.builders import flat_square, surface_of
 
 
 @dataclass(frozen=True)
@@ -303,7 +301,7 @@ def test_the_folder_that_is_full_is_named(copying, site, temporary, monkeypatch,
 def test_depth_maps_need_room_before_they_are_rendered(temporary, monkeypatch):
     monkeypatch.setattr(atomic, "_free_bytes", lambda folder: 1 << 18)
     with pytest.raises(OSError) as error:
-        extract_surface(flat_square(1.0, 0.0), five_views(), Extract())
+        _require_room(five_views())
     assert atomic.full_folder(error.value, []) == temporary
 
 
@@ -322,7 +320,7 @@ def test_two_and_three_photos_give_a_surface(count):
     whole = five_views()
     neighbors = [np.array([other for other in range(count) if other != row]) for row in range(count)]
     few = replace(whole, views=whole.views[:count], neighbors=neighbors)
-    found = extract_surface(flat_square(4.0, 0.5), few, Extract(voxel_size=0.15, coverage=1.0))
+    found = surface_of(flat_square(4.0, 0.5), few)
     points = found.cloud.point.positions.numpy()
     inner = np.abs(points[:, :2]).max(axis=1) < 3.5
     assert inner.sum() > 1000 and np.abs(points[inner, 2] - 0.5).max() < 0.1

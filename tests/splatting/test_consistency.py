@@ -6,8 +6,8 @@ import torch
 from sc3d.geometry.cameras import rays
 from sc3d.splatting import losses
 from sc3d.splatting.consistency import blocking, consistent, pixel_rays, reprojection_error
+from tests.extraction.builders import views
 from tests.splatting.test_losses import PLANE, camera, plane_depth
-from tests.test_extraction import views
 
 
 def test_rays_are_those_of_the_camera_module():

@@ -115,12 +115,63 @@ def test_what_is_missing_or_damaged_is_said(site, tmp_path):
     with pytest.raises(InputError, match="sc3d depth"):
         execute("extract", scene, Extract(method="depth"))
     file = tmp_path / "a.npz"
-    write_depth_map(file, DepthMap(*(np.ones(shape, np.uint8) for shape in ((9, 9), (9, 9, 3), (9, 9)))))
+    write_depth_map(
+        file, DepthMap(*(np.ones(shape, np.uint8) for shape in ((9, 9), (9, 9, 3), (9, 9), (9, 9))))
+    )
     whole = file.read_bytes()
     for content in (b"nothing", whole[:200], whole[:-50], b""):
         file.write_bytes(content)
         for read in (read_depth_map, depth_map_size):
             with pytest.raises(InputError, match="damaged"):
                 read(file)
+    file.write_bytes(whole)
+    with np.load(file) as found:
+        before = {name: found[name] for name in ("depth", "normals", "num_views")}
+    np.savez(file, **before)  # as the version before wrote them
+    with pytest.raises(InputError, match="damaged .*sky.*: run `sc3d depth --overwrite`"):
+        read_depth_map(file)
     with pytest.raises(InputError, match="at least 32"):
         Depth(max_size=3)
+
+
+def test_without_any_confirmed_depth_the_command_fails_and_little_of_it_is_told(
+    site, tmp_path, monkeypatch, caplog
+):
+    from sc3d.stages import depth
+
+    scene, shares = copy_of(site, tmp_path), [(0.0, 0.0, 0.4, 0.1)] * 8
+    monkeypatch.setattr(depth, "estimate_depths", lambda job, tasks: shares)
+    with pytest.raises(InputError, match="no depth of the 8 photos is confirmed"):
+        execute("depth", scene, Depth(max_size=64))
+    assert not scene.depth.exists()
+    shares[3:] = [(0.6, 0.5, 0.8, 0.1)] * 5
+    names = [view.name for view in scene.model.views]
+    execute("depth", scene, Depth(max_size=64))
+    assert f"3 of 8 photos have under 5% confirmed depth: {', '.join(names[:3])}" in caplog.text
+
+
+def small_map() -> DepthMap:
+    depth = np.arange(1, 7, dtype=np.float32).reshape(2, 3)
+    counts = np.uint8([[0, 1, 2], [0, 3, 0]])
+    normals = np.tile(np.int8([0, 0, -127]), (2, 3, 1))
+    sky = np.zeros((2, 3), bool)
+    depth[1, 2], sky[1, 2] = 0, True
+    return DepthMap(depth, normals, counts, sky)
+
+
+def test_depth_maps_tell_confirmed_from_continued_and_are_never_averaged(tmp_path):
+    found = small_map()
+    np.testing.assert_array_equal(found.confirmed(1), [[0, 2, 3], [0, 5, 0]])
+    np.testing.assert_array_equal(found.confirmed(2), [[0, 0, 3], [0, 5, 0]])
+    np.testing.assert_array_equal(found.continued, [[1, 0, 0], [4, 0, 0]])
+    assert found.resized((2, 3)) is found
+    for name, values in vars(found.resized((4, 6))).items():
+        np.testing.assert_array_equal(values, vars(found)[name].repeat(2, axis=0).repeat(2, axis=1))
+    one = found.resized((1, 1))
+    assert one.depth.shape == (1, 1) and one.depth[0, 0] in found.depth
+    nothing = DepthMap.nothing((4, 5))
+    for each in (nothing.depth, nothing.confirmed(1), nothing.continued, nothing.sky):
+        assert each.shape == (4, 5) and not each.any()
+    write_depth_map(tmp_path / "a.npz", found)
+    for name, values in vars(read_depth_map(tmp_path / "a.npz")).items():
+        np.testing.assert_array_equal(values, vars(found)[name])

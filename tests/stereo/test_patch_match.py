@@ -10,15 +10,17 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from sc3d.geometry.cameras import View, rays
+from sc3d.io.images import write_image
 from sc3d.scene.depth_map import DepthMap, depth_file, read_depth_map
 from sc3d.stereo import patch_match
 from sc3d.stereo.agreement import RELATIVE, TOLERANCE, count_agreements
 from sc3d.stereo.multi_view import StereoJob, estimate_depths, plane_normals, save, upsampled
 from sc3d.stereo.pinhole_pairs import GrayView, stacked, transfers
 from sc3d.tiling.executor import SerialExecutor
-from tests.stereo.textured_scene import HEIGHT, WIDTH, textured_view
+from tests.stereo.textured_scene import FOCAL, HEIGHT, WIDTH, textured_view
 
 SLANTED = (np.array([0.5, 0.3, -1.0]), -5.0 / np.linalg.norm([0.5, 0.3, -1.0]))
+UP = np.array([0.0, -1.0, 0.0])
 CENTERS = [np.array([x, y, 0.0]) for x, y in ((0, 0), (0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))]
 
 
@@ -33,14 +35,17 @@ def job_of(folder: Path, views: list[GrayView], depths: list[np.ndarray]) -> Ste
         )
     cameras = [view.view for view in views]
     sources = [np.array([other for other in range(len(views)) if other != row]) for row in range(len(views))]
-    ranges = [(0.02, 1.0)] * len(views)
+    ranges = [(0.02, 1.0, 1.0)] * len(views)
     for name in ("work", "output"):
         (folder / name).mkdir(exist_ok=True)
     job = StereoJob(
-        folder, cameras, cameras, sources, ranges, seeds, WIDTH, folder / "work", folder / "output"
+        folder, cameras, cameras, sources, ranges, seeds, WIDTH, UP, folder / "work", folder / "output"
     )
     for row, view in enumerate(views):
-        save(job.gray_file(row), np.round(view.gray * 255).astype(np.uint8))
+        gray = np.round(view.gray * 255).astype(np.uint8)
+        save(job.gray_file(row), gray)
+        (folder / "images").mkdir(exist_ok=True)
+        write_image(folder / "images" / view.view.name, np.repeat(gray[..., None], 3, axis=2))
     return job
 
 
@@ -63,7 +68,7 @@ def test_a_slanted_plane_is_found_everywhere(slanted):
     job, depths = slanted
     found = result(job, 0)
     inner = np.s_[8:-8, 8:-8]
-    disparity = np.abs(0.5 * WIDTH * (1 / found.depth - 1 / depths[0]))[inner]  # px, between neighbors
+    disparity = np.abs(0.5 * WIDTH * (1 / found.depth[inner] - 1 / depths[0][inner]))  # px, between neighbors
     assert np.median(disparity) < 0.03 and np.quantile(disparity, 0.95) < 0.1
     assert (found.num_views[inner] >= 2).mean() > 0.95
 
@@ -128,6 +133,8 @@ def test_an_even_sky_is_confirmed_by_nobody(tmp_path):
     inside = np.zeros_like(sky)
     inside[: np.nonzero(sky.any(1))[0].max() - 6] = True
     assert sky.mean() > 0.2 and (found.num_views >= 2)[sky & inside].mean() < 0.03
+    assert found.sky[sky & inside].mean() > 0.97 and not found.sky[depths[0] > 0].mean() > 0.02
+    assert not found.depth[found.sky].any() and not found.num_views[found.sky].any()
 
 
 def test_views_in_any_order_give_the_same_and_so_does_an_interrupted_run(slanted, tmp_path):
@@ -170,7 +177,8 @@ def test_dissimilarity_is_that_of_its_definition():
             B,
             np.float32(0),
             np.float32(1),
-            np.zeros((1, 0, 0), np.float32),
+            np.float32(1),
+            np.zeros((1, 0, 0, 3), np.float32),
             A,
             B,
         )
@@ -207,7 +215,8 @@ def test_agreements_are_those_of_a_slow_twin():
         (1 / pair[1] * random.choice([1.0, 1.004, 1.03, 0.0], pair[1].shape)).astype(np.float32)
         for pair in pairs
     ]
-    counts = count_agreements(maps[0], views[0], maps[1:], views[1:])
+    facing = [np.stack([map_, 0 * map_, 0 * map_], axis=2) for map_ in maps]
+    counts = count_agreements(maps[0], views[0], facing[1:], views[1:])
     assert set(np.unique(counts)) >= {0, 1, 2}
     for row, column in zip(random.integers(0, HEIGHT, 300), random.integers(0, WIDTH, 300), strict=True):
         slow = sum(
@@ -215,6 +224,94 @@ def test_agreements_are_those_of_a_slow_twin():
             for other, map_ in zip(views[1:], maps[1:], strict=True)
         )
         assert counts[row, column] == slow
+
+
+def test_between_pixels_a_slanted_plane_agrees_where_a_stepped_one_does_not():
+    """Ground at a grazing angle: from row to row its inverse depth changes by more than RELATIVE."""
+    ground, target = (np.array([0.0, -1, 0]), -1.0), np.array([0.0, 0.3, 5.0])
+    views, inverses = [], []
+    for center in CENTERS[:3]:
+        gray, depth = textured_view(center + [0, 0, 0.37 * center[0]], target + center, [ground])
+        views.append(gray.view)
+        inverses.append(np.where(depth > 0, 1 / np.maximum(depth, 1e-9), 0))
+    planes = []
+    for inverse in inverses:
+        slopes = np.gradient(inverse, axis=1), np.gradient(inverse, axis=0)
+        planes.append(np.stack([inverse, *slopes], axis=2).astype(np.float32))
+    far = (inverses[0] > 0.02) & (inverses[0] < 0.12)
+    far[:, :20] = far[:, -20:] = False
+    own = inverses[0].astype(np.float32)
+    slanted = count_agreements(own, views[0], planes[1:], views[1:])
+    stepped = count_agreements(
+        own, views[0], [each * np.float32([1, 0, 0]) for each in planes[1:]], views[1:]
+    )
+    assert far.sum() > 500 and (slanted[far] == 2).mean() > 0.98
+    assert (stepped[far] == 2).mean() < 0.8
+    loose = count_agreements(own * np.float32(1.02), views[0], planes[1:], views[1:], 3.0)
+    assert (loose >= count_agreements(own * np.float32(1.02), views[0], planes[1:], views[1:])).all()
+    assert (loose[far] == 2).mean() > 0.9
+
+
+def test_of_two_sources_one_is_enough_where_the_other_sees_nothing():
+    """Three photos of a strip: most pixels of an outer one lie in one of the two others only. The right plane must
+    cost less there than a wrong one that happens to lie in both.
+    """
+    (first, depth), (near, _), (far, _) = [
+        textured_view(np.array([x, 0.0, 0.0]), np.array([x, 0.0, 5.0]), [SLANTED]) for x in (0.0, 1.0, 4.5)
+    ]
+    views = [near.view, far.view]
+    inverse = (1 / depth).astype(np.float32)
+    true = np.stack([inverse, np.gradient(inverse, axis=1), np.gradient(inverse, axis=0)], axis=2)
+    stereo = patch_match.Stereo(
+        first.gray,
+        stacked([near.gray, far.gray]),
+        np.array([[WIDTH, HEIGHT]] * 2),
+        *transfers([first.view] * 2, views),
+        np.float32(0.02),
+        np.float32(1),
+        np.float32(0.5),
+        np.zeros((2, 0, 0, 3), np.float32),
+        *transfers(views, [first.view] * 2),
+    )
+    x = 0.5 + np.arange(WIDTH) - FOCAL * 1.0 * inverse  # columns in the near view
+    other = 0.5 + np.arange(WIDTH) - FOCAL * 4.5 * inverse
+    lonely = (x > 15) & (x < WIDTH - 15) & (other < 0)
+    lonely[:10] = lonely[-10:] = False
+    assert lonely.mean() > 0.3
+    right, wrong = np.empty((HEIGHT, WIDTH), np.float32), np.empty((HEIGHT, WIDTH), np.float32)
+    patch_match.evaluate(stereo, true, right)
+    assert (right[lonely] < patch_match.LONELY + 0.1).mean() > 0.95
+    for factor in (0.3, 0.6, 1.3):
+        patch_match.evaluate(stereo, true * np.float32(factor), wrong)
+        assert (wrong > right)[lonely].mean() > 0.95
+    alone = stereo._replace(
+        sources=stereo.sources[:1],
+        sizes=stereo.sizes[:1],
+        A=stereo.A[:1],
+        B=stereo.B[:1],
+        others=stereo.others[:1],
+    )
+    patch_match.evaluate(alone, true, wrong)
+    np.testing.assert_allclose(right[lonely], wrong[lonely] + patch_match.LONELY, atol=1e-4)
+
+
+def test_three_photos_of_a_strip_are_right_where_one_other_sees_them(tmp_path):
+    """The two outer ones share next to nothing."""
+    pairs = [
+        textured_view(np.array([x, 0.0, 0.0]), np.array([x, 0.0, 5.0]), [SLANTED], name=f"{number}.png")
+        for number, x in enumerate((0.0, 1.8, 3.6))
+    ]
+    job = job_of(tmp_path, [pair[0] for pair in pairs], [pair[1] for pair in pairs])
+    estimate_depths(job, SerialExecutor())
+    found, depth = result(job, 0), pairs[0][1]
+    shift = FOCAL * 1.8 / depth  # px, to the middle one
+    columns = 0.5 + np.arange(WIDTH) * np.ones((HEIGHT, 1))
+    lonely = (columns - shift > 8) & (columns - 2 * shift < 0) & (columns < WIDTH - 8)
+    lonely[:8] = lonely[-8:] = False
+    assert lonely.mean() > 0.15
+    error = np.abs(found.depth / depth - 1)[lonely]
+    assert (error < 0.01).mean() > 0.95 and np.quantile(error, 0.98) < 0.05
+    assert (found.num_views[lonely] == 1).mean() > 0.9
 
 
 def agrees(

@@ -1,0 +1,67 @@
+"""Gaussians on known planes come out as mesh and cloud where they are; what one view sees is added or left out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sc3d.errors import Sc3dError
+from sc3d.extraction.centers import center_cloud
+from sc3d.splatting.gaussians import Gaussians
+from tests.extraction.builders import data, flat_square, surface_of, views
+
+
+def test_plane_comes_out_flat_closed_and_upwards():
+    surfaces = surface_of(flat_square(4.0, 0.5), data())
+    points = surfaces.cloud.point.positions.numpy()
+    inner = np.abs(points[:, :2]).max(axis=1) < 3.5
+    assert inner.sum() > 1000 and np.abs(points[inner, 2] - 0.5).max() < 0.05
+    assert surfaces.cloud.point.normals.numpy()[inner, 2].min() > 0.95
+    assert np.abs(surfaces.cloud.point.colors.numpy().astype(int) - 90).max() <= 1
+    cells = np.floor(points[inner, :2] / 0.3).astype(int)
+    assert len(np.unique(cells, axis=0)) >= 23**2
+    assert 0 < surfaces.confirmed <= 1 and surfaces.coverage >= surfaces.confirmed - 0.02
+
+
+def test_completion_covers_what_only_one_view_sees():
+    lonely = replace(
+        data(), neighbors=[np.array([4]), np.array([4]), np.array([4]), np.array([4]), np.array([0])]
+    )
+    without = surface_of(flat_square(8.0, 0.0), lonely, "nothing")
+    completed = surface_of(flat_square(8.0, 0.0), lonely, "continued")
+    assert completed.coverage > without.coverage + 0.02
+    assert completed.confirmed == without.confirmed and completed.occluders == without.continued == 0
+    assert completed.coverage - without.coverage > completed.continued - 0.01  # others see it, too
+    assert np.abs(completed.cloud.point.positions.numpy()[:, 2]).max() < 0.1
+    assert surface_of(flat_square(8.0, 0.0), lonely).occluders < 0.001  # nothing is before the plane
+
+
+def test_median_depth_sees_through_a_veil():
+    """Faint discs 2 m above the middle of the ground: blended depth mixes the two, and no two views agree."""
+    ground, veil = flat_square(4.0, 0.5), flat_square(1.0, 2.5)
+    veil.opacity_logits[:] = -3.0
+    joined = {
+        name: torch.cat([values, veil.parameters()[name]]) for name, values in ground.parameters().items()
+    }
+    errors = {}
+    for mode in ("blended", "median"):
+        points = surface_of(Gaussians(**joined), data(), "nothing", mode).cloud.point.positions.numpy()
+        errors[mode] = np.abs(points[np.abs(points[:, :2]).max(axis=1) < 3.5, 2] - 0.5)
+    assert errors["median"].max() < 0.05 and len(errors["median"]) > 1000
+    assert errors["blended"].max() > 0.2
+
+
+def test_nothing_to_see_is_said():
+    with pytest.raises(Sc3dError, match="no view shows a surface"):
+        surface_of(flat_square(1.0, 50.0), data())
+
+
+def test_centers_with_colors_and_normals_towards_the_cameras():
+    gaussians = flat_square(2.0, 0.0)
+    cloud = center_cloud(gaussians, np.array([view.center for view in views()]), 0.3)
+    assert len(cloud.point.positions) == len(gaussians)
+    assert (cloud.point.normals.numpy()[:, 2] > 0.99).all()
+    assert np.abs(cloud.point.colors.numpy().astype(int) - [200, 120, 40]).max() <= 1
+    with pytest.raises(Sc3dError, match="min-opacity"):
+        center_cloud(gaussians, np.zeros((1, 3)), 0.99)
