@@ -19,7 +19,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
-from sc3d.io.folders import files_below
+from sc3d.io.folders import files_below, resolved
 from sc3d.io.limits import MAX_PIXELS, MAX_SIDE
 from sc3d.io.orientation import (
     ORIENTATION,
@@ -251,7 +251,7 @@ def find_photos(folder: Path) -> list[Path]:
 
 def require_place(photos: Path, images: Path) -> None:
     """InputError if `images` already holds other photos than those of the folder `photos`."""
-    if images.exists() and not images.is_symlink() and images.resolve() != photos.resolve():
+    if images.exists() and not images.is_symlink() and resolved(images) != resolved(photos):
         raise InputError(f"{images} already holds other photos: choose another scene folder")
 
 
@@ -260,18 +260,18 @@ def link_photos(photos: Path, images: Path) -> None:
     folder. InputError if it already holds others.
     """
     require_place(photos, images)
-    if images.exists() and images.resolve() == photos.resolve():
+    if images.exists() and resolved(images) == resolved(photos):
         return
     with atomic_path(images) as temporary:
         try:
-            os.symlink(photos.resolve(), temporary, target_is_directory=True)
+            os.symlink(resolved(photos), temporary, target_is_directory=True)
         except (OSError, NotImplementedError):  # Windows asks for a privilege
             shutil.copytree(photos, temporary)
 
 
 def require_within(file: Path, folder: Path) -> None:
     """InputError if a file of a folder is a link to a file outside of it; the folder itself may be a link."""
-    if not file.resolve().is_relative_to(folder.resolve()):
+    if not resolved(file).is_relative_to(resolved(folder)):
         raise InputError(
             f"{file} is a link that leads out of {folder}: copy the file there, or make the whole folder a link"
         )
@@ -326,6 +326,15 @@ def read_opaque(path: Path) -> np.ndarray | None:
         orientation = _orientation(image) if image.format == "TIFF" else 1
         opaque = np.array(image.convert("RGBA").getchannel("A")) > 0
     return None if opaque.all() else np.ascontiguousarray(turned(opaque, inverse(orientation)))
+
+
+def frame_of_photo(path: Path) -> tuple | None:
+    """How masks lie on a photo, by its header: its size as stored and its EXIF orientation; None where that is
+    not all, as it has alpha or cannot be read.
+    """
+    with suppress(InputError), open_image(path, "photo") as image:
+        return None if _has_alpha(image) else (*_stored_size(image), _orientation(image))
+    return None
 
 
 def has_alpha(path: Path) -> bool:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sc3d.io.folders import resolved
 from sc3d.io.images import has_alpha, image_size, photo_bits, read_image, read_opaque, used_range, write_image
 
 PNG = ".png"
@@ -40,6 +41,6 @@ def readable_photos(images: Path, names: list[str], work: Path) -> tuple[Path, P
 
 def _link(photo: Path, target: Path) -> None:
     try:
-        os.symlink(photo.resolve(), target)
+        os.symlink(resolved(photo), target)
     except (OSError, NotImplementedError):  # Windows asks for a privilege
         shutil.copyfile(photo, target)

@@ -31,6 +31,7 @@ def inputs(scene: Scene, settings: Export) -> list[Path]:
         settings.labelled or scene.labelled,
         scene.gaussians,
         georeference_path(scene),
+        *([scene.images, scene.masks] if "masks" in settings.format else []),  # which are shown beside
     ]
 
 

@@ -30,6 +30,7 @@ logger = logging.getLogger(__name__)
 BACKGROUND = "_background_"  # LabelMe's own name for it
 NOTHING = -1  # a pixel without a stroke; 0 is background
 MIN_POINTS = {"point": 1, "line": 2, "linestrip": 1, "polygon": 3, "rectangle": 2, "circle": 2}
+MAX_SHAPES, MAX_POINTS = 10_000, 200_000  # on one photo; nobody draws more
 DEFAULT_WIDTH = 0.005  # of a stroke that states none, share of the photo's longest side
 _MAX_COORDINATE = 1e5  # px; more cannot be meant, and would overflow the fixed-point coordinates of OpenCV
 _SHIFT = 4  # fractional bits of those coordinates
@@ -168,6 +169,7 @@ def parse_shapes(
     shapes = content.get("shapes") if isinstance(content, dict) else None
     if not isinstance(content, dict) or not isinstance(shapes, list):
         raise InputError(f"{origin} is not a LabelMe file: it has no list of shapes")
+    _check_amount(shapes, origin)
     stated: tuple[Any, Any] = (content.get("imageWidth"), content.get("imageHeight"))
     scale = 1.0
     if stated != (None, None):
@@ -179,6 +181,15 @@ def parse_shapes(
     return tuple(
         _parse_shape(shape, f"{origin}: shape {index + 1}", ids, scale) for index, shape in enumerate(shapes)
     )
+
+
+def _check_amount(shapes: list, origin: Path | str) -> None:
+    lists = [shape.get("points") for shape in shapes if isinstance(shape, dict)]
+    points = sum(len(found) for found in lists if isinstance(found, list))
+    if len(shapes) > MAX_SHAPES or points > MAX_POINTS:
+        raise InputError(
+            f"{origin} has {len(shapes)} shapes with {points} points: at most {MAX_SHAPES} with {MAX_POINTS} are drawn"
+        )
 
 
 def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) -> StrokeShape:
