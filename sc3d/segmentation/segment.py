@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from sc3d.io.atomic import claim, discard, remove_leftovers
+from sc3d.io.atomic import claim, discard, remove_leftovers, require_replaceable
 from sc3d.io.images import (
     find_photos,
     image_size,
@@ -126,6 +126,7 @@ def _set_aside(folders: Folders, suffix: str) -> None:
         aside = folder.with_name(f"{folder.name}.{suffix}")
         if folder.is_dir():
             discard(aside)
+            require_replaceable(aside, is_folder=True)
             folder.rename(aside)
             logger.info("%s is now %s", folder, aside)
 

@@ -39,6 +39,13 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
     return [path for name in settings.format for path in _module(name).outputs(scene, settings)]
 
 
+def besides(scene: Scene, settings: Export) -> list[Path]:
+    modules = [_module(name) for name in settings.format]
+    return [
+        path for module in modules if hasattr(module, "besides") for path in module.besides(scene, settings)
+    ]
+
+
 def run(scene: Scene, settings: Export) -> dict[str, object]:
     if set(settings.format) - CAMERAS_ONLY:
         scene.require(scene.classes, hint="copy the class table of the labels there")

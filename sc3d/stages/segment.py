@@ -23,7 +23,7 @@ def inputs(scene: Scene, settings: Segment) -> list[Input]:
         return [scene.classes, scene.sparse, scene.masks, scene.confidence, scene.cloud, scene.mesh, frames]
     given = [path for path in (settings.masks, settings.confidence, settings.mapping) if path is not None]
     if settings.backend == "files":
-        return [scene.classes, *given, frames]
+        return [scene.classes, *given, frames, *([] if settings.masks else [scene.sparse])]
     return [
         scene.classes,
         scene.images,
