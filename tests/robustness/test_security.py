@@ -142,6 +142,23 @@ def test_what_a_worker_raises_is_told():
         assert executor.run("right", wrong, [2]) == ["b"]
 
 
+def told_to_end(folder: Path) -> None:
+    signal.signal(signal.SIGTERM, lambda *_: (folder / "trace").touch())  # as a native library prints one
+    hang(folder)
+
+
+@linux
+def test_busy_workers_end_without_a_word(tmp_path):
+    pool = worker_pool.WorkerPool(1)
+    worker = worker_pool._Worker(1)
+    pool._workers.append(worker)
+    worker.give(told_to_end, 0, tmp_path)
+    wait_until(lambda: list(tmp_path.iterdir()))
+    started = time.monotonic()
+    pool.close()
+    assert time.monotonic() - started < worker_pool.SECONDS and not (tmp_path / "trace").exists()
+
+
 @linux
 def test_workers_end_with_a_killed_command(tmp_path):
     program = (
@@ -439,7 +456,7 @@ def reading_runs(scene: Path) -> dict[str, tuple[str, object]]:
 
 
 READS = [
-    *STAGES, "georeference gps", "georeference again", "extract depth", "segment masks", "segment in place", "label cloud", "label density",
+    *STAGES[1:], "georeference gps", "georeference again", "extract depth", "segment masks", "segment in place", "label cloud", "label density",
     "import cloud",
 ]  # fmt: skip
 
@@ -607,6 +624,34 @@ def test_a_page_writes_no_strokes_through_a_link(packed, tmp_path):
     attack.plant(["strokes/"])
     with pytest.raises(InputError, match="remove the link"):
         Session(Scene(attack.scene))
+
+
+def test_strokes_that_become_a_link_are_not_written(packed, tmp_path):
+    """While the page is open."""
+    from sc3d.annotate.session import Session
+    from sc3d.scene.scene import Scene
+
+    attack = Attack(packed, tmp_path)
+    attack.unpack("annotate")
+    session = Session(Scene(attack.scene))
+    attack.plant(["strokes/"])
+    drawn = {"label": "road", "shape_type": "point", "points": [[1, 1]]}
+    for shapes in ([drawn], []):
+        with pytest.raises(InputError, match="remove the link"):
+            session.save("photo_0", {"shapes": shapes})
+    with pytest.raises(InputError, match="remove the link"):
+        session.try_out("photo_0")
+    assert all(text == "my thesis" for text in attack._content().values())
+
+
+def test_a_length_of_absurd_length_is_too_large():
+    """Python refuses to read such a number."""
+    from sc3d.annotate.server import Handler, Refusal
+
+    asked = SimpleNamespace(headers={"Content-Type": "application/json", "Content-Length": "9" * 5000})
+    with pytest.raises(Refusal) as refusal:
+        Handler._body(asked)
+    assert refusal.value.status == 413
 
 
 def test_links_that_a_user_makes_are_followed(packed, here, tmp_path):
