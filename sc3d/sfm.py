@@ -18,7 +18,7 @@ from sc3d.errors import InputError, Sc3dError, left_out
 from sc3d.georeferencing.gps import Flight, read_flight
 from sc3d.io.atomic import require_room, telling_of_full_disk, temporary_name
 from sc3d.io.colmap import registered_images, write_model
-from sc3d.io.readable_photos import readable_photos
+from sc3d.io.readable_photos import readable_photos, transparent_photos
 from sc3d.settings.reconstruction import Mapping
 
 logger = logging.getLogger(__name__)
@@ -53,6 +53,8 @@ def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) 
             _match(database, len(names), settings)
             model, parts = _map(database, readable, work, settings, len(names), flight is not None)
             reasons = _reasons(database, names, model, parts)
+            clear = transparent_photos({name: images / name for name in reasons})
+            reasons |= dict.fromkeys(clear, "wholly transparent")
         write_model(output, model)
     if reasons:
         unregistered = [f"{name} ({why})" for name, why in reasons.items()]

@@ -199,7 +199,7 @@ export class Canvas {
     if (isArea(shape)) {
       path.closePath();
       context.globalAlpha = 0.5;
-      context.fill(path);
+      if (shape.shape_type !== "mask") context.fill(path); // whose pixels are not the whole box
       context.globalAlpha = 1;
       context.lineWidth = line;
       context.stroke(path);

@@ -1,7 +1,7 @@
 // The strokes of one photo with their history, and the geometry they need. Coordinates are px of the photo.
 
 const DEFAULT_WIDTH = 0.005; // of strokes that state none, share of the longest side; as in stroke_files.py
-const AREAS = new Set(["polygon", "rectangle", "circle"]);
+const AREAS = new Set(["polygon", "rectangle", "circle", "mask"]);
 
 export class Drawing {
   constructor(photo, shapes) {
@@ -49,10 +49,11 @@ export class Drawing {
 
 export const isArea = shape => AREAS.has(shape.shape_type);
 
-// The corners of a shape: rectangles and circles of LabelMe state two points only.
+// The corners of a shape: rectangles, circles and masks of LabelMe state two points only; of a mask, the box is shown.
 export function outline(shape) {
   const [[left, top], [right, bottom] = []] = shape.points;
   if (shape.shape_type === "rectangle") return [[left, top], [right, top], [right, bottom], [left, bottom]];
+  if (shape.shape_type === "mask") return [[left, top], [right + 1, top], [right + 1, bottom + 1], [left, bottom + 1]];
   if (shape.shape_type === "circle") {
     const radius = Math.hypot(right - left, bottom - top);
     return Array.from({ length: 64 }, (_, index) => [left + radius * Math.cos(index * Math.PI / 32), top + radius * Math.sin(index * Math.PI / 32)]);

@@ -14,13 +14,14 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.atomic import require_inside
 from sc3d.io.folders import resolved
-from sc3d.io.images import find_photos, read_image, require_within
+from sc3d.io.images import read_image
 from sc3d.io.json_files import read_json, write_json
+from sc3d.io.photo_folder import find_photos, require_within
 from sc3d.io.provenance import digest
 from sc3d.scene.photo_names import PhotoNames, photo_name
 from sc3d.scene.scene import Scene
 from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, shrink
-from sc3d.segmentation.strokes.files import BACKGROUND, read_shapes, shown_size
+from sc3d.segmentation.strokes.files import BACKGROUND, as_labelme, read_shapes, shown_size
 
 DISPLAY_SIZE = 4096  # px, longest side of the photo in the browser
 TRIAL_SIZE = 2048  # px, longest side of the mask that is tried out
@@ -134,11 +135,7 @@ class Session:
         """The shapes of a LabelMe file, checked, in px of the photo."""
         names = {entry.id: entry.name for entry in self.class_table} | {0: BACKGROUND}
         shapes = read_shapes(content, origin, self.photos[key], self.class_table)
-        return [
-            {"label": names[shape.label], "shape_type": shape.kind, "points": shape.points.tolist()}
-            | ({"width": shape.width} if shape.width else {})
-            for shape in shapes
-        ]
+        return [as_labelme(shape, names[shape.label], self.sizes[key]) for shape in shapes]
 
     def photo(self, key: str) -> bytes:
         """The photo as JPEG, as shown: turned by its EXIF orientation, as in LabelMe; strokes lie in this

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sc3d.errors import InputError
-from sc3d.io.images import IMAGE_SUFFIXES, write_image
+from sc3d.io.images import write_image
+from sc3d.io.photo_folder import IMAGE_SUFFIXES
 from sc3d.scene.photo_names import PhotoNames
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import ViewCommand

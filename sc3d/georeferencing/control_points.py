@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,14 +14,17 @@ import pycolmap
 from sc3d.errors import InputError, examples
 from sc3d.georeferencing.alignment import Similarity, camera_up, upside_down
 from sc3d.georeferencing.control_fit import (
+    EXCHANGED,
     MIN_POINTS,
     Accuracy,
     ControlFit,
     Correspondences,
     fit_control_points,
+    fits_exchanged,
 )
 from sc3d.georeferencing.gcp_list import is_title, parse_crs, parse_mark, read_lines
 from sc3d.georeferencing.georeference import crs_to_geodetic, geodetic_to_enu
+from sc3d.georeferencing.geotags import is_altitude
 from sc3d.io.colmap import cam_from_world, registered_images
 from sc3d.io.crs import split_crs
 from sc3d.scene.photo_names import PhotoNames
@@ -34,7 +37,8 @@ logger = logging.getLogger(__name__)
 PIXEL_CENTER = 0.5  # ODM and OpenSfM call the center of the first pixel (0, 0)
 # of the distance to the cameras; points that miss the fit by less are as good as the cameras
 MAX_ERROR = 0.02
-SAME_HEIGHT = 1e-3  # m: heights that differ by less were not measured
+# share of the points whose marks meet: below the first the axes are in doubt, from the second on they are right
+MOST_MEET = (0.5, 0.8)
 BAD_MARK = 0.02  # of the photo's longer side: marks that miss the others by more were set wrong
 FAR_FROM_GPS = 20_000.0  # m: control points this far from the photos' GPS are in another CRS
 
@@ -43,7 +47,7 @@ FAR_FROM_GPS = 20_000.0  # m: control points this far from the photos' GPS are i
 class ControlPoints:
     """G surveyed points and where photos show them.
 
-    names: of the points; geodetic: (G, 3) latitude, longitude (degrees), height (m)
+    names: of the points; geodetic: (G, 3) latitude, longitude (degrees), height (m; beyond what is on Earth: none)
     observations: per point, the (K, 2) px, COLMAP's convention, by photo name
     epsg: of the file's CRS, horizontal part, if that is a projected one with a code, else None
     """
@@ -58,8 +62,22 @@ class ControlPoints:
         """Median of the points, rounded, which a wrong one does not move away: latitude, longitude, height of
         the local ENU frame.
         """
-        latitude, longitude, height = np.median(self.geodetic, axis=0)
-        return round(float(latitude), 6), round(float(longitude), 6), round(float(height), 0)
+        latitude, longitude, _ = np.median(self.geodetic, axis=0)
+        heights = self.geodetic[self.measured, 2]
+        height = float(np.median(heights)) if len(heights) else 0.0
+        return round(float(latitude), 6), round(float(longitude), 6), round(height, 0)
+
+    @property
+    def measured(self) -> np.ndarray:
+        """(G,) bool: the height can be one."""
+        return np.array([is_altitude(height) for height in self.geodetic[:, 2]], bool)
+
+    @property
+    def enu(self) -> np.ndarray:
+        """(G, 3) m, at `origin`; those without a height lie at its height."""
+        geodetic = self.geodetic.copy()
+        geodetic[~self.measured, 2] = self.origin[2]
+        return geodetic_to_enu(geodetic, self.origin)
 
 
 def read_control_points(path: Path, photos: Sequence[str]) -> ControlPoints:
@@ -115,6 +133,14 @@ def _warn(path: Path, unknown: list[str], twice: list[str]) -> None:
 
 def _geodetic(positions: np.ndarray, crs: pyproj.CRS, path: Path) -> np.ndarray:
     geodetic = crs_to_geodetic(positions, crs)
+    exchanged = crs_to_geodetic(positions[:, [1, 0, 2]], crs)
+    if crs.is_projected and _are_inside(exchanged, crs) and not _are_inside(geodetic, crs):
+        logger.warning(
+            "%s: x and y are exchanged, north before east: as written the points lie outside the area of %s, exchanged inside; they are read so",
+            path,
+            crs.name,
+        )
+        geodetic = exchanged
     outside = ~np.isfinite(geodetic).all(axis=1) | (np.abs(geodetic[:, :2]) > [90.0, 180.0]).any(axis=1)
     if outside.any():
         raise InputError(
@@ -122,6 +148,17 @@ def _geodetic(positions: np.ndarray, crs: pyproj.CRS, path: Path) -> np.ndarray:
             f"check the CRS and the order ({'east, north' if crs.is_projected else 'longitude, latitude'})"
         )
     return geodetic
+
+
+def _are_inside(geodetic: np.ndarray, crs: pyproj.CRS) -> bool:
+    """Whether half of some points or more, (G, 3) latitude, longitude, height, lie where a CRS is made for."""
+    area = split_crs(crs)[0].area_of_use
+    if area is None:
+        return False
+    latitude, longitude, _ = geodetic.T
+    width = (area.east - area.west) % 360 or 360
+    inside = (latitude >= area.south) & (latitude <= area.north) & ((longitude - area.west) % 360 <= width)
+    return bool(2 * inside.sum() >= len(inside))
 
 
 def check_accuracy(file: Path | None, accuracy: Accuracy | None) -> None:
@@ -147,9 +184,19 @@ def check_control_points(
         if photo in sizes and ((pixel < 0) | (pixel > sizes[photo])).any()
     ]
     if outside:
+        fits = all(
+            (pixel[::-1] >= 0).all() and (pixel[::-1] <= sizes[photo]).all()
+            for seen in points.observations
+            for photo, pixel in seen.items()
+            if photo in sizes
+        )
         raise InputError(
             f"{len(outside)} marks of ground control points lie outside their photos ({examples(outside)}): "
-            "they belong to photos of another size"
+            + (
+                "with x and y of the pixels exchanged all lie inside; the order is px py (column, row)"
+                if fits
+                else "they belong to photos of another size"
+            )
         )
     if gps is not None:
         away = float(np.linalg.norm(geodetic_to_enu(np.array([points.origin]), gps)))
@@ -193,6 +240,7 @@ def drop_wrong_marks(model: pycolmap.Reconstruction, points: ControlPoints) -> C
     point. Marks that do not meet and cannot tell which of them is wrong take their point with them. Says so.
     """
     limit = BAD_MARK * max(max(camera.width, camera.height) for camera in model.cameras.values())
+    _check_axes(model, points, limit)
     registered = {model.image(image_id).name for image_id in model.reg_image_ids()}
     kept, marks, apart = [], [], []
     for name, observations in zip(points.names, points.observations):
@@ -224,6 +272,32 @@ def drop_wrong_marks(model: pycolmap.Reconstruction, points: ControlPoints) -> C
     return replace(points, observations=kept)
 
 
+def _check_axes(model: pycolmap.Reconstruction, points: ControlPoints, limit: float) -> None:
+    """InputError if the marks of most points meet only with the axes of the pixels exchanged or turned over."""
+    heights = {image.name: image.camera.height for image in registered_images(model)}
+
+    def share(read: Callable[[str, np.ndarray], np.ndarray]) -> float:
+        """Of the points, those whose marks meet within `limit`, px."""
+        seen = [
+            {photo: read(photo, pixel) for photo, pixel in observations.items() if photo in heights}
+            for observations in points.observations
+        ]
+        errors = [triangulate(model, marks)[1].max() for marks in seen if len(marks) > 1]
+        return float(np.mean(np.array(errors) <= limit)) if errors else 1.0
+
+    if share(lambda _, pixel: pixel) >= MOST_MEET[0]:
+        return
+    for read, what in (
+        (lambda _, pixel: pixel[[1, 0]], "x and y of the pixels exchanged: the order is px py (column, row)"),
+        (
+            lambda photo, pixel: np.array([pixel[0], heights[photo] - pixel[1]]),
+            "y of the pixels counted from the top: it runs downwards",
+        ),
+    ):
+        if share(read) >= MOST_MEET[1]:
+            raise InputError(f"the marks of the ground control points do not meet, but would with {what}")
+
+
 def align_to_control_points(
     model: pycolmap.Reconstruction,
     points: ControlPoints,
@@ -243,8 +317,9 @@ def align_to_control_points(
     fit, rows = found.fit, found.rows
     transform(model, fit.similarity)
     if fit.exact:
-        kept = rows[fit.kept]
-        _adjust(model, [points.observations[row] for row in kept], found.target[fit.kept], refine_focal)
+        held = fit.kept & fit.points.measured
+        observations = [points.observations[row] for row in rows[held]]
+        _adjust(model, observations, fit.points.target[held], refine_focal)
     return found.figures(model, points)
 
 
@@ -252,19 +327,21 @@ def align_to_control_points(
 class Matched:
     """How control points fit a model.
 
-    rows: (U,) of the points that two or more photos show; target: (U, 3) their ENU positions, m
+    rows: (U,) of the points that two or more photos show
     """
 
     fit: ControlFit
     rows: np.ndarray
-    target: np.ndarray
 
     def figures(self, model: pycolmap.Reconstruction, points: ControlPoints) -> dict[str, object]:
         """Residuals of a model that has been brought onto the points."""
         offsets = np.array([triangulate(model, points.observations[row])[0] for row in self.rows])
-        offsets = offsets - self.target
-        kept = self.fit.kept
-        squares = (offsets[kept] ** 2).mean(axis=0)
+        offsets = offsets - self.fit.points.target
+        kept, measured = self.fit.kept, self.fit.points.measured
+        horizontal = float((offsets[kept, :2] ** 2).sum(axis=1).mean())
+        counted = offsets[kept & measured, 2] if measured.any() else np.zeros(1)
+        # heights that are no measurements say nothing
+        vertical = 0.0 if self.fit.upright else (counted**2).sum() / kept.sum()
         apart = self.fit.leave_one_out
         listed = {
             points.names[row]: {
@@ -283,10 +360,11 @@ class Matched:
             "leave_one_out_rms": None if apart is None else round(float(np.sqrt((apart**2).mean())), 4),
             "accuracy_horizontal_vertical_m": np.round(self.fit.accuracy, 4).tolist(),
             "up_from_cameras": self.fit.upright,
-            # heights that are no measurements say nothing
-            "rms": round(float(np.sqrt(squares[: 2 if self.fit.upright else 3].sum())), 4),
-            "rms_horizontal": round(float(np.sqrt(squares[:2].sum())), 4),
-            "rms_vertical": round(float(np.sqrt(squares[2])), 4),
+            "heights_not_used": [points.names[row] for row in self.rows[~measured]],
+            "height_unit": self.fit.unit or "as given",
+            "rms": round(float(np.sqrt(horizontal + vertical)), 4),
+            "rms_horizontal": round(float(np.sqrt(horizontal)), 4),
+            "rms_vertical": round(float(np.sqrt((counted**2).mean())), 4),
             "residuals": {name: found for name, found in listed.items() if name not in out},
             "residuals_left_out": {name: found for name, found in listed.items() if name in out},
         }
@@ -298,7 +376,7 @@ def match_control_points(
     """Fit control points to a model, which stays as it is, and say in one line how well they do. InputError if
     they do not.
     """
-    target = geodetic_to_enu(points.geodetic, points.origin)
+    target = points.enu
     source, rows = _triangulate_all(model, points)
     if len(rows) < MIN_POINTS:
         raise InputError(
@@ -313,21 +391,25 @@ def match_control_points(
             camera_up(rotations),
             MAX_ERROR * _distance(model, source, target[rows]),
             accuracy,
-            bool(np.ptp(heights) < SAME_HEIGHT),
+            np.where(points.measured[rows], heights, np.nan),
         ),
         [points.names[row] for row in rows],
     )
     if upside_down(rotations, fit.similarity):
         raise InputError(
-            "the ground control points would turn the cameras upside down: check the order x y (east, north)"
+            f"the ground control points would turn the cameras upside down: {EXCHANGED}"
+            if fits_exchanged(fit.points)
+            else "the ground control points would turn the cameras upside down: check the order x y (east, north)"
         )
-    _tell(fit, [points.names[row] for row in rows], source, target[rows], float(heights[0]))
-    return Matched(fit, rows, target[rows])
+    _tell(fit, [points.names[row] for row in rows], heights)
+    return Matched(fit, rows)
 
 
-def _tell(fit: ControlFit, names: list[str], source: np.ndarray, target: np.ndarray, height: float) -> None:
-    """One line of what the user should know of a fit; nothing if all is as it should be."""
-    distances = np.linalg.norm((fit.similarity.apply(source) - target)[:, : 2 if fit.upright else 3], axis=1)
+def _tell(fit: ControlFit, names: list[str], heights: np.ndarray) -> None:
+    """One line of what the user should know of a fit; nothing if all is as it should be. heights: (U,) m, as
+    given
+    """
+    distances = np.linalg.norm(fit.points.offsets(fit.similarity, fit.upright), axis=1)
     words = []
     if not fit.exact:
         rms = np.sqrt((distances[fit.kept] ** 2).mean())
@@ -339,10 +421,27 @@ def _tell(fit: ControlFit, names: list[str], source: np.ndarray, target: np.ndar
     if not fit.kept.all():
         left_out = [f"{names[row]} ({distances[row]:.2f} m)" for row in np.flatnonzero(~fit.kept)]
         words.append(f"left out, as they do not fit the others: {', '.join(left_out)}")
-    if fit.upright:
-        words.append(f"heights are all {height:g} or say nothing: up comes from the cameras")
+    words += _tell_heights(fit, names, heights)
     if words:
         logger.warning("ground control points: %s", "; ".join(words))
+
+
+def _tell_heights(fit: ControlFit, names: list[str], heights: np.ndarray) -> list[str]:
+    words, unused = [], np.flatnonzero(~fit.points.measured)
+    if fit.unit:
+        words.append(
+            f"heights are {fit.slope:.2f} times what the cameras and the coordinates say: they are taken for {fit.unit}; write them in the unit of the CRS"
+        )
+    if len(unused):
+        values = ", ".join(f"{value:g}" for value in dict.fromkeys(heights[unused]))
+        words.append(
+            f"heights of {len(unused)} of {len(names)} are {values}, which is no measurement: these points count horizontally only, "
+            + examples([names[row] for row in unused])
+        )
+    if fit.upright:
+        reason = "" if len(unused) else f"heights are all {heights[0]:g} or say nothing: "
+        words.append(f"{reason}up comes from the cameras")
+    return words
 
 
 def transform(model: pycolmap.Reconstruction, similarity: Similarity) -> None:

@@ -18,6 +18,7 @@ STANDARD_DEVIATION = (1.0, 1.0, 1.0)
 # m; RTK states the antenna's, but shutter and antenna are neither at one time nor in one place
 SMALLEST_DEVIATION = 0.05
 LARGEST_DEVIATION = 100.0  # m; what is stated beyond that is a filler
+ALTITUDES = (-500.0, 20_000.0)  # m; what lies beyond is a filler, such as -9999 or 4294967295
 HEAD = 1 << 20  # bytes of a photo that are searched for XMP
 LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE, HORIZONTAL_ERROR = (
     1,
@@ -104,15 +105,29 @@ def _read(photo: Path) -> Geotag | str:
         next((xmp[name] for name in names if name in xmp), math.nan)
         for names in (XMP_LATITUDE, XMP_LONGITUDE, ("AbsoluteAltitude",))
     )
-    geodetic = _finer(stated, drone)
+    adobe, above_takeoff = _adobe(text), xmp.get("RelativeAltitude", math.nan)
+    geodetic = _finer(_measured(stated), _measured(drone))
     if not all(map(math.isfinite, geodetic)):
-        geodetic = _filled(geodetic, _adobe(text))
+        geodetic = _filled(geodetic, _measured(adobe))
+    if not math.isfinite(geodetic[2]) and any(map(math.isfinite, (stated[2], drone[2], adobe[2]))):
+        return _unusable((*geodetic[:2], 0.0)) or "with an altitude that no photo has"
     return _unusable(geodetic) or Geotag(
         geodetic,
         _deviation(xmp, _number(exif.get(HORIZONTAL_ERROR))),
-        xmp.get("RelativeAltitude"),
+        above_takeoff if is_altitude(above_takeoff) else None,
         xmp.get("RtkFlag", 0) >= RTK_FLOAT,
     )
+
+
+def is_altitude(altitude: float) -> bool:
+    """Whether an altitude, m, can be one on Earth and is not a filler or nothing."""
+    return ALTITUDES[0] <= altitude <= ALTITUDES[1]
+
+
+def _measured(position: Position) -> Position:
+    """A position without an altitude that is a filler."""
+    latitude, longitude, altitude = position
+    return latitude, longitude, altitude if is_altitude(altitude) else math.nan
 
 
 def read_drone_xmp(photo: Path) -> dict[str, float]:

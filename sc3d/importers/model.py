@@ -12,7 +12,7 @@ from sc3d.importers.clouds import Geometry
 from sc3d.importers.project import Project
 from sc3d.io.colmap import build_model, registered_images, write_model
 from sc3d.io.folders import resolved
-from sc3d.io.images import link_photos
+from sc3d.io.photo_folder import link_photos
 from sc3d.scene.scene import Scene
 
 MAX_POINTS = 100_000  # sparse points that are made from a cloud

@@ -10,7 +10,8 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.importers.project import Project
-from sc3d.io.images import find_photos, image_size
+from sc3d.io.images import image_size
+from sc3d.io.photo_folder import find_photos
 from sc3d.scene.photo_names import PhotoNames, photo_name, shared_folders
 
 

@@ -5,31 +5,28 @@ from __future__ import annotations
 import base64
 import logging
 import mmap
-import os
-import shutil
 import struct
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
-from sc3d.io.folders import files_below, resolved
 from sc3d.io.limits import MAX_PIXELS, MAX_SIDE
 from sc3d.io.orientation import (
     ORIENTATION,
     inverse,
-    mask_turn,
     turned,
     turned_size,
     with_orientation,
 )
-from sc3d.io.photo_depth import FLOAT, bits_of, raw_mode, stretch, value_range
+from sc3d.io.photo_depth import FLOAT, bits_of, stretch, value_range
+from sc3d.io.photo_folder import broken_link, find_photos
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -81,14 +78,6 @@ def open_image(path: Path, what: str = "image") -> Iterator[Image.Image]:
     # files
     except Exception:
         raise InputError(f"cannot read the {what} {path}: {_what_is_wrong(path)}") from None
-
-
-def broken_link(link: Path) -> str:
-    """What to say of a link to nothing."""
-    return (
-        f"{link} is a link to {link.readlink()}, which is not there: has it been moved? "
-        "Put it back, or make the link anew"
-    )
 
 
 def _what_is_wrong(path: Path) -> str:
@@ -171,112 +160,6 @@ def _find_scan(data: mmap.mmap) -> int:
     return -1
 
 
-IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
-
-
-OTHER_SUFFIXES = {
-    ".heic",
-    ".heif",
-    ".avif",
-    ".webp",
-    ".bmp",
-    ".gif",
-    ".jp2",
-    ".jxl",
-    ".dng",
-    ".raw",
-    ".cr2",
-    ".nef",
-    ".arw",
-}
-NO_PHOTOS = {"__macosx", "@eadir", "thumbnails", "thumbs"}  # folders of archives, file servers and viewers
-
-
-def list_photos(folder: Path) -> list[Path]:
-    """Photos of a folder and its subfolders, by path. No photos are what sc3d has written there, hidden files
-    and folders, and thumbnails.
-    """
-    return _survey(folder)[0]
-
-
-def left_out(folder: Path) -> str:
-    """What in a folder of photos is not used, by reason, with numbers and examples; "" if nothing is."""
-    parts = []
-    for reason, files in _survey(folder)[1].items():
-        shown = [str(file.relative_to(folder)) for file in files[:3]] + ["..."] * (len(files) > 3)
-        parts += [f"{len(files)} {reason} ({', '.join(shown)})"] if files else []
-    return "; ".join(parts)
-
-
-def _survey(folder: Path) -> tuple[list[Path], dict[str, list[Path]]]:
-    """Photos, and the files and folders that are left out, by reason."""
-    files, made = files_below(folder)
-    hidden, thumbnails, others, photos = list[Path](), list[Path](), list[Path](), list[Path]()
-    for file in files:
-        suffix, parts = file.suffix.lower(), file.relative_to(folder).parts
-        if suffix not in IMAGE_SUFFIXES | OTHER_SUFFIXES:
-            continue
-        if any(part.startswith(".") for part in parts):
-            hidden.append(file)
-        elif any(part.lower() in NO_PHOTOS for part in parts[:-1]):
-            thumbnails.append(file)
-        else:
-            (photos if suffix in IMAGE_SUFFIXES else others).append(file)
-    reasons = {
-        "of a format that is not read, convert them to JPEG": others,
-        "written by sc3d": made,
-        "hidden": hidden,
-        "thumbnails or leftovers of an archive": thumbnails,
-    }
-    return photos, reasons
-
-
-def find_photos(folder: Path) -> list[Path]:
-    """As `list_photos`; InputError if there are none, or one is a link that leads elsewhere."""
-    if folder.is_symlink() and not folder.exists():
-        raise InputError(broken_link(folder))
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder: give the folder that holds the photos")
-    photos = list_photos(folder)
-    if not photos:
-        others = left_out(folder)
-        raise InputError(
-            f"no photos in {folder}: JPEG, PNG or TIFF files are expected"
-            + (f"; left out: {others}" if others else "")
-        )
-    for photo in photos:
-        require_within(photo, folder)
-    return photos
-
-
-def require_place(photos: Path, images: Path) -> None:
-    """InputError if `images` already holds other photos than those of the folder `photos`."""
-    if images.exists() and not images.is_symlink() and resolved(images) != resolved(photos):
-        raise InputError(f"{images} already holds other photos: choose another scene folder")
-
-
-def link_photos(photos: Path, images: Path) -> None:
-    """Make `images` a link to a folder of photos, a copy where links are not possible; nothing if it is that
-    folder. InputError if it already holds others.
-    """
-    require_place(photos, images)
-    if images.exists() and resolved(images) == resolved(photos):
-        return
-    with atomic_path(images) as temporary:
-        try:
-            os.symlink(resolved(photos), temporary, target_is_directory=True)
-        except (OSError, NotImplementedError):  # Windows asks for a privilege
-            shutil.copytree(photos, temporary)
-
-
-def require_within(file: Path, folder: Path) -> None:
-    """InputError if a file of a folder is a link to a file outside of it; the folder itself may be a link."""
-    if not resolved(file).is_relative_to(resolved(folder)):
-        raise InputError(
-            f"{file} is a link that leads out of {folder}: copy the file there, or make the whole folder a link"
-        )
-
-
 def read_image(path: Path, folder: Path | None = None, shown: bool = False) -> np.ndarray:
     """(H, W, 3) uint8 RGB; InputError if it is damaged, cut off or too large.
 
@@ -298,12 +181,12 @@ def read_stored(path: Path) -> np.ndarray:
         if (
             header.format == "TIFF"
             and bits_of(header) == 8
-            and (_orientation(header) != 1 or _has_alpha(header))
+            and (orientation_of(header) != 1 or _has_alpha(header))
         ):
-            orientation = _orientation(header)
+            orientation = orientation_of(header)
             rgba = np.array(header.convert("RGBA"))
             return np.ascontiguousarray(turned(rgba[..., :3], inverse(orientation)))
-        if header.format == "TIFF" and _orientation(header) != 1:
+        if header.format == "TIFF" and orientation_of(header) != 1:
             raise InputError(
                 f"cannot read the photo {path}: it is a turned TIFF of more than 8 bits; save it upright, without EXIF orientation"
             )
@@ -323,7 +206,7 @@ def read_opaque(path: Path) -> np.ndarray | None:
     with open_image(path, "photo") as image:
         if not _has_alpha(image):
             return None
-        orientation = _orientation(image) if image.format == "TIFF" else 1
+        orientation = orientation_of(image) if image.format == "TIFF" else 1
         opaque = np.array(image.convert("RGBA").getchannel("A")) > 0
     return None if opaque.all() else np.ascontiguousarray(turned(opaque, inverse(orientation)))
 
@@ -333,7 +216,7 @@ def frame_of_photo(path: Path) -> tuple | None:
     not all, as it has alpha or cannot be read.
     """
     with suppress(InputError), open_image(path, "photo") as image:
-        return None if _has_alpha(image) else (*_stored_size(image), _orientation(image))
+        return None if _has_alpha(image) else (*stored_size(image), orientation_of(image))
     return None
 
 
@@ -389,10 +272,11 @@ def read_orientation(path: Path) -> int:
     if not path.is_file():
         return 1
     with open_image(path) as image:
-        return _orientation(image)
+        return orientation_of(image)
 
 
-def _orientation(image: Image.Image) -> int:
+def orientation_of(image: Image.Image) -> int:
+    """EXIF orientation of an opened Pillow image, 1 to 8; 1 if it states none."""
     found = image.getexif().get(ORIENTATION, 1)
     return found if isinstance(found, int) and 1 <= found <= 8 else 1
 
@@ -408,96 +292,12 @@ def check_photo(path: Path) -> tuple[int, int]:
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) as stored, from the header; InputError if the file is not an image, or too large a one."""
     with open_image(path) as image:
-        return _stored_size(image)
+        return stored_size(image)
 
 
-def _stored_size(image: Image.Image) -> tuple[int, int]:
-    """Pillow states the size of a TIFF as shown."""
-    return turned_size(image.size, _orientation(image)) if image.format == "TIFF" else image.size
-
-
-class IndexImage(NamedTuple):
-    """A gray or palette picture as it is stored.
-
-    samples: (H, W) uint8 values, those of 1, 2 and 4 bits not scaled
-    bits: per value; palette: (K, 3) uint8 RGB, None if it is gray
-    clear: values whose palette entry has alpha 0
-    """
-
-    samples: np.ndarray
-    bits: int
-    palette: np.ndarray | None
-    clear: tuple[int, ...] = ()
-
-    @property
-    def scale(self) -> int:
-        """Gray level of the value 1."""
-        return 255 // ((1 << self.bits) - 1)
-
-    def without_clear(self, table: np.ndarray) -> np.ndarray:
-        """A table by value in which those that are clear mean 0."""
-        return np.where(np.isin(np.arange(len(table)), self.clear), table.dtype.type(0), table)
-
-
-def read_samples(path: Path) -> IndexImage:
-    """Values of a gray or palette PNG of up to 8 bits; alpha 0 gives 0. InputError for other pictures."""
-    with open_image(path, "mask") as image:
-        if image.mode.startswith("I"):
-            raise InputError(f"{path} has 16 bits per pixel: an 8-bit PNG with one id per pixel is expected")
-        if image.mode not in ("L", "P", "1", "LA") or bits_of(image) != 8:
-            raise InputError(
-                f"{path} has colors ({image.mode}): an 8-bit PNG with one id per pixel is expected"
-            )
-        raw = raw_mode(image)
-        bits = 1 if image.mode == "1" else next((bits for bits in (2, 4) if raw == f"L;{bits}"), 8)
-        if image.mode == "LA":
-            gray, alpha = np.moveaxis(np.array(image), -1, 0)
-            return IndexImage(np.where(alpha > 0, gray, 0).astype(np.uint8), 8, None)
-        clear = _clear_values(image.info.get("transparency"))
-        if image.mode == "1":  # Pillow says 255 for 1
-            clear = tuple(min(value, 1) for value in clear)
-        colors = image.getpalette("RGB") if image.mode == "P" else None
-        samples = np.array(image, np.uint8)  # Pillow scales 2 and 4 bits to 255, and makes 1 bit 0 and 1
-    if colors is not None:
-        return IndexImage(samples, 8, np.array(colors, np.uint8).reshape(-1, 3), clear)
-    if bits in (2, 4):
-        samples //= np.uint8(255 // ((1 << bits) - 1))
-    return IndexImage(np.where(np.isin(samples, clear), np.uint8(0), samples), bits, None)
-
-
-def _clear_values(transparency: int | bytes | None) -> tuple[int, ...]:
-    """Values that a tRNS chunk makes transparent: one gray level or entry, or the alpha of every entry."""
-    if isinstance(transparency, bytes):
-        return tuple(value for value, alpha in enumerate(transparency) if alpha == 0)
-    return () if transparency is None else (transparency,)
-
-
-def read_index_image(path: Path) -> np.ndarray:
-    """(H, W) uint8 of a gray or palette PNG: gray levels of the one, indices of the other."""
-    image = read_samples(path)
-    return image.samples if image.palette is not None else image.samples * np.uint8(image.scale)
-
-
-def turned_onto(pixels: np.ndarray, path: Path, photo: Path | None) -> np.ndarray:
-    """(H, W) values of the mask `path` in the frame of its photo as stored (`mask_orientation`)."""
-    return np.ascontiguousarray(turned(pixels, mask_orientation(path, photo)[0]))
-
-
-def index_image_size(path: Path, photo: Path | None) -> tuple[int, int]:
-    """(width, height) of a mask in the frame of its photo as stored, from the header."""
-    return turned_size(image_size(path), mask_orientation(path, photo)[0])
-
-
-def mask_orientation(path: Path, photo: Path | None) -> tuple[int, bool]:
-    """How a mask is turned into the frame of its photo as stored, and whether only a rule says so
-    (`mask_turn`); (1, False) where there is no photo.
-    """
-    if photo is None or not photo.is_file():
-        return 1, False
-    with open_image(photo, "photo") as image:
-        orientation, size = _orientation(image), _stored_size(image)
-    with open_image(path, "mask") as image:
-        return mask_turn(_orientation(image), _stored_size(image), orientation, size)
+def stored_size(image: Image.Image) -> tuple[int, int]:
+    """(width, height) as stored of an opened Pillow image; Pillow states that of a TIFF as shown."""
+    return turned_size(image.size, orientation_of(image)) if image.format == "TIFF" else image.size
 
 
 def data_uri(image: np.ndarray, suffix: str = ".jpg") -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import errno
 import json
+import re
 from contextlib import suppress
 from pathlib import Path
 
@@ -37,6 +38,21 @@ def read_text(path: Path) -> str:
 def _require_file(path: Path) -> None:
     if not path.is_file():  # a pipe could be waited for, and a device has no end
         raise FileNotFoundError(errno.ENOENT, "No such file")
+
+
+def whole_number(value: object) -> int | None:
+    """The whole number that a value of another program means, which may write 640 as 640.0; None for any other."""
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    return value if isinstance(value, int) and not isinstance(value, bool) else None
+
+
+def whole_number_of(text: object) -> int | None:
+    """As `whole_number`, also of a text such as "640" or "640.0"."""
+    if not isinstance(text, str):
+        return whole_number(text)
+    found = re.fullmatch(r"\s*([+-]?[0-9]{1,18})(?:\.0*)?\s*", text)
+    return int(found[1]) if found else None
 
 
 def write_json(path: Path, content: object) -> None:

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 import sc3d
 from sc3d.errors import InputError
 from sc3d.io.folders import files_below
-from sc3d.io.images import IMAGE_SUFFIXES, frame_of_photo
+from sc3d.io.images import frame_of_photo
 from sc3d.io.limits import HOLLOW, SOLID
+from sc3d.io.photo_folder import IMAGE_SUFFIXES
 
 if TYPE_CHECKING:
     from hashlib import blake2b

@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from sc3d.errors import left_out
 from sc3d.io.folders import resolved
-from sc3d.io.images import has_alpha, image_size, photo_bits, read_image, read_opaque, used_range, write_image
+from sc3d.io.images import (
+    has_alpha,
+    image_size,
+    photo_bits,
+    read_image,
+    read_opaque,
+    used_range,
+    write_image,
+)
+
+logger = logging.getLogger(__name__)
 
 PNG = ".png"
 
@@ -37,6 +50,21 @@ def readable_photos(images: Path, names: list[str], work: Path) -> tuple[Path, P
         pixels = np.ones(image_size(images / name)[::-1], bool) if opaque is None else opaque
         write_image(work / "opaque" / f"{name}{PNG}", np.where(pixels, 255, 0).astype(np.uint8))
     return photos, work / "opaque" if masked else None
+
+
+def transparent_photos(photos: Mapping[str, Path]) -> list[str]:
+    """Names of the photos of which nothing is opaque; photos: paths by name, those that do not exist are passed over."""
+    files = {name: photo for name, photo in photos.items() if photo.is_file() and has_alpha(photo)}
+    opaque = ((name, read_opaque(photo)) for name, photo in files.items())
+    return [name for name, pixels in opaque if pixels is not None and not pixels.any()]
+
+
+def tell_of_transparent(photos: Mapping[str, Path], what: str) -> list[str]:
+    """Warn of `transparent_photos`, say what becomes of them, and return their names."""
+    clear = transparent_photos(photos)
+    if clear:
+        logger.warning(left_out(clear, len(photos), f"photos are wholly transparent and {what}"))
+    return clear
 
 
 def _link(photo: Path, target: Path) -> None:

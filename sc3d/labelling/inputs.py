@@ -14,6 +14,7 @@ import open3d as o3d
 from sc3d.errors import InputError, left_out
 from sc3d.geometry.cameras import View, may_see
 from sc3d.io.clouds import read_cloud
+from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.labelling.density import GaussianField, gaussian_density, kernel_density
 from sc3d.labelling.observation import Mask
 from sc3d.scene.channels import Channels
@@ -68,6 +69,7 @@ class Masks:
         count = len(self.views) + len(self.without)
         away = [view.name for view in self.views if not may_see(view, low, high)]
         sure = [view.name for view in self.views if view.name not in self.confidences]
+        tell_of_transparent({view.name: self.scene.photo(view.name) for view in self.views}, "do not vote")
         if self.without:
             logger.info(left_out(self.without, count, "photos have no mask and do not vote"))
         if away:

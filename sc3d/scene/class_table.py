@@ -11,7 +11,7 @@ from typing import TypeGuard
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.json_files import read_json
+from sc3d.io.json_files import read_json, whole_number
 from sc3d.scene.channels import Channels
 
 # in names: they would act on terminals, or cannot be written
@@ -70,6 +70,14 @@ class ClassTable:
             "unlabelled" if label == 0 else f"class {label}",
         )
 
+    def find(self, name: str) -> int | None:
+        """Id of a class by its name: as it is written, else in any letter case if only one class fits; None if
+        none does.
+        """
+        exact = [entry.id for entry in self.classes if entry.name == name.strip()]
+        alike = [entry.id for entry in self.classes if entry.name.casefold() == name.strip().casefold()]
+        return exact[0] if exact else alike[0] if len(alike) == 1 else None
+
     def unknown(self, labels: np.ndarray) -> list[int]:
         """Ids in `labels` (any shape, uint8) that are neither 0 nor in the table."""
         present = np.flatnonzero(np.bincount(np.asarray(labels, np.uint8).ravel(), minlength=256))
@@ -108,7 +116,7 @@ def _parse_class(entry: object, origin: Path | str) -> SemanticClass:
         raise InputError(
             f'{origin}: every class must be an object like {{"id": 1, "name": "building", "color": [214, 60, 60]}}'
         )
-    label, name, color = entry.get("id"), entry.get("name"), entry.get("color")
+    label, name, color = _whole(entry.get("id")), entry.get("name"), _whole_all(entry.get("color"))
     if not _is_int(label, 1, 255):
         raise InputError(
             f"{origin}: class id {label!r} must be a whole number from 1 to 255 (0 means unlabelled)"
@@ -121,7 +129,7 @@ def _parse_class(entry: object, origin: Path | str) -> SemanticClass:
         or not all(_is_int(value, 0, 255) for value in color)
     ):
         raise InputError(f"{origin}: class {label} needs a color of three numbers from 0 to 255")
-    prompts, asprs = entry.get("prompts", [name]), entry.get("asprs", 1)
+    prompts, asprs = entry.get("prompts", [name]), _whole(entry.get("asprs", 1))
     if not isinstance(prompts, list | tuple) or not all(isinstance(prompt, str) for prompt in prompts):
         raise InputError(f"{origin}: prompts of class {label} must be a list of texts")
     if any(CONTROL.search(text) for text in (name, *prompts)) or len(name) > MAX_NAME:
@@ -131,6 +139,15 @@ def _parse_class(entry: object, origin: Path | str) -> SemanticClass:
     if not _is_int(asprs, 0, 255):
         raise InputError(f"{origin}: asprs code of class {label} must be a whole number from 0 to 255")
     return SemanticClass(label, name.strip(), tuple(color), tuple(prompts), asprs)
+
+
+def _whole(value: object) -> object:
+    """A float without fraction, as tables and statistics programs write ids, as the int that it means."""
+    return whole_number(value) if isinstance(value, float) and whole_number(value) is not None else value
+
+
+def _whole_all(values: object) -> object:
+    return [_whole(value) for value in values] if isinstance(values, list | tuple) else values
 
 
 def _is_int(value: object, low: int, high: int) -> TypeGuard[int]:

@@ -23,7 +23,7 @@ from urllib.parse import unquote
 
 from sc3d.errors import InputError
 from sc3d.io.folders import resolved
-from sc3d.io.images import IMAGE_SUFFIXES
+from sc3d.io.photo_folder import IMAGE_SUFFIXES
 
 # of a foreign name; all others belong to the name
 SUFFIXES = IMAGE_SUFFIXES | set(".json .webp .bmp .gif .dng .heic .heif .arw .cr2 .nef .raw .rw2".split())
@@ -33,6 +33,8 @@ _MAX_REDUCTIONS = 6  # words and hashes that are taken off one name
 _CAMERA_FOLDER = re.compile(
     r"[1-9]\d\d\w{5}"
 )  # as cameras name them (DCF, JEITA CP-3461): 100MEDIA, 101_PANO
+# parts of a data set, as YOLO, COCO (train2017) and Roboflow name their folders
+_SPLIT = re.compile(r"(?:train|training|trainval|val|valid|validation|test|testing)[-_]?\d*")
 
 # What annotation programs and data sets write before or behind the name of the photo: FloodNet's _lab,
 # Cityscapes' _gtFine_labelIds, CamVid's _L, Segments.ai's _label_ground-truth, ...
@@ -270,25 +272,42 @@ def shared_folders(foreign: str, name: str) -> int:
 
 def files_of_photos(folder: Path, names: PhotoNames, suffixes: Iterable[str]) -> list[Path]:
     """Files of a folder that may belong to photos, by path: those in it, and those in folders below that are
-    named like folders of the photos, or as cameras name folders (others hold something else). With a pattern,
-    those at any depth that fit it.
+    named like folders of the photos, as cameras name folders, or as the parts of a data set (train, val, test);
+    others hold something else. All files below where those have none, and those that fit the pattern if there
+    is one.
     """
-    allowed, wanted = {""}, set(suffixes)
+    files = _files_below(folder, set(suffixes))
+    if names.pattern is not None:
+        return files
+    allowed = {""}
     for name in names.names:
         parts = [_fold(part) for part in name.split("/")[:-1]]
         allowed |= {"/".join(parts[start:]) for start in range(len(parts))}
-    depth, found = max(len(path.split("/")) if path else 0 for path in allowed), []
+    return [file for file in files if _is_place(file.relative_to(folder).parts[:-1], allowed)] or files
+
+
+def _files_below(folder: Path, suffixes: set[str]) -> list[Path]:
+    """Files of a folder and the folders below that are not hidden, by path."""
+    found = []
     for place, folders, files in os.walk(folder):
-        parts = [_fold(part) for part in Path(place).relative_to(folder).parts]
-        deeper = names.pattern is not None or len(parts) < depth
-        folders[:] = sorted(below for below in folders if deeper and not below.startswith("."))
-        if names.pattern is not None or "/".join(parts) in allowed or _is_camera_folder(parts):
-            found += [
-                Path(place, file)
-                for file in files
-                if not file.startswith(".") and Path(file).suffix.lower() in wanted
-            ]
+        folders[:] = [below for below in folders if not below.startswith(".")]
+        found += [
+            Path(place, file)
+            for file in files
+            if not file.startswith(".") and Path(file).suffix.lower() in suffixes
+        ]
     return sorted(file for file in found if file.is_file())
+
+
+def _is_place(parts: tuple[str, ...], allowed: set[str]) -> bool:
+    """Whether folders are among the allowed, but for those of the parts of a data set."""
+    folders = [_fold(part) for part in parts]
+    rest = [part for part in folders if not _SPLIT.fullmatch(part)]
+    if "/".join(folders) in allowed or "/".join(rest) in allowed:
+        return True
+    return _is_camera_folder(rest) and len(rest) <= max(
+        len(place.split("/")) if place else 0 for place in allowed
+    )
 
 
 def _unique_keys(names: tuple[str, ...]) -> dict[str, str]:

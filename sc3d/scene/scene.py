@@ -11,21 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sc3d.errors import InputError, examples
-from sc3d.io.images import (
-    broken_link,
-    check_photo,
-    find_photos,
-    image_size,
-    index_image_size,
-    list_photos,
-    mask_orientation,
-    read_image,
-    read_opaque,
-    require_within,
-    turned_onto,
-)
+from sc3d.io.images import check_photo, image_size, read_image, read_opaque
 from sc3d.io.limits import FARTHEST, MAX_MASK_PIXELS
+from sc3d.io.mask_images import index_image_size, mask_orientation, turned_onto
 from sc3d.io.orientation import turned_size
+from sc3d.io.photo_folder import broken_link, find_photos, list_photos, require_within
 from sc3d.scene.class_table import CONTROL, ClassTable, read_classes
 from sc3d.scene.mask_values import Meanings, meanings_of, read_confidence, read_labels
 from sc3d.scene.photo_names import PhotoNames, files_of_photos, photo_name

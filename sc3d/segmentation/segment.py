@@ -12,19 +12,13 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from sc3d.io.atomic import claim, discard, remove_leftovers, require_replaceable
-from sc3d.io.images import (
-    find_photos,
-    image_size,
-    index_image_size,
-    read_image,
-    read_opaque,
-    read_orientation,
-    require_within,
-    write_image,
-)
+from sc3d.io.images import image_size, read_image, read_opaque, read_orientation, write_image
 from sc3d.io.json_files import read_json, write_json
+from sc3d.io.mask_images import index_image_size
 from sc3d.io.orientation import inverse, turned
+from sc3d.io.photo_folder import find_photos, require_within
 from sc3d.io.provenance import digest
+from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.photo_names import PhotoNames, photo_name
 from sc3d.scene.scene import Scene, check_mask_aspect
@@ -153,6 +147,7 @@ def segment_photos(
     images = images or Path(os.path.commonpath([photo.parent for photo in photos]))
     names = PhotoNames(photo_name(photo, images) for photo in photos)
     todo = _check_photos(images, names, folders.masks, overwrite)
+    tell_of_transparent({name: images / name for name in names.names}, "have an empty mask")
     pending, num_pixels, num_instances = set(todo), np.zeros(256, np.int64), 0
     for photo in tqdm(todo, desc="segment", unit="photo", disable=None):
         image = read_image(images / photo, images, shown=True)

@@ -37,13 +37,14 @@ def replace_prompts(class_table: ClassTable, prompts: tuple[str, ...]) -> ClassT
     texts = {}
     for prompt in prompts:
         name, separator, values = prompt.partition("=")
-        if not separator or name not in {entry.name for entry in class_table} or not values.strip():
+        label = class_table.find(name)
+        if not separator or label is None or not values.strip():
             raise InputError(
                 f"--prompts {prompt!r} must be NAME=text,text with a class name of {[entry.name for entry in class_table]}"
             )
-        texts[name] = tuple(value.strip() for value in values.split(",") if value.strip())
+        texts[label] = tuple(value.strip() for value in values.split(",") if value.strip())
     return ClassTable(
-        tuple(replace(entry, prompts=texts.get(entry.name, entry.prompts)) for entry in class_table)
+        tuple(replace(entry, prompts=texts.get(entry.id, entry.prompts)) for entry in class_table)
     )
 
 

@@ -19,7 +19,7 @@ from sc3d.importers.project import Project, project_files, read_project, warn_of
 from sc3d.io.atomic import require_writable
 from sc3d.io.clouds import write_geometry
 from sc3d.io.colmap import is_model
-from sc3d.io.images import find_photos, require_place
+from sc3d.io.photo_folder import find_photos, require_place
 from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.runner import execute
 from sc3d.scene.photo_names import photo_name

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sc3d.io.images import find_photos
+from sc3d.io.photo_folder import find_photos
 from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Mapping

@@ -26,7 +26,9 @@ from sc3d.georeferencing.gps import read_flight
 from sc3d.georeferencing.placement import make_level, place_model
 from sc3d.io.atomic import require_writable
 from sc3d.io.colmap import load_model, registered_images, write_model
-from sc3d.io.images import check_photo, find_photos, left_out, link_photos, num_pages
+from sc3d.io.images import check_photo, num_pages
+from sc3d.io.photo_folder import find_photos, link_photos, unused_files
+from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.runner import execute
 from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
@@ -62,6 +64,12 @@ def prepare(photos: Path, scene: Scene, settings: Reconstruct) -> None:
     _tell(photos, files)
     if len(files) < 2:
         raise InputError(f"{photos} holds one photo: at least two that overlap are needed")
+    clear = tell_of_transparent({name: photos / name for name in sizes}, "show nothing")
+    if len(files) - len(clear) < 2:
+        raise InputError(
+            f"{len(clear)} of {len(files)} photos in {photos} are wholly transparent: at least two others are needed; "
+            "save them without alpha if it is no mask"
+        )
     _check_place(photos, sizes, settings)
     require_writable(scene.path)
     link_photos(photos, scene.images)
@@ -69,7 +77,7 @@ def prepare(photos: Path, scene: Scene, settings: Reconstruct) -> None:
 
 def _tell(photos: Path, files: list[Path]) -> None:
     """Say what of the folder is not used."""
-    others, several = left_out(photos), [file.name for file in files if num_pages(file) > 1]
+    others, several = unused_files(photos), [file.name for file in files if num_pages(file) > 1]
     if others:
         logger.warning("%s: left out %s", photos, others)
     if several:

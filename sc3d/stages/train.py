@@ -10,8 +10,9 @@ from pathlib import Path
 from sc3d.errors import InputError, left_out
 from sc3d.geometry.blocks import split_blocks
 from sc3d.io.atomic import atomic_path, claim, remove
-from sc3d.io.images import find_photos
+from sc3d.io.photo_folder import find_photos
 from sc3d.io.provenance import digest
+from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.io.splats import origin_comment, write_splat_ply
 from sc3d.scene.scene import Scene, check_photos, require_views
 from sc3d.settings.train import Train
@@ -76,6 +77,7 @@ def _tell_of_left_out(scene: Scene) -> None:
     unknown = [name for name in names if name not in known]
     if unknown:
         logger.info(left_out(unknown, len(names), "photos have no camera and are not used"))
+    tell_of_transparent({name: scene.photo(name) for name in sorted(known)}, "teach nothing")
 
 
 def write_log(rows: list[dict[str, float]], path: Path) -> None:

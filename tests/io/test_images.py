@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 
 from sc3d.errors import InputError
-from sc3d.io.images import data_uri, link_photos, require_place, write_image
+from sc3d.io.images import data_uri, write_image
+from sc3d.io.photo_folder import link_photos, require_place
 
 
 def photos(path):

@@ -137,7 +137,8 @@ def _build_photos(folder: Path) -> None:
 def _read_photos(folder: Path) -> object:
     from sc3d.georeferencing.focal import exif_focal
     from sc3d.georeferencing.geotags import read_geotag
-    from sc3d.io.images import find_photos, read_image, read_orientation
+    from sc3d.io.images import read_image, read_orientation
+    from sc3d.io.photo_folder import find_photos
 
     return [
         (read_image(photo).shape, read_orientation(photo), read_geotag(photo), exif_focal(photo))
@@ -150,7 +151,7 @@ def _build_masks(folder: Path) -> None:
 
 
 def _read_masks(folder: Path) -> object:
-    from sc3d.io.images import read_index_image
+    from sc3d.io.mask_images import read_index_image
     from sc3d.scene.class_table import parse_classes
     from sc3d.scene.scene import match_masks
 

@@ -16,13 +16,15 @@ from PIL import Image
 
 from sc3d.annotate.session import Session
 from sc3d.errors import InputError
-from sc3d.io.images import read_index_image, read_orientation
+from sc3d.io.images import read_orientation
+from sc3d.io.mask_images import read_index_image
 from sc3d.io.orientation import inverse, turned, turned_points, turned_size
 from sc3d.runner import execute
 from sc3d.scene.class_table import parse_classes
 from sc3d.scene.scene import Scene
 from sc3d.segmentation.segment import Folders, Segmentation, segment_photos
 from sc3d.segmentation.strokes.files import read_strokes
+from sc3d.segmentation.text_prompts import replace_prompts
 from sc3d.settings.labels import Segment
 from tests.builders import ROOT, instance_of
 
@@ -537,3 +539,324 @@ def test_a_transparent_gray_level_is_no_class(tmp_path, mode, clear):
     image = Image.fromarray(values * 255).convert("1") if mode == "1" else Image.fromarray(values)
     image.save(file, transparency=255 if mode == "1" else clear)
     np.testing.assert_array_equal(imported(scene, tmp_path / "m"), np.where(values == clear, 0, values))
+
+
+# ids and colors in any kind of PNG, each file looked at alone
+
+
+def colored(mask: np.ndarray, alpha: np.ndarray | None = None) -> Image.Image:
+    rgb = np.array([(0, 0, 0), *(COLORS[label] for label in range(1, 5))], np.uint8)[mask]
+    return Image.fromarray(rgb if alpha is None else np.dstack([rgb, alpha]))
+
+
+def saved(path: Path, image: Image.Image | np.ndarray) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    (image if isinstance(image, Image.Image) else Image.fromarray(image)).save(path)
+    return path
+
+
+def in_channels(mask: np.ndarray) -> np.ndarray:
+    return np.repeat(mask[..., None], 3, axis=2)
+
+
+def wide_png(path: Path, pixels: np.ndarray) -> Path:
+    """A PNG of 16 bits per channel; pixels: (H, W) or (H, W, 3)."""
+    import cv2
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    wide = pixels.astype(np.uint16)
+    cv2.imwrite(str(path), np.ascontiguousarray(wide[..., ::-1]) if wide.ndim == 3 else wide)
+    return path
+
+
+MEMBERS = {  # what a mask of `bands` may be, in one folder with any other
+    "colors": lambda path: saved(path, colored(bands())),
+    "colors with alpha": lambda path: saved(path, colored(bands(), np.full(bands().shape, 255, np.uint8))),
+    "palette of colors": lambda path: palette_png(path, bands(), [0, 4, 2, 1, 3], {0: (0, 0, 0)} | COLORS),
+    "palette of ids": lambda path: palette_png(
+        path, bands(), [0, 1, 2, 3, 4], {row: (9, row, 9) for row in range(5)}
+    ),
+    "gray": lambda path: saved(path, bands()),
+    "ids in three channels": lambda path: saved(path, in_channels(bands())),
+    "16 bits": lambda path: wide_png(path, bands().astype(np.uint16)),
+    "16 bits in three channels": lambda path: wide_png(path, in_channels(bands())),
+    "colors of 16 bits": lambda path: wide_png(path, np.array(colored(bands())).astype(np.uint16) * 257),
+}
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_every_kind_of_png_in_one_folder(tmp_path, name):
+    """Imported, and as it lies in a folder of truth."""
+    scene = make_scene(tmp_path)
+    for row, kind in enumerate((name, "colors", "gray")):
+        Image.new("RGB", STORED).save(scene.images / f"p{row}.jpg")
+        MEMBERS[kind](tmp_path / "m" / f"p{row}.png")
+    execute("segment", scene, Segment(masks=tmp_path / "m"))
+    for row in range(3):
+        np.testing.assert_array_equal(read_index_image(scene.masks / f"p{row}.png"), bands())
+    np.testing.assert_array_equal(scene.read_mask(tmp_path / "m" / "p0.png", "p0.jpg"), bands())
+
+
+def test_channels_that_may_be_ids_or_colors_are_refused(tmp_path):
+    scene = make_scene(tmp_path)
+    table = json.loads(json.dumps(TABLE))
+    table[0]["color"] = [table[1]["id"]] * 3
+    scene.classes.write_text(json.dumps(table))
+    both = np.where(bands() > 2, table[1]["id"], 0).astype(np.uint8)
+    saved(tmp_path / "m" / "a.png", in_channels(both))
+    with pytest.raises(
+        InputError, match=r"a\.png .* whose colors stand for different classes.*--format index"
+    ):
+        imported(scene, tmp_path / "m")
+    with pytest.raises(InputError, match=r"a\.png .* stand for different classes"):
+        scene.read_mask(tmp_path / "m" / "a.png", "a.jpg")
+    np.testing.assert_array_equal(imported(scene, tmp_path / "m", format="index"), both)
+    found = imported(scene, tmp_path / "m", format="color")
+    np.testing.assert_array_equal(found, np.where(both > 0, table[0]["id"], 0))
+
+
+def test_colors_of_16_bits_are_no_black(tmp_path):
+    """Whose high byte alone was read."""
+    wide_png(tmp_path / "m" / "a.png", np.dstack([bands(), bands() * 2, bands()]))
+    with pytest.raises(InputError, match="16 bits that are none of 8"):
+        imported(make_scene(tmp_path), tmp_path / "m")
+
+
+@pytest.mark.parametrize("mode", ["gray", "channels", "16 bits"])
+def test_a_binary_mask_is_told_what_to_say(tmp_path, mode):
+    top = 65535 if mode == "16 bits" else 255
+    mask = np.where(bands() > 2, top, 0).astype(np.uint16 if mode == "16 bits" else np.uint8)
+    saved(tmp_path / "m" / "a.png", in_channels(mask) if mode == "channels" else mask)
+    with pytest.raises(InputError, match="binary mask.*--mapping mapping.json") as told:
+        imported(make_scene(tmp_path), tmp_path / "m")
+    shown = f'{{"{top}": "{TABLE[0]["name"]}"}}'
+    assert shown in str(told.value)
+    mapping = tmp_path / "mapping.json"
+    mapping.write_text(shown)
+    found = imported(make_scene(tmp_path / "b"), tmp_path / "m", mapping=mapping)
+    np.testing.assert_array_equal(found, np.where(mask > 0, TABLE[0]["id"], 0))
+
+
+def test_a_mapping_of_ids_and_colors(tmp_path):
+    scene = make_scene(tmp_path)
+    Image.new("RGB", STORED).save(scene.images / "b.jpg")
+    saved(tmp_path / "m" / "a.png", np.where(bands() > 2, 77, 0).astype(np.uint8))
+    saved(tmp_path / "m" / "b.png", colored(np.where(bands() > 2, 4, 0)))
+    mapping = tmp_path / "mapping.json"
+    color = "#{:02x}{:02x}{:02x}".format(*COLORS[4])
+    mapping.write_text(json.dumps({"77": NAMES[1], color: NAMES[2]}))
+    np.testing.assert_array_equal(
+        imported(scene, tmp_path / "m", mapping=mapping), np.where(bands() > 2, 1, 0)
+    )
+    np.testing.assert_array_equal(read_index_image(scene.masks / "b.png"), np.where(bands() > 2, 2, 0))
+
+
+def test_confidence_in_three_channels(tmp_path):
+    scene = make_scene(tmp_path)
+    saved(scene.confidence / "a.png", in_channels(bands() * np.uint8(60)))
+    found = scene.read_confidence(scene.confidence / "a.png", "a.jpg")
+    np.testing.assert_array_equal(found, bands() * np.uint8(60))
+    saved(scene.confidence / "a.png", colored(bands()))
+    with pytest.raises(InputError, match="has colors: a confidence map is"):
+        scene.read_confidence(scene.confidence / "a.png", "a.jpg")
+    wide_png(scene.confidence / "a.png", bands())
+    with pytest.raises(InputError, match="16 bits per pixel: a confidence map is"):
+        scene.read_confidence(scene.confidence / "a.png", "a.jpg")
+
+
+# what programs write otherwise: one rule for masks and strokes
+
+
+def square(label: str, kind: str = "polygon", **more: object) -> dict:
+    """An area of 12 x 8 px at column 6, row 10."""
+    corners = {
+        "rectangle": [[6, 10], [18, 18]],
+        "mask": [[6, 10], [17, 17]],
+        "circle": [[12, 14], [12, 18]],
+        "linestrip": [[6, 14], [18, 14]],
+    }
+    return {"label": label, "shape_type": kind, "points": corners.get(kind, polygon(6, 10, 18, 18))} | more
+
+
+def picture(mask: np.ndarray) -> str:
+    stream = io.BytesIO()
+    Image.fromarray(mask.astype(np.uint8)).save(stream, "PNG")
+    return base64.b64encode(stream.getvalue()).decode()
+
+
+CORNER = np.ones((8, 12), bool)
+CORNER[:4, :6] = False  # of a mask shape
+
+
+def both(tmp_path: Path, content: dict, orientation: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Class ids as `segment --masks` and as strokes read them, in the frame of the photo as stored."""
+    scene = make_scene(tmp_path, orientation)
+    scene.strokes.mkdir()
+    (scene.strokes / "a.json").write_text(json.dumps(content))
+    (strokes,) = read_strokes(scene.strokes, scene.images, scene.class_table())
+    painted = np.maximum(strokes.paint(*strokes.size)[0], 0)
+    return imported(scene, scene.strokes), turned(painted, inverse(orientation))
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [
+        (square(NAMES[2].upper()), (48, 32)),
+        (square(f" {NAMES[2].title()} "), (48, 32)),
+        (square(NAMES[2]), (48.0, 32.0)),
+        (square(NAMES[2], "rectangle"), (48.0, 32)),
+        (square(NAMES[2], "oriented_rectangle"), (48, 32)),
+        (square(NAMES[2], "rotation"), (48, 32)),
+        (square(NAMES[2], "mask", mask=picture(np.ones((8, 12)))), (48, 32)),
+    ],
+)
+def test_masks_and_strokes_are_read_alike(tmp_path, shape, size):
+    content = {"shapes": [shape], "imageWidth": size[0], "imageHeight": size[1]}
+    mask, strokes = both(tmp_path, content)
+    expected = np.zeros(STORED[::-1], np.uint8)
+    expected[10:18, 6:18] = 2
+    np.testing.assert_array_equal(mask, expected)
+    differ = strokes != expected
+    differ[9:19, 5:19] = False  # OpenCV draws the edge of polygons, too
+    assert not differ.any() and (strokes[10:18, 6:18] == 2).all()
+
+
+@pytest.mark.parametrize(
+    ("stated", "orientation"),
+    [("half", 1), *((kind, each) for kind in ("shown", "stored") for each in ORIENTATIONS)],
+)
+def test_mask_shapes_in_strokes(tmp_path, orientation, stated):
+    size = {"shown": turned_size(STORED, orientation), "stored": STORED, "half": (24, 16)}[stated]
+    shape = square(NAMES[2], "mask", mask=picture(CORNER))
+    if stated == "half":
+        shape |= {"points": [[3, 5], [8, 8]], "mask": picture(CORNER[::2, ::2])}
+    content = {"shapes": [shape], "imageWidth": size[0], "imageHeight": size[1]}
+    mask, strokes = both(tmp_path, content, orientation)
+    if stated == "half":
+        mask = np.repeat(np.repeat(mask, 2, 0), 2, 1)
+    assert (mask == 2).sum() == CORNER.sum()
+    np.testing.assert_array_equal(strokes, mask)
+
+
+def test_mask_shapes_survive_the_page(tmp_path):
+    scene = make_scene(tmp_path)
+    shape = square(NAMES[2], "mask", mask=picture(CORNER))
+    session = Session(scene)
+    line = square(NAMES[1], "linestrip", width=2) | {"points": [[6, 28], [18, 28]]}
+    session.save("a", {"shapes": [shape, line]})
+    session.save("a", {"shapes": session.read("a")})
+    first = session.read("a")[0]
+    assert first["points"] == shape["points"] and first["shape_type"] == "mask"
+    (strokes,) = read_strokes(scene.strokes, scene.images, scene.class_table())
+    labels = strokes.paint(*STORED)[0]
+    assert labels[11, 7] == -1 and labels[17, 17] == 2
+    small = strokes.paint(6, 4)[0]
+    assert 2 in small  # a small mask does not vanish
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"mask": "no picture"}, {"mask": None}, {"points": [[40, 10], [51, 17]]}, {"mask": picture(CORNER * 0)}],
+)
+def test_junk_mask_shapes_in_strokes_are_refused(tmp_path, change):
+    scene = make_scene(tmp_path)
+    scene.strokes.mkdir()
+    shape = square(NAMES[2], "mask", mask=picture(CORNER)) | change
+    (scene.strokes / "a.json").write_text(json.dumps({"shapes": [shape]}))
+    with pytest.raises(InputError, match="shape 1: the mask"):
+        read_strokes(scene.strokes, scene.images, scene.class_table())
+
+
+def test_background_of_strokes_in_other_letter_case(tmp_path):
+    scene = make_scene(tmp_path)
+    scene.strokes.mkdir()
+    (scene.strokes / "a.json").write_text(json.dumps({"shapes": [square("_Background_")]}))
+    (strokes,) = read_strokes(scene.strokes, scene.images, scene.class_table())
+    assert strokes.shapes[0].label == 0
+
+
+@pytest.mark.parametrize("kind", [float, str, lambda value: f"{value}.0"])
+def test_numbers_of_coco_as_floats_and_texts(tmp_path, kind):
+    content = json.loads(coco(1))
+    for entry in content["images"]:
+        entry |= {key: kind(entry[key]) for key in ("id", "width", "height")}
+    for entry in content["annotations"]:
+        entry |= {"category_id": kind(entry["category_id"])}
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    np.testing.assert_array_equal(imported(make_scene(tmp_path), tmp_path / "coco.json"), bands())
+
+
+def test_numbers_of_cvat_as_floats(tmp_path):
+    box = f'<mask label="{NAMES[2]}" left="6.0" top="10.0" width="12.0" height="8.0" rle="0, 96" z_order="1.0"/>'
+    text = f'<annotations><image id="0" name="a.jpg" width="48.0" height="32.0">{box}</image></annotations>'
+    (tmp_path / "cvat.xml").write_text(text)
+    found = imported(make_scene(tmp_path), tmp_path / "cvat.xml")
+    assert (found[10:18, 6:18] == 2).all() and (found == 2).sum() == 96
+
+
+@pytest.mark.parametrize(
+    ("mapping", "label", "expected"),
+    [
+        ({"wall": NAMES[1]}, "Wall", 1),
+        ({"Wall ": NAMES[1].upper()}, "wall", 1),
+        ({"wall": 1.0}, "wall", 1),
+        ({"wall": "1"}, "wall", 1),
+        ({NAMES[2]: NAMES[1]}, NAMES[2].upper(), 1),
+        ({NAMES[2].upper(): NAMES[1]}, NAMES[2], 2),  # as ever: the table has this very name
+    ],
+)
+def test_mappings_in_other_letter_case(tmp_path, mapping, label, expected):
+    (tmp_path / "a.json").write_text(json.dumps({"shapes": [square(label)]}))
+    (tmp_path / "map.json").write_text(json.dumps(mapping))
+    found = imported(make_scene(tmp_path), tmp_path / "a.json", mapping=tmp_path / "map.json")
+    assert (found[10:18, 6:18] == expected).all()
+
+
+def test_class_tables_with_floats():
+    entry = TABLE[0] | {"id": 1.0, "color": [1.0, 2.0, 3.0], "asprs": 6.0}
+    (found,) = parse_classes([entry], "classes.json")
+    assert (found.id, found.color, found.asprs) == (1, (1, 2, 3), 6)
+    with pytest.raises(InputError, match="whole number"):
+        parse_classes([entry | {"id": 1.5}], "classes.json")
+
+
+def test_prompts_name_classes_in_any_letter_case():
+    table = replace_prompts(parse_classes(TABLE, "classes"), (f"{NAMES[2].upper()}=street,lane",))
+    assert next(entry.prompts for entry in table if entry.id == 2) == ("street", "lane")
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda one: [one, one | {"file_name": "b.jpg"}], r"gives the id 1 to two images, a\.jpg and b\.jpg"),
+        (
+            lambda one: [one, one | {"id": 2}],
+            r"lists the image a\.jpg twice, as id 1 and 2, both with annotations",
+        ),
+        (lambda one: [one | {"id": 9}], "annotations of an image that it does not list, id 1: add it"),
+    ],
+)
+def test_images_listed_twice_in_coco(tmp_path, change, told):
+    content = json.loads(coco(1))
+    content["annotations"].append(content["annotations"][0] | {"image_id": 2})
+    content["images"] = change(content["images"][0])
+    if len(content["images"]) < 2 or content["images"][1]["id"] == 1:
+        content["annotations"].pop()
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=told):
+        imported(make_scene(tmp_path), tmp_path / "coco.json")
+
+
+def test_equal_entries_of_an_image_in_coco_are_one(tmp_path):
+    content = json.loads(coco(1))
+    content["images"] *= 2
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    np.testing.assert_array_equal(imported(make_scene(tmp_path), tmp_path / "coco.json"), bands())
+
+
+def test_categories_of_one_id_in_coco_are_refused(tmp_path):
+    content = json.loads(coco(1))
+    content["categories"][1]["id"] = content["categories"][0]["id"]
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=f"two categories, {NAMES[1]} and {NAMES[2]}"):
+        imported(make_scene(tmp_path), tmp_path / "coco.json")

@@ -14,8 +14,8 @@ import pytest
 from PIL import Image
 
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import View
-from sc3d.georeferencing.alignment import Similarity, camera_up
+from sc3d.geometry.cameras import View, look_at
+from sc3d.georeferencing.alignment import Similarity, camera_up, fit_similarity
 from sc3d.georeferencing.control_fit import fit_upright, fit_weighted
 from sc3d.georeferencing.control_points import (
     ControlPoints,
@@ -29,7 +29,7 @@ from sc3d.georeferencing.georeference import enu_to_geodetic, from_origin, geode
 from sc3d.georeferencing.placement import georeference_control_points
 from sc3d.io.colmap import cam_from_world, load_model, registered_images, write_model
 from sc3d.scene.scene import Scene
-from tests.georeferencing.test_georeference import build_model, fly, pixels_of, site
+from tests.georeferencing.test_georeference import build_model, fly, pinhole_view, pixels_of, site
 
 ORIGIN = (46.84269, -91.99443, 200.0)
 SHIFT = Similarity(0.1, pycolmap.Rotation3d(np.array([0.4, -1.0, 0.7])).matrix(), np.array([9.0, 8, 7]))
@@ -191,6 +191,186 @@ class TestHandheldGps:
                 fit = fit_weighted(source, target, (0.05, 3.0) if given else (1.0, 1.0))
                 errors[given].append(np.linalg.norm(fit.apply(source)[:, :2] - source[:, :2]))
         assert np.mean(errors[True]) < 0.8 * np.mean(errors[False])
+
+
+FEET = 1 / 0.3048
+GROUND = {
+    "flat": lambda x, y: 0.02 * np.sin(x),
+    "gentle": lambda x, y: np.sin(x / 6) * np.cos(y / 7),
+    "slope": lambda x, y: np.tan(np.radians(10)) * x + 0.05 * np.sin(y),
+    "hilly": lambda x, y: 4 * np.sin(x / 7 + 1) + 3 * np.cos(y / 5),
+}
+# (-18, -14) to (16, 14), then inside
+PLACES = np.array(
+    [
+        (-18, -14),
+        (19, -12),
+        (-15, 15),
+        (16, 14),
+        (2, 5),
+        (-2, -13),
+        (9, -3),
+        (-9, 4),
+        (12, 6),
+        (-17, 1),
+        (3, 13),
+        (-7, -6),
+    ],
+    float,
+)
+
+
+def oblique() -> list[View]:
+    """12 views around the site, 45 degrees down."""
+    turn = np.arange(12) * np.pi / 6
+    centers = np.column_stack([40 * np.cos(turn), 40 * np.sin(turn), np.full(12, 40.0)])
+    return [
+        pinhole_view(f"{row}.jpg", (640, 480), (420, 420, 320, 240), look_at(center, np.zeros(3), (0, 0, 1)))
+        for row, center in enumerate(centers)
+    ]
+
+
+class TestHeights:
+    """Heights that are in another unit, fillers or none, over several kinds of ground, by few points and many."""
+
+    def place(self, views, ground, count, change, noise=0.01):
+        """Tilt in degrees, height error in m of the cameras, figures; `change` of heights (count,) in m."""
+        surveyed = np.column_stack([PLACES, GROUND[ground](*PLACES.T)])[:count]
+        measured = surveyed + np.random.default_rng(4).normal(0, noise, surveyed.shape) * [1, 1, 2]
+        geodetic = enu_to_geodetic(measured, ORIGIN)
+        geodetic[:, 2] = change(geodetic[:, 2])
+        names = [f"gcp{row:02d}" for row in range(count)]
+        points = ControlPoints(names, geodetic, [pixels_of(point, views) for point in surveyed], None)
+        model = moved_model(views)
+        figures = georeference_control_points(model, points, 32615).figures["control_points"]
+        centers = {image.name: image.projection_center() for image in registered_images(model)}
+        placed = geodetic_to_enu(
+            enu_to_geodetic(np.array([centers[view.name] for view in views]), points.origin), ORIGIN
+        )
+        true = np.array([view.center for view in views])
+        found = fit_similarity(true, placed)
+        assert found.scale == pytest.approx(1, abs=5e-3)
+        return np.degrees(np.arccos(found.rotation[2, 2])), abs((placed - true)[:, 2].mean()), figures
+
+    @pytest.mark.parametrize("views", [lambda: fly(2), oblique])
+    @pytest.mark.parametrize("count", [4, 12])
+    @pytest.mark.parametrize("ground", GROUND)
+    def test_right_heights_stay(self, caplog, views, count, ground):
+        tilt, height, figures = self.place(views(), ground, count, lambda heights: heights)
+        assert tilt < 0.12 and height < 0.05 and figures["left_out"] == 0
+        assert figures["height_unit"] == "as given" and figures["heights_not_used"] == []
+        assert not caplog.text
+
+    @pytest.mark.parametrize("views", [lambda: fly(2), oblique])
+    @pytest.mark.parametrize(
+        "count, ground", [(4, "slope"), (4, "hilly"), (12, "gentle"), (12, "slope"), (12, "hilly")]
+    )
+    def test_feet(self, caplog, views, count, ground):
+        tilt, height, figures = self.place(views(), ground, count, lambda heights: heights * FEET)
+        assert tilt < 0.12 and height < 0.05 and figures["left_out"] == 0
+        assert figures["height_unit"] == "feet" and figures["rms_vertical"] < 0.05
+        assert "heights are 3.2" in caplog.text and "taken for feet" in caplog.text
+
+    @pytest.mark.parametrize("count", [4, 12])
+    def test_meters_where_the_crs_has_feet(self, caplog, count):
+        tilt, height, figures = self.place(fly(2), "hilly", count, lambda heights: heights * 0.3048)
+        assert tilt < 0.12 and height < 0.05 and figures["left_out"] == 0
+        assert "heights are 0.3" in caplog.text and "taken for meters" in caplog.text
+
+    def test_poor_heights_are_not_taken_for_another_unit(self):
+        for ground in ("flat", "gentle"):
+            for count in (5, 8, 12):
+                _, _, figures = self.place(fly(2), ground, count, lambda heights: heights.round(), 0.1)
+                assert figures["height_unit"] == "as given" and figures["heights_not_used"] == []
+
+    @pytest.mark.parametrize("views", [lambda: fly(2), oblique])
+    @pytest.mark.parametrize("filler", [0.0, -9999.0, 4294967295.0])
+    @pytest.mark.parametrize("real", [1, 3, 6])
+    @pytest.mark.parametrize("ground", ["slope", "hilly"])
+    def test_fillers_count_horizontally_only(self, caplog, views, filler, real, ground):
+        tilt, height, figures = self.place(
+            views(), ground, 12, lambda heights: np.where(np.arange(12) < real, heights, filler)
+        )
+        assert figures["left_out"] == 0 and figures["points"] == 12 and height < 0.3
+        assert figures["up_from_cameras"] == (real == 1)
+        assert tilt < (2.0 if real == 1 else 0.12)  # cameras may be askew
+        assert figures["heights_not_used"] == [f"gcp{row:02d}" for row in range(real, 12)]
+        assert f"heights of {12 - real} of 12 are {filler:g}, which is no measurement" in caplog.text
+
+    def test_a_measurement_for_all_others_that_the_ground_contradicts(self, caplog):
+        tilt, _, figures = self.place(
+            fly(2), "hilly", 12, lambda heights: np.where(np.arange(12) == 2, heights, 187.0)
+        )
+        assert tilt < 2 and figures["left_out"] == 0 and len(figures["heights_not_used"]) == 11
+        assert "up comes from the cameras" in caplog.text
+
+    def test_no_height_that_can_be_one(self, caplog):
+        tilt, _, figures = self.place(fly(2), "hilly", 12, lambda heights: np.full(12, -9999.0))
+        assert tilt < 2 and figures["up_from_cameras"] and len(figures["heights_not_used"]) == 12
+
+    def test_half_fillers_among_feet(self, caplog):
+        tilt, height, figures = self.place(
+            fly(2), "hilly", 12, lambda heights: np.where(np.arange(12) % 2, heights * FEET, 0)
+        )
+        assert tilt < 0.2 and height < 0.3 and figures["height_unit"] == "feet"
+        assert len(figures["heights_not_used"]) == 6
+
+    def test_equal_heights_among_right_ones_count(self):
+        # whole meters, of which some are the same
+        _, _, figures = self.place(fly(2), "hilly", 12, np.round)
+        assert figures["left_out"] == 0 and figures["heights_not_used"] == []
+
+
+class TestExchanged:
+    @pytest.mark.parametrize("views", [lambda: fly(2), oblique])
+    @pytest.mark.parametrize("ground", GROUND)
+    @pytest.mark.parametrize("count", [4, 12])
+    def test_coordinates(self, views, ground, count):
+        surveyed = np.column_stack([PLACES, GROUND[ground](*PLACES.T)])[:count]
+        points = ControlPoints(
+            [f"gcp{row:02d}" for row in range(count)],
+            enu_to_geodetic(surveyed[:, [1, 0, 2]], ORIGIN),
+            [pixels_of(point, views()) for point in surveyed],
+            None,
+        )
+        with pytest.raises(InputError, match="with x and y exchanged they fit: the order is x y"):
+            align_to_control_points(moved_model(views()), points)
+
+    @pytest.mark.parametrize("header", ["EPSG:32615", "EPSG:26991", "WGS84 UTM 15N"])
+    def test_northing_first_outside_the_crs_is_read_so(self, tmp_path, caplog, header):
+        import pyproj
+
+        crs = pyproj.CRS.from_epsg(26991 if "26991" in header else 32615)
+        place = from_origin(ORIGIN, crs.to_epsg()).to_crs(SURVEYED)
+        for name, order in (("right", [0, 1, 2]), ("exchanged", [1, 0, 2])):
+            rows = [
+                [*position[order], 10 + row, 20, "a.jpg", f"p{row}"] for row, position in enumerate(place)
+            ]
+            text = "\n".join("\t".join(map(str, row)) for row in rows)
+            (tmp_path / f"{name}.txt").write_text(f"{header}\n{text}\n")
+        right = read_control_points(tmp_path / "right.txt", ["a.jpg"])
+        assert not caplog.text
+        exchanged = read_control_points(tmp_path / "exchanged.txt", ["a.jpg"])
+        np.testing.assert_allclose(exchanged.geodetic, right.geodetic)
+        assert "x and y are exchanged" in caplog.text and "read so" in caplog.text
+
+    @pytest.mark.parametrize("kind, words", [("exchanged", "column, row"), ("upwards", "runs downwards")])
+    @pytest.mark.parametrize("views", [lambda: fly(6), oblique])
+    def test_pixels(self, kind, words, views):
+        points = control(SURVEYED, views())
+        for seen in points.observations:
+            for photo, pixel in seen.items():
+                seen[photo] = pixel[[1, 0]] if kind == "exchanged" else np.array([pixel[0], 480 - pixel[1]])
+        with pytest.raises(InputError, match=f"do not meet, but would with .*{words}"):
+            align_to_control_points(moved_model(views()), points)
+
+    def test_pixels_outside_their_photos(self):
+        points = control(SURVEYED, views := fly(6))
+        for seen in points.observations:
+            for photo, pixel in seen.items():
+                seen[photo] = pixel[[1, 0]]
+        with pytest.raises(InputError, match=r"outside their photos .* exchanged all lie inside"):
+            check_control_points(points, {view.name: (640, 480) for view in views}, None)
 
 
 class TestMarks:

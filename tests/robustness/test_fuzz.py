@@ -246,7 +246,8 @@ def test_faces_are_accepted_if_they_have_corners_that_exist(
 @settings(QUICK, max_examples=40)
 @given(st.integers(1, 40), st.integers(1, 40), st.randoms(use_true_random=False))
 def test_masks_are_read_as_they_were_written(tmp_path_factory, width, height, rng):
-    from sc3d.io.images import read_index_image, write_image
+    from sc3d.io.images import write_image
+    from sc3d.io.mask_images import read_index_image
 
     folder = tmp_path_factory.mktemp("masks")
     mask = np.frombuffer(rng.randbytes(width * height), np.uint8).reshape(height, width)

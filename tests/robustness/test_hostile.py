@@ -22,8 +22,10 @@ from PIL import Image
 import sc3d
 from sc3d.cli import main
 from sc3d.errors import InputError
-from sc3d.io.images import find_photos, image_size, read_image, read_index_image
+from sc3d.io.images import image_size, read_image
 from sc3d.io.json_files import read_json, read_text
+from sc3d.io.mask_images import read_index_image
+from sc3d.io.photo_folder import find_photos
 from sc3d.report.data import _read_sidecars, read_features
 from sc3d.runner import MAX_SIDECAR
 from sc3d.scene.class_table import read_classes

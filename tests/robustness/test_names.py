@@ -18,12 +18,13 @@ from sc3d.errors import InputError
 from sc3d.importers.clouds import read_geometry
 from sc3d.importers.metashape import read as read_metashape
 from sc3d.importers.photos import locate_photos
-from sc3d.io.images import read_index_image, write_image
+from sc3d.io.images import write_image
 from sc3d.io.json_files import read_json, write_json
+from sc3d.io.mask_images import read_index_image
 from sc3d.runner import execute
 from sc3d.scene.class_table import read_classes
 from sc3d.scene.photo_names import NamePattern, PhotoNames
-from sc3d.scene.scene import Scene
+from sc3d.scene.scene import Scene, match_masks
 from sc3d.segmentation.mask_formats.import_masks import import_masks
 from sc3d.segmentation.mask_formats.source import MaskFiles
 from sc3d.segmentation.segment import Folders, Segmentation, segment_photos
@@ -160,6 +161,50 @@ def test_masks_in_folders(tmp_path, table, caplog):
         import_masks(flat, tmp_path / "masks", sizes_of(*CARDS), table)
     one = write_masks(tmp_path / "101MEDIA", DJI_0002=3)  # the name of the folder tells
     assert import_masks(one, tmp_path / "more", sizes_of(*CARDS), table) == [CARDS[3]]
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("train", "val"),  # YOLO
+        ("train2017", "val2017"),  # COCO
+        ("Train/masks", "valid/masks"),
+        ("", "test"),
+        ("masks", "masks"),
+        ("labels/train", "labels/test"),
+    ],
+)
+def test_masks_in_the_parts_of_a_data_set(tmp_path, table, first, second):
+    photos, given = sizes_of("a.jpg", "b.jpg", "c.jpg"), tmp_path / "given"
+    write_image(given / first / "a.png", mask_of(1))
+    write_image(given / second / "b.png", mask_of(3))
+    for source in (MaskFiles(given), MaskFiles(given, "index")):
+        assert import_masks(source, tmp_path / "masks", photos, table) == ["a.jpg", "b.jpg"]
+    assert values_in(tmp_path / "masks") == {"a.png": 1, "b.png": 3}
+    # truth and confidence
+    assert sorted(match_masks(given, photos, table)) == ["a.jpg", "b.jpg"]
+    sure = tmp_path / "confidence"
+    import_masks(given, tmp_path / "masks", photos, table, given, sure)
+    assert values_in(sure) == {"a.png": 1, "b.png": 3}
+    if first != second:
+        write_image(given / second / "a.png", mask_of(1))
+        with pytest.raises(InputError, match=r"a\.jpg has a mask in .*a\.png and another in .*a\.png"):
+            import_masks(given, tmp_path / "masks", photos, table)
+        with pytest.raises(InputError, match=r"a\.png and .*a\.png both belong to a\.jpg"):
+            match_masks(given, photos, table)
+
+
+def test_masks_of_cards_in_the_parts_of_a_data_set(tmp_path, table):
+    given = write_masks(tmp_path / "given", **{"train/100MEDIA/DJI_0001": 1, "val/101MEDIA/DJI_0001": 3})
+    assert import_masks(given, tmp_path / "masks", sizes_of(*CARDS), table) == [CARDS[0], CARDS[2]]
+
+
+def test_strokes_in_the_parts_of_a_data_set(tmp_path, table):
+    write_photos(tmp_path / "images", "a.jpg", "b.jpg")
+    for folder, name in (("train", "a"), ("val", "b")):
+        write_json(tmp_path / "strokes" / folder / f"{name}.json", labelme("road", f"{name}.jpg"))
+    found = read_strokes(tmp_path / "strokes", tmp_path / "images", table)
+    assert [one.photo.name for one in found] == ["a.jpg", "b.jpg"]
 
 
 def test_photos_that_differ_in_suffix(tmp_path, table):

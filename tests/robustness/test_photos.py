@@ -17,18 +17,18 @@ from sc3d.errors import InputError
 from sc3d.io.images import (
     check_photo,
     data_uri,
-    find_photos,
     image_size,
-    left_out,
-    link_photos,
     read_image,
     read_opaque,
     used_range,
 )
 from sc3d.io.orientation import turned
+from sc3d.io.photo_folder import find_photos, link_photos, unused_files
 from sc3d.io.provenance import digest
 from sc3d.io.readable_photos import readable_photos
+from sc3d.runner import execute
 from sc3d.scene.scene import Scene, check_photos
+from sc3d.settings.labels import Label
 from sc3d.settings.reconstruction import Reconstruct
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import scene_data
@@ -294,6 +294,39 @@ def test_what_is_transparent_is_not_trained_on(tmp_path):
     assert 0.4 < mask.mean() < 0.6 and (np.abs(image[mask].astype(int) - 120) <= 1).mean() > 0.95
 
 
+def with_alpha(path: Path, alpha: int) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.dstack([pixels(), np.full(pixels().shape[:2], alpha, np.uint8)])).save(path)
+    return path
+
+
+def test_a_wholly_transparent_photo_is_named(tmp_path, caplog):
+    """Before features are looked for, where it is segmented, and where it would vote."""
+    folder = tmp_path / "photos"
+    for name, alpha in (("a", 0), ("b", 255), ("c", 9)):
+        with_alpha(folder / f"{name}.png", alpha)
+    told = "1 of 3 photos are wholly transparent and show nothing: a.png"
+    prepare(folder, Scene(tmp_path / "scene"), Reconstruct())
+    assert told in caplog.text
+    with_alpha(folder / "c.png", 0)
+    with pytest.raises(InputError, match="2 of 3 photos in .* are wholly transparent: at least two others"):
+        prepare(folder, Scene(tmp_path / "other"), Reconstruct())
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_wholly_transparent_photo_does_not_vote_and_says_so(tmp_path, caplog):
+    scene = labelled_scene(tmp_path)
+    first, *others = scene.model.views
+    for view in scene.model.views:
+        rgba = np.full((view.height, view.width, 4), 0 if view is first else 255, np.uint8)
+        scene.images.mkdir(exist_ok=True)
+        Image.fromarray(rgba).save(scene.photo(view.name), "PNG")
+    execute("label", Scene(scene.path), Label(), overwrite=True)
+    assert (
+        f"1 of {1 + len(others)} photos are wholly transparent and do not vote: {first.name}" in caplog.text
+    )
+
+
 # what lies in the folder of photos
 
 
@@ -322,7 +355,7 @@ def test_a_scene_inside_the_folder_of_photos(tmp_path):
     for folder in (photos, scene.images):
         assert [file.name for file in find_photos(folder)] == ["a.jpg", "b.jpg"]
         assert digest(folder) == before
-    assert left_out(photos) == "1 written by sc3d (out)"
+    assert unused_files(photos) == "1 written by sc3d (out)"
 
 
 def test_a_scene_that_is_the_folder_of_photos(tmp_path):
@@ -359,7 +392,7 @@ def test_leftovers_are_no_photos(tmp_path):
         (photos / name).parent.mkdir(exist_ok=True)
         shutil.copyfile(photos / "a.jpg", photos / name)
     assert [file.name for file in find_photos(photos)] == ["a.jpg", "b.jpg"]
-    assert left_out(photos).startswith("2 hidden (._a.jpg, .trash/c.jpg); 3 thumbnails or leftovers")
+    assert unused_files(photos).startswith("2 hidden (._a.jpg, .trash/c.jpg); 3 thumbnails or leftovers")
 
 
 # links

@@ -290,6 +290,39 @@ class TestFiles:
         assert len(flight.tags) == 11 and "11 of 12 photos have GPS" in caplog.text
         assert word is None or (word in caplog.text and "02.jpg" in caplog.text)
 
+    @pytest.mark.parametrize("altitude", [4294967295, 65535, 99999, 20001, -501, -9999, -32768])
+    def test_altitudes_that_cannot_be_are_none(self, tmp_path, caplog, altitude):
+        write_flight(tmp_path, grid(), {})
+        stated = {"GPSAltitude": IFDRational(abs(altitude), 1), "GPSAltitudeRef": bytes([altitude < 0])}
+        for name in names(12)[2:4]:
+            write_photo(tmp_path / name, MELBOURNE, **stated)
+        flight = read_flight(tmp_path, names(12))
+        assert len(flight.tags) == 10
+        assert "10 of 12 photos have GPS" in caplog.text
+        assert "2 with an altitude that no photo has: 02.jpg, 03.jpg" in caplog.text
+        # what XMP says instead counts, unless that cannot be either
+        xmp = 'drone-dji:AbsoluteAltitude="{}" drone-dji:RelativeAltitude="-9999"'
+        found = [
+            read_geotag(write_photo(tmp_path / "a.jpg", MELBOURNE, xmp.format(height), **stated))
+            for height in ("75.5", "+4294967.3")
+        ]
+        assert found[0].geodetic[2] == 75.5 and found[0].above_takeoff is None and found[1] is None
+        # and it does not replace what EXIF says
+        right = write_photo(tmp_path / "b.jpg", MELBOURNE, xmp.format(altitude))
+        assert read_geotag(right).geodetic[2] == 20
+
+    @pytest.mark.parametrize("altitude", [-430, 8849, 12000, 0])
+    def test_altitudes_from_the_dead_sea_to_an_airplane(self, tmp_path, altitude):
+        photo = write_photo(tmp_path / "a.jpg", (*MELBOURNE[:2], float(altitude)))
+        assert read_geotag(photo).geodetic[2] == altitude
+
+    def test_a_flight_of_which_no_altitude_can_be_says_so(self, tmp_path, caplog):
+        write_flight(tmp_path, grid(), {})
+        for name in names(12):
+            write_photo(tmp_path / name, MELBOURNE, GPSAltitude=IFDRational(4294967295, 1))
+        assert read_flight(tmp_path, names(12)) is None
+        assert "12 with an altitude that no photo has: 00.jpg" in caplog.text
+
     def test_positions_cut_to_seconds_are_said_to_be_coarse(self, tmp_path, caplog):
         positions = grid() * [8, 8, 1]
         for name, (latitude, longitude, height) in zip(names(12), enu_to_geodetic(positions, MELBOURNE)):

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from sc3d.errors import InputError
-from sc3d.io.images import read_index_image, write_image
+from sc3d.io.images import write_image
+from sc3d.io.mask_images import read_index_image
 from sc3d.scene.class_table import parse_classes
 from sc3d.segmentation.grounded_sam import Detections, GroundedSam
 from sc3d.segmentation.models import IMAGENET, enlarge, outline, to_pixels

@@ -18,7 +18,8 @@ import pytest
 from PIL import Image
 
 from sc3d.errors import InputError
-from sc3d.io.images import read_index_image, write_image
+from sc3d.io.images import write_image
+from sc3d.io.mask_images import read_index_image
 from sc3d.runner import execute
 from sc3d.scene.class_table import parse_classes
 from sc3d.scene.scene import Scene

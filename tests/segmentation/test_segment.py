@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from sc3d.errors import InputError, MissingPackageError
-from sc3d.io.images import read_index_image, write_image
+from sc3d.io.images import write_image
+from sc3d.io.mask_images import read_index_image
 from sc3d.scene.class_table import parse_classes
 from sc3d.segmentation.grounded_sam import GroundedSam
 from sc3d.segmentation.instances import Areas, Instance, fill_gaps, merge_instances, paint_areas
@@ -295,7 +296,7 @@ def test_import_masks(tmp_path):
         ("c", np.zeros((6, 8), np.uint8), "belongs to no photo"),
         ("b", np.zeros((8, 8), np.uint8), "aspect"),
         ("b", np.full((6, 8), 3, np.uint8), "class id 3"),
-        ("b", np.zeros((6, 8, 3), np.uint8), "colors"),
+        ("b", np.full((6, 8, 3), (1, 2, 3), np.uint8), "colors"),
     ],
 )
 def test_import_writes_nothing_if_a_mask_does_not_fit(tmp_path, stem, mask, message):

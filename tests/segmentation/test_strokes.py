@@ -171,7 +171,7 @@ def test_large_photos_are_looked_at_small_but_cut_finely(scene):
         ),
         (
             lambda folder: (folder / "a.json").write_text(
-                json.dumps(labelme([shape("road", [[1, 1]], "mask")]))
+                json.dumps(labelme([shape("road", [[1, 1]], "cuboid")]))
             ),
             "possible are",
         ),

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from sc3d.geometry.cameras import View, in_image, local_origin, pixel_centers, project
 from sc3d.geometry.raycast import Surface, first_surface, surface_points
 from sc3d.io.clouds import read_cloud, read_mesh
-from sc3d.io.images import read_index_image
+from sc3d.io.mask_images import read_index_image
 from sc3d.scene.scene import Scene
 from sc3d.settings.synthesize import SynthesizeCity
 from sc3d.synthetic import city

@@ -15,7 +15,7 @@ from sc3d.cli import main as sc3d
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.io.clouds import read_cloud
-from sc3d.io.images import read_index_image
+from sc3d.io.mask_images import read_index_image
 from sc3d.io.splats import write_splat_ply
 from sc3d.labelling.cloud import Cloud
 from sc3d.scene.scene import Scene

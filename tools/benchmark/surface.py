@@ -11,7 +11,7 @@ from tqdm import tqdm
 from sc3d.geometry.cameras import View, local_origin, undistorted
 from sc3d.geometry.raycast import Surface, first_surface, see_points
 from sc3d.io.clouds import read_cloud, read_mesh
-from sc3d.io.images import read_index_image
+from sc3d.io.mask_images import read_index_image
 from sc3d.scene.scene import Scene
 from sc3d.splatting.dataset import load_gaussians
 from sc3d.splatting.evaluation import depth_map

@@ -18,7 +18,8 @@ from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import Surface, first_surface, nearest_points
 from sc3d.io.atomic import atomic_path
 from sc3d.io.clouds import read_cloud
-from sc3d.io.images import read_index_image, write_image
+from sc3d.io.images import write_image
+from sc3d.io.mask_images import read_index_image
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.inputs import Masks, point_density
 from sc3d.metrics import Confusion, EvaluationPixels, depth_edge_band

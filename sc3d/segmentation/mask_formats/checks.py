@@ -15,6 +15,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.images import read_orientation
+from sc3d.io.json_files import whole_number_of
 from sc3d.io.limits import MAX_MASK_PIXELS
 from sc3d.io.orientation import inverse, mask_turn, turned_size
 from sc3d.scene.photo_names import PhotoNames, photo_name, stem
@@ -141,11 +142,8 @@ class Checks:
         orientation = 1 if self._photos is None else read_orientation(self._photos / name)
         if stated is None:
             return turned_size(photo, orientation), inverse(orientation)
-        try:
-            width, height = (int(value) for value in stated)
-            if width < 1 or height < 1 or (width, height) != tuple(float(value) for value in stated):
-                raise ValueError
-        except (ValueError, TypeError, OverflowError):
+        width, height = whole_number_of(stated[0]), whole_number_of(stated[1])
+        if width is None or height is None or min(width, height) < 1:
             self.add(
                 "no size",
                 f"{_where(name, origin)} has a size that is none: {str(stated[0])[:20]} x {str(stated[1])[:20]}",

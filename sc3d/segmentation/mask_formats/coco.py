@@ -7,15 +7,16 @@ Datumaro mark every mask that is not a polygon as one.
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.json_files import read_json
+from sc3d.io.json_files import read_json, whole_number_of
 from sc3d.segmentation.mask_formats.annotations import Annotation, PhotoAnnotations
 from sc3d.segmentation.mask_formats.outlines import (
     OutlineError,
@@ -33,21 +34,63 @@ def read_coco(file: Path) -> Iterator[PhotoAnnotations]:
     images, annotations, categories = (
         _entries(content, key, file) for key in ("images", "annotations", "categories")
     )
-    names = {_id(category, "id", file): str(category.get("name", "")) for category in categories}
+    images = list({json.dumps(image, sort_keys=True): image for image in images}.values())
+    names = _names(categories, file)
     by_image = defaultdict(list)
     for annotation in annotations:
         by_image[_id(annotation, "image_id", file)].append(annotation)
     known = [_id(image, "id", file) for image in images]
     strangers = by_image.keys() - set(known)
-    if strangers or len(set(known)) < len(known):
+    if strangers:
         raise InputError(
-            f"{file} has annotations of an image that it does not list, or an image twice: it is damaged"
+            f"{file} has annotations of an image that it does not list, id {_shown(min(strangers, key=str))}: "
+            "add it to images, or take them out"
         )
+    _check_once(images, known, by_image, file)
     for image, image_id in zip(images, known, strict=True):
         photo, size = str(image.get("file_name", "")), (image.get("width"), image.get("height"))
         found = tuple(_annotation(entry, names, file) for entry in by_image[image_id])
         photos = (*_original_name(image), photo)
         yield PhotoAnnotations(str(file), photos, None if None in size else size, found, smaller_on_top=True)
+
+
+def _names(categories: list[dict], file: Path) -> dict[int | str, str]:
+    """Names of the categories by id; InputError if two have one id."""
+    names: dict[int | str, str] = {}
+    for category in categories:
+        number, name = _id(category, "id", file), str(category.get("name", ""))
+        if names.setdefault(number, name) != name:
+            raise InputError(
+                f"{file} gives the id {_shown(number)} to two categories, {_shown(names[number])} and {_shown(name)}: "
+                "give each its own"
+            )
+    return names
+
+
+def _check_once(
+    images: list[dict], ids: list[int | str], annotated: Container[int | str], file: Path
+) -> None:
+    """InputError if two images have one id, or one name and annotations both."""
+    by_id, by_name = dict[int | str, str](), dict[str, int | str]()
+    for image, number in zip(images, ids, strict=True):
+        name = str(image.get("file_name", ""))
+        if number in by_id:
+            raise InputError(
+                f"{file} gives the id {_shown(number)} to two images, {_shown(by_id[number])} and {_shown(name)}: "
+                "give each its own, or leave one"
+            )
+        by_id[number] = name
+        if number in annotated and name and name in by_name:
+            raise InputError(
+                f"{file} lists the image {_shown(name)} twice, as id {_shown(by_name[name])} and {_shown(number)}, both with "
+                "annotations: give them to one"
+            )
+        if number in annotated:
+            by_name[name] = number
+
+
+def _shown(value: object) -> str:
+    return repr(str(value)[-80:])[1:-1]
 
 
 def _original_name(image: dict) -> tuple[str, ...]:
@@ -67,9 +110,10 @@ def _entries(content: object, key: str, file: Path) -> list[dict]:
 
 
 def _id(entry: dict, key: str, file: Path) -> int | str:
-    if not isinstance(entry.get(key), int | str):
+    found, value = whole_number_of(entry.get(key)), entry.get(key)  # some programs write 7 as 7.0 or "7"
+    if found is None and not isinstance(value, str):
         raise InputError(f"{file} is not a COCO file of instances: an entry lacks its {key}")
-    return entry[key]
+    return str(value) if found is None else found
 
 
 def _annotation(entry: dict, names: dict[int | str, str], file: Path) -> Annotation:

@@ -13,6 +13,7 @@ from pathlib import Path
 from xml.parsers import expat
 
 from sc3d.errors import InputError
+from sc3d.io.json_files import whole_number_of
 from sc3d.segmentation.mask_formats.annotations import Annotation, PhotoAnnotations
 from sc3d.segmentation.mask_formats.outlines import (
     OutlineError,
@@ -85,12 +86,12 @@ class _Document:
             self._image = None
 
     def _level(self, attributes: dict[str, str]) -> int:
-        try:
-            return int(attributes.get("z_order", 0))
-        except ValueError:
+        level = whole_number_of(attributes.get("z_order", 0))
+        if level is None:
             raise InputError(
                 f"{self.file} has the z_order {attributes['z_order'][:40]!r}: a whole number is expected"
-            ) from None
+            )
+        return level
 
 
 def _outline(tag: str, attributes: dict[str, str], size: tuple[int, int]) -> Polygons | RunLengths:
@@ -106,7 +107,14 @@ def _outline(tag: str, attributes: dict[str, str], size: tuple[int, int]) -> Pol
         return ellipse(
             [attributes["cx"], attributes["cy"]], [attributes["rx"], attributes["ry"]], rotation, size
         )
-    left, top, width, height = (int(attributes[key]) for key in ("left", "top", "width", "height"))
+    left, top, width, height = (_whole(attributes[key]) for key in ("left", "top", "width", "height"))
     if min(left, top, width, height) < 0 or max(left, top, width, height) > max(size):
         raise OutlineError("lies outside of the image")
     return run_lengths(attributes["rle"].split(","), (left, top, width, height), False, size)
+
+
+def _whole(text: str) -> int:
+    found = whole_number_of(text)
+    if found is None:
+        raise ValueError
+    return found

@@ -12,7 +12,8 @@ from pathlib import Path
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path, discard
 from sc3d.io.folders import resolved
-from sc3d.io.images import index_image_size, read_orientation, turned_onto, write_image
+from sc3d.io.images import read_orientation, write_image
+from sc3d.io.mask_images import index_image_size, is_indexed, turned_onto
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.mask_values import read_confidence
 from sc3d.scene.photo_names import PhotoNames
@@ -89,6 +90,13 @@ def import_masks(
     masks, maps = check_masks(
         replace(source, format="index") if in_place else source, photo_sizes, class_table, confidence, photos
     )
+    wide = next(
+        (mask.origin for mask in masks.values() if in_place and not is_indexed(Path(mask.origin))), None
+    )
+    if wide is not None:
+        raise InputError(
+            f"{wide} has colors, or 16 bits: the scene's own masks are 8-bit PNGs with one id per pixel"
+        )
     _check_target(source.path, scene_masks)
     if scene_confidence is not None:
         _check_target(confidence, scene_confidence)

@@ -21,6 +21,7 @@ from sc3d.segmentation.mask_formats.outlines import (
     OutlineError,
     Polygons,
     RunLengths,
+    Values,
     ellipse,
     numbers,
     polygons,
@@ -66,16 +67,19 @@ def _outline(shape: dict, kind: str, size: tuple[int, int]) -> Polygons | RunLen
         center, edge = numbers(points)
         return ellipse(center, [np.hypot(*(edge - center))] * 2, 0.0, size)
     if kind == "mask":
-        return _mask(shape["mask"], numbers(points), size)
+        left, top, mask = decode_mask(shape["mask"], points, size)
+        return run_lengths(row_lengths(mask), (left, top, mask.shape[1], mask.shape[0]), False, size)
     raise OutlineError("is of a type that is not known")
 
 
-def _mask(text: str, corners: np.ndarray, size: tuple[int, int]) -> RunLengths:
-    """A PNG in base64 for the pixels from the first to the second corner, both included; its size is checked
-    before it is decoded.
+def decode_mask(text: str, points: Values, size: tuple[int, int]) -> tuple[int, int, np.ndarray]:
+    """The left column, the top row and the (H, W) bool pixels of a mask shape: a PNG in base64 for the pixels from
+    the first to the second corner, both included; its size is checked before it is decoded. OutlineError if it
+    does not fit; size: (width, height) px of the image.
     """
     from PIL import Image
 
+    corners = numbers(points)
     if (
         corners.shape != (2, 2)
         or (corners < 0).any()
@@ -89,7 +93,15 @@ def _mask(text: str, corners: np.ndarray, size: tuple[int, int]) -> RunLengths:
         with Image.open(io.BytesIO(base64.b64decode(text, validate=True)), formats=["PNG"]) as image:
             if image.size != (width, height):
                 raise OutlineError("has a picture of another size than its corners say")
-            mask = np.array(image.convert("L")) > 0
+            return left, top, np.array(image.convert("L")) > 0
     except (OSError, SyntaxError, binascii.Error, Image.DecompressionBombError):
         raise OutlineError("has a damaged picture") from None
-    return run_lengths(row_lengths(mask), (left, top, width, height), False, size)
+
+
+def encode_mask(mask: np.ndarray) -> str:
+    """What `decode_mask` reads, of the (H, W) bool pixels of a mask shape."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(mask.astype(np.uint8) * np.uint8(255)).save(stream, "PNG")
+    return base64.b64encode(stream.getvalue()).decode()

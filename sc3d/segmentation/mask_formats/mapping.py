@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,10 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.json_files import read_json
+from sc3d.io.json_files import read_json, whole_number_of
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.mask_values import UNKNOWN, Meanings, color_code, meanings_of
+from sc3d.scene.mask_values import BLACK, UNKNOWN, Meanings, color_code, meanings_of
 
+MAX_IDS = 1 << 16  # of PNGs with one id per pixel
 UNLABELLED = ("ignore", "unlabelled", "unlabeled")
 
 
@@ -35,73 +37,51 @@ class ClassMapping:
         return ", ".join(entry.name for entry in self.table)
 
     def find(self, keys: tuple[str, ...]) -> int | None:
-        """Class id for the first key that the mapping has, or else for a name in the table (upper or lower
-        case); None if there is none.
+        """Class id for the first key that the mapping has, or else for a name in the table; of both also in
+        another letter case, where that is clear. None if there is none.
         """
+        mapping = self.mapping or {}
         for key in keys:
-            if self.mapping is not None and key in self.mapping:
-                return self.mapping[key]
-        return _by_name(keys[0], self.table)
+            if key in mapping:
+                return mapping[key]
+        if any(entry.name == keys[0].strip() for entry in self.table):
+            return self.table.find(keys[0])
+        for key in keys:
+            alike = self._folded.get(key.strip().casefold(), set())
+            if len(alike) == 1:
+                return next(iter(alike))
+        return self.table.find(keys[0])
 
     @cached_property
-    def by_id(self) -> np.ndarray:
-        """(65536,) int16 class id per value in a PNG, UNKNOWN where there is none. A mapping replaces the
-        numbering of the table.
-        """
-        table = np.full(1 << 16, UNKNOWN, np.int16)
-        table[0] = 0
-        if self.mapping is None:
-            table[[entry.id for entry in self.table]] = [entry.id for entry in self.table]
-            return table
-        for key, class_id in self.mapping.items():
-            if not re.fullmatch(r"[0-9]{1,5}", key) or int(key) >= len(table):
-                raise InputError(
-                    f"{self.origin}: {key!r} is no id: PNGs with one id per pixel need whole numbers from 0 to 65535"
-                )
-            table[int(key)] = class_id
-        return table
-
-    @cached_property
-    def by_color(self) -> np.ndarray:
-        """(2^24,) int16 class id per color 0xRRGGBB, UNKNOWN where there is none; black is unlabelled unless
-        it is a class.
-        """
-        if self.mapping is None:
-            colors = [(entry.color, entry.id, entry.name) for entry in self.table]
-            # The table shows unlabelled pixels in a dark gray, and so do pictures made with it.
-            colors = [
-                ((0, 0, 0), 0, "unlabelled"),
-                (tuple(self.table.palette[0].tolist()), 0, "unlabelled"),
-                *colors,
-            ]
-        else:
-            colors = [
-                ((0, 0, 0), 0, "unlabelled"),
-                *((self._color(key), class_id, key) for key, class_id in self.mapping.items()),
-            ]
-        table, owners = np.full(1 << 24, UNKNOWN, np.int16), dict[int, int]()
-        for color, class_id, owner in colors:
-            code = color_code(color)
-            if owners.get(code, class_id) not in (class_id, 0):
-                raise InputError(
-                    f"{self.origin or 'the class table'}: {owner!r} has the color {color} of another class: colors cannot tell them apart"
-                )
-            owners[code] = table[code] = class_id
-        return table
+    def _folded(self) -> dict[str, set[int]]:
+        """Class ids by the keys of the mapping in lower case."""
+        found = defaultdict[str, set[int]](set)
+        for key, class_id in (self.mapping or {}).items():
+            found[key.casefold()].add(class_id)
+        return found
 
     @cached_property
     def meanings(self) -> Meanings:
-        """What the values and the palettes of PNGs may stand for; without ids or colors where the mapping has
-        none.
+        """What the values and colors of PNGs may stand for. A mapping replaces the numbering and the colors of the
+        table; InputError if one of its keys is neither an id nor a color, or a color stands for two classes.
         """
         if self.mapping is None:
             return meanings_of(self.table)
-        try:
-            known = np.flatnonzero(self.by_color != UNKNOWN)
-        except InputError:  # its keys are no colors
-            return Meanings(self.by_id, {})
-        by_color = dict(zip(known.tolist(), self.by_color[known].tolist(), strict=True))
-        return Meanings(np.full(256, UNKNOWN, np.int16), by_color)
+        ids, colors = dict[int, int](), {BLACK: 0}
+        for key, class_id in self.mapping.items():
+            if re.fullmatch(r"[0-9]{1,5}", key) and int(key) < MAX_IDS:
+                ids[int(key)] = class_id
+                continue
+            code = color_code(self._color(key))
+            if colors.get(code, class_id) not in (class_id, 0):
+                raise InputError(
+                    f"{self.origin}: {key!r} has the color of another class: colors cannot tell them apart"
+                )
+            colors[code] = class_id
+        by_id = np.full(MAX_IDS, UNKNOWN, np.int16)
+        if ids:
+            by_id[[0, *ids]] = [ids.get(0, 0), *ids.values()]
+        return Meanings(by_id, colors if len(ids) < len(self.mapping) else {})
 
     def _color(self, key: str) -> tuple[int, int, int]:
         code = re.fullmatch(r"#([0-9a-fA-F]{6})", key)
@@ -110,7 +90,10 @@ class ClassMapping:
             return red, green, blue
         values = re.fullmatch(r"[\[(]?\s*([0-9]{1,3})\s*,\s*([0-9]{1,3})\s*,\s*([0-9]{1,3})\s*[\])]?", key)
         if not values or max(map(int, values.groups())) > 255:
-            raise InputError(f'{self.origin}: {key!r} is no color: write it as "#d63c3c" or "[214, 60, 60]"')
+            raise InputError(
+                f"{self.origin}: {key!r} is no id and no color: PNGs need whole numbers from 0 to {MAX_IDS - 1}, "
+                'or colors such as "#d63c3c" or "[214, 60, 60]"'
+            )
         red, green, blue = map(int, values.groups())
         return red, green, blue
 
@@ -135,31 +118,13 @@ def read_mapping(mapping: Path | None, table: ClassTable) -> ClassMapping:
 
 
 def _class_id(key: str, value: object, table: ClassTable, origin: Path) -> int:
-    found = None
-    if value is None:
-        found = 0
-    elif isinstance(value, str):
-        found = _by_name(value, table)
-        if found is None and value.strip().casefold() in UNLABELLED:
-            found = 0
-    elif (
-        isinstance(value, int)
-        and not isinstance(value, bool)
-        and value in {0, *(entry.id for entry in table)}
-    ):
-        found = value
-    if found is None:
+    found = 0 if value is None else whole_number_of(value)
+    if isinstance(value, str):
+        found = named if (named := table.find(value)) is not None else found
+        found = 0 if found is None and value.strip().casefold() in UNLABELLED else found
+    if found is None or found not in {0, *(entry.id for entry in table)}:
         names = ", ".join(entry.name for entry in table)
         raise InputError(
             f"{origin}: {key!r} stands for {value!r}, which is no class: write one of {names}, or null for unlabelled"
         )
     return found
-
-
-def _by_name(name: str, table: ClassTable) -> int | None:
-    """Class id of a name; exact if there is one, else whatever the case if only one fits."""
-    exact = [entry.id for entry in table if entry.name == name.strip()]
-    alike = [entry.id for entry in table if entry.name.casefold() == name.strip().casefold()]
-    if exact:
-        return exact[0]
-    return alike[0] if len(alike) == 1 else None

@@ -66,7 +66,7 @@ def read_masks(
         _tell_of_other_folders(source.path, files)
     for file in files:
         try:
-            for name, mask in _read(file, "auto" if automatic and kind == "index" else kind, checks):
+            for name, mask in _read(file, "auto" if automatic and kind not in READERS else kind, checks):
                 if name in masks:
                     checks.add(
                         "double",
@@ -97,7 +97,8 @@ def read_masks(
             len(checks.turned),
             checks.turned[0],
         )
-    logger.info("%s: %s masks for %d of %d photos", source.path, kind, len(masks), len(photo_sizes))
+    told = "PNG" if automatic and kind not in READERS else kind
+    logger.info("%s: %s masks for %d of %d photos", source.path, told, len(masks), len(photo_sizes))
     return dict(sorted(masks.items()))
 
 

@@ -1,8 +1,9 @@
 """What a user drew on photos: strokes, polygons and colors, read, checked and painted at any size.
 
 LabelMe JSON: shapes of type linestrip, line, point (with `"width": <px>`, which LabelMe keeps although it
-does not know it), polygon, rectangle and circle; coordinates in px from the upper left corner of the photo as
-it is shown (`sc3d.io.orientation`); later shapes cover earlier ones. The label is the name of a class, or
+does not know it), polygon, rectangle, oriented rectangle, circle and mask; coordinates in px from the upper left corner of the photo as
+it is shown (`sc3d.io.orientation`); later shapes cover earlier ones. The label is the name of a class, in any
+letter case, or
 `_background_` for what belongs to no class. PNG: the colors of the class table; black and transparent pixels
 say nothing. A photo may have both, the PNG below.
 """
@@ -12,24 +13,28 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.images import find_photos, image_size, mask_orientation, open_image, read_orientation
-from sc3d.io.json_files import read_json
+from sc3d.io.images import image_size, open_image, read_orientation
+from sc3d.io.json_files import read_json, whole_number
+from sc3d.io.mask_images import mask_orientation
 from sc3d.io.orientation import mask_turn, turned, turned_points, turned_size
+from sc3d.io.photo_folder import find_photos
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.photo_names import PhotoNames, files_of_photos, photo_name
 from sc3d.scene.scene import check_mask_aspect
+from sc3d.segmentation.mask_formats.labelme import decode_mask, encode_mask
+from sc3d.segmentation.mask_formats.outlines import OutlineError
 
 logger = logging.getLogger(__name__)
 
 BACKGROUND = "_background_"  # LabelMe's own name for it
 NOTHING = -1  # a pixel without a stroke; 0 is background
-MIN_POINTS = {"point": 1, "line": 2, "linestrip": 1, "polygon": 3, "rectangle": 2, "circle": 2}
+MIN_POINTS = {"point": 1, "line": 2, "linestrip": 1, "polygon": 3, "rectangle": 2, "circle": 2, "mask": 2}
+POLYGONS = ("oriented_rectangle", "rotation")  # of LabelMe and X-AnyLabeling, with all their corners
 MAX_SHAPES, MAX_POINTS = 10_000, 200_000  # on one photo; nobody draws more
 DEFAULT_WIDTH = 0.005  # of a stroke that states none, share of the photo's longest side
 _MAX_COORDINATE = 1e5  # px; more cannot be meant, and would overflow the fixed-point coordinates of OpenCV
@@ -40,14 +45,18 @@ _MIN_SHARE = 0.25  # of a reduced pixel that a PNG must cover
 
 @dataclass(frozen=True)
 class StrokeShape:
-    """One stroke or area. label: class id, 0 = background; points: (N, 2) float64 px of the photo as shown;
-    width: of strokes, px, 0 = default.
+    """One stroke or area.
+
+    label: class id, 0 = background; kind: of `MIN_POINTS`
+    points: (N, 2) float64 px of the photo as shown; of a mask, corners of its box
+    width: of strokes, px, 0 = default; mask: (H, W) bool pixels of a mask, on a grid of its own over the box
     """
 
     label: int
     kind: str
     points: np.ndarray
     width: float = 0.0
+    mask: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -142,6 +151,18 @@ def _outside(shapes: tuple[StrokeShape, ...], size: tuple[int, int]) -> list[int
     return found
 
 
+def as_labelme(shape: StrokeShape, label: str, size: tuple[int, int]) -> dict[str, object]:
+    """A shape as LabelMe writes it, of a photo of `size`, (width, height) px as shown; label: name of the class."""
+    head: dict[str, object] = {"label": label, "shape_type": shape.kind}
+    if shape.mask is None:
+        return head | {"points": shape.points.tolist()} | ({"width": shape.width} if shape.width else {})
+    canvas = _draw_mask(shape.mask, shape.points, size[::-1])
+    places = np.argwhere(canvas)
+    low, high = places.min(axis=0), places.max(axis=0)
+    crop = canvas[low[0] : high[0] + 1, low[1] : high[1] + 1]
+    return head | {"points": [low[::-1].tolist(), high[::-1].tolist()], "mask": encode_mask(crop)}
+
+
 def read_shapes(
     content: object, origin: Path | str, photo: Path, class_table: ClassTable
 ) -> tuple[StrokeShape, ...]:
@@ -150,11 +171,15 @@ def read_shapes(
     """
     orientation, size = read_orientation(photo), image_size(photo)
     sides = [content.get(key) for key in ("imageWidth", "imageHeight")] if isinstance(content, dict) else []
-    stated = [side for side in sides if isinstance(side, int) and 0 < side < _MAX_COORDINATE]
+    stated = [side for side in map(_side, sides) if side]
     if len(stated) < 2 or mask_turn(1, (stated[0], stated[1]), orientation, size)[0] != 1:
         return parse_shapes(content, origin, turned_size(size, orientation), class_table)
     return tuple(
-        replace(shape, points=turned_points(shape.points, size, orientation))
+        replace(
+            shape,
+            points=turned_points(shape.points, size, orientation),
+            mask=None if shape.mask is None else turned(shape.mask, orientation),
+        )
         for shape in parse_shapes(content, origin, size, class_table)
     )
 
@@ -170,16 +195,10 @@ def parse_shapes(
     if not isinstance(content, dict) or not isinstance(shapes, list):
         raise InputError(f"{origin} is not a LabelMe file: it has no list of shapes")
     _check_amount(shapes, origin)
-    stated: tuple[Any, Any] = (content.get("imageWidth"), content.get("imageHeight"))
-    scale = 1.0
-    if stated != (None, None):
-        if not all(isinstance(side, int) and 0 < side < _MAX_COORDINATE for side in stated):
-            raise InputError(f"{origin}: imageWidth and imageHeight must be whole numbers of px")
-        check_mask_aspect(origin, stated, size)
-        scale = max(size) / max(stated)
-    ids = {entry.name: entry.id for entry in class_table} | {BACKGROUND: 0}
+    drawn = _drawn_size(content, origin, size)
     return tuple(
-        _parse_shape(shape, f"{origin}: shape {index + 1}", ids, scale) for index, shape in enumerate(shapes)
+        _parse_shape(shape, f"{origin}: shape {index + 1}", class_table, drawn, max(size) / max(drawn))
+        for index, shape in enumerate(shapes)
     )
 
 
@@ -192,13 +211,37 @@ def _check_amount(shapes: list, origin: Path | str) -> None:
         )
 
 
-def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) -> StrokeShape:
+def _drawn_size(content: dict, origin: Path | str, size: tuple[int, int]) -> tuple[int, int]:
+    """(width, height) px that a file states, that of the photo where it states none."""
+    stated = (content.get("imageWidth"), content.get("imageHeight"))
+    if stated == (None, None):
+        return size
+    width, height = map(_side, stated)
+    if not width or not height:
+        raise InputError(f"{origin}: imageWidth and imageHeight must be whole numbers of px")
+    check_mask_aspect(origin, (width, height), size)
+    return width, height
+
+
+def _side(value: object) -> int:
+    """A side of an image in px; 0 if it is none."""
+    side = whole_number(value)
+    return side if side is not None and 0 < side < _MAX_COORDINATE else 0
+
+
+def _parse_shape(
+    shape: object, origin: str, class_table: ClassTable, drawn: tuple[int, int], scale: float
+) -> StrokeShape:
+    """drawn: (width, height) px of the image that it was drawn on; scale: from that to the photo"""
     if not isinstance(shape, dict):
         raise InputError(f"{origin} is not an object")
-    label, kind = shape.get("label"), shape.get("shape_type") or "polygon"
-    if not isinstance(label, str) or label not in ids:
+    name, kind = shape.get("label"), shape.get("shape_type") or "polygon"
+    kind = "polygon" if kind in POLYGONS else kind
+    label = _label(name, class_table)
+    if label is None:
+        known = ", ".join([*(entry.name for entry in class_table), BACKGROUND])
         raise InputError(
-            f"{origin} is of the class {str(label)[:40]!r}, which is not in the class table: one of {', '.join(ids)}"
+            f"{origin} is of the class {str(name)[:40]!r}, which is not in the class table: one of {known}"
         )
     if not isinstance(kind, str) or kind not in MIN_POINTS:
         raise InputError(f"{origin} is a {str(kind)[:40]!r}: possible are {', '.join(MIN_POINTS)}")
@@ -214,7 +257,27 @@ def _parse_shape(shape: object, origin: str, ids: dict[str, int], scale: float) 
     placed = np.array(points, np.float64).reshape(-1, 2) * scale
     if not (np.abs(placed) < _MAX_COORDINATE).all():
         raise InputError(f"{origin}: points must be a list of [x, y] in px")
-    return StrokeShape(ids[label], kind, placed, float(width) * scale)
+    if kind == "mask":
+        return _parse_mask(shape, origin, label, drawn, scale)
+    return StrokeShape(label, kind, placed, float(width) * scale)
+
+
+def _label(name: object, class_table: ClassTable) -> int | None:
+    """Class id of a name in any letter case, 0 for `BACKGROUND`; None if there is none."""
+    if not isinstance(name, str):
+        return None
+    return 0 if name.strip().casefold() == BACKGROUND else class_table.find(name)
+
+
+def _parse_mask(shape: dict, origin: str, label: int, drawn: tuple[int, int], scale: float) -> StrokeShape:
+    try:
+        left, top, mask = decode_mask(shape.get("mask", ""), shape["points"], drawn)
+    except (OutlineError, TypeError, ValueError) as error:
+        raise InputError(f"{origin}: the mask {error}") from None
+    if not mask.any():
+        raise InputError(f"{origin}: the mask has no pixels")
+    corners = np.array([[left, top], [left + mask.shape[1], top + mask.shape[0]]], np.float64) * scale
+    return StrokeShape(label, "mask", corners, mask=mask)
 
 
 def _is_number(value: object) -> bool:
@@ -304,6 +367,8 @@ def _draw(shape: StrokeShape, scale: np.ndarray, default_width: float, size: tup
     """(H, W) bool pixels that a shape covers, at least one unless it lies outside; scale: (2,) of x and y;
     size: (H, W).
     """
+    if shape.mask is not None:
+        return _draw_mask(shape.mask, shape.points * scale, size)
     canvas, points = np.zeros(size, np.uint8), shape.points
     if shape.kind == "circle":
         angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
@@ -322,3 +387,26 @@ def _draw(shape: StrokeShape, scale: np.ndarray, default_width: float, size: tup
         # a single point is no line to OpenCV
         cv2.polylines(canvas, [np.concatenate([fixed[0], fixed[0][-1:]])], False, 1, thickness, shift=_SHIFT)
     return canvas > 0
+
+
+def _draw_mask(mask: np.ndarray, corners: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) bool pixels whose centers lie on pixels of a mask, or the one under its first pixel if none does.
+
+    corners: (2, 2) x, y of its box, px; size: (H, W)
+    """
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    cells = (high - low) / mask.shape[::-1]
+    columns, rows = (
+        np.floor((np.arange(count) + 0.5 - low[axis]) / cells[axis]).astype(int)
+        for axis, count in enumerate(size[::-1])
+    )
+    canvas = np.zeros(size, bool)
+    inside = [
+        (index >= 0) & (index < count) for index, count in zip((rows, columns), mask.shape, strict=True)
+    ]
+    canvas[np.ix_(*inside)] = mask[np.ix_(rows[inside[0]], columns[inside[1]])]
+    if mask.any() and not canvas.any():
+        first = (np.argwhere(mask)[0][::-1] + 0.5) * cells + low
+        column, row = np.clip(first.astype(int), 0, np.array(size[::-1]) - 1)
+        canvas[row, column] = True
+    return canvas
