@@ -186,11 +186,9 @@ def _dispatch(name: str, command: Any) -> None:
     if name in COMMANDS:
         importlib.import_module(MODULES.get(name, f"sc3d.commands.{name}")).main(command)
         return
-    from sc3d.io.atomic import require_writable
     from sc3d.runner import execute
     from sc3d.scene.scene import Scene
 
-    require_writable(command.scene)
     execute(name, Scene(command.scene), command.settings, command.overwrite)
 
 

@@ -263,6 +263,23 @@ def test_files_of_holes_are_not_read_for_hours(tmp_path):
     assert digest(file)
 
 
+def test_a_scene_that_cannot_be_written_is_still_read(tmp_path, monkeypatch, caplog, capsys):
+    """From an archive or another user: what is finished is finished, and outputs may lie elsewhere."""
+    scene = builders.labelled_scene(tmp_path / "scene")
+    cli.main(["label", str(scene.path)])
+    before = atomic._is_writable
+    monkeypatch.setattr(
+        atomic, "_is_writable", lambda folder: scene.path not in (folder, *folder.parents) and before(folder)
+    )
+    cli.main(["label", str(scene.path)])
+    assert "up to date" in caplog.text
+    cli.main(["propagate", str(scene.path), "--method", "knn", "--output", str(tmp_path / "labelled.ply")])
+    assert (tmp_path / "labelled.ply").is_file()
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["propagate", str(scene.path)])
+    assert stopped.value.code == 2 and "cannot write to" in capsys.readouterr().err
+
+
 def test_closed_streams_lead_to_nowhere(tmp_path):
     """Else the next file that is opened gets the number of standard output, and what libraries print."""
     command = f"{sys.executable} -c 'from sc3d.cli import main; main()'"
