@@ -19,6 +19,7 @@ from sc3d.geometry.neighbors import orient_normals
 from sc3d.geometry.raycast import FirstSurface, Surface, first_surface
 from sc3d.geometry.tsdf import DepthFusion, Part, cloud_in_order, drop_small_parts, near_mesh, pixel_squares
 from sc3d.io.atomic import require_room, temporary_name
+from sc3d.settings.common import DepthMode
 from sc3d.settings.reconstruction import Extract
 from sc3d.splatting.consistency import blocking, consistent, pixel_rays
 from sc3d.splatting.evaluation import facing_depth
@@ -76,7 +77,7 @@ def extract_surface(gaussians: Gaussians, data: DepthViews, settings: Extract) -
     require_room(Path(tempfile.gettempdir()) / "depth", size)
     with tempfile.TemporaryDirectory(prefix=temporary_name("sc3d-depth")) as folder:
         maps = _DepthMaps(Path(folder), data)
-        footprint = maps.render(gaussians)
+        footprint = maps.render(gaussians, settings.depth_mode)
         voxel_size = settings.voxel_size or _default_voxel_size(gaussians.means.detach().numpy(), footprint)
         fusion, confirmed = _fused(data, lambda row: maps.confirmed(row, settings.min_views), voxel_size)
         if not confirmed:
@@ -283,11 +284,12 @@ class _DepthMaps:
     def __init__(self, folder: Path, data: DepthViews) -> None:
         self.folder, self.data = folder, data
 
-    def render(self, gaussians: Gaussians) -> float:
+    def render(self, gaussians: Gaussians, mode: DepthMode) -> float:
         """Write all maps; returns the median size of a pixel on the surface, world units."""
         footprints, empty = [], list[str]()
         for row, view in enumerate(tqdm(self.data.views, desc="depth", unit="view", disable=None)):
-            depth, (nearest, farthest) = facing_depth(gaussians, view, MAX_ANGLE), self.data.depth_range
+            depth = facing_depth(gaussians, view, MAX_ANGLE, mode)
+            nearest, farthest = self.data.depth_range
             depth[(depth <= nearest) | (depth >= farthest)] = 0
             opaque = self.data.opaque(row)
             if opaque is not None:

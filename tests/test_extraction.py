@@ -66,6 +66,22 @@ def test_completion_covers_what_only_one_view_sees():
     assert np.abs(completed.cloud.point.positions.numpy()[:, 2]).max() < 0.1
 
 
+def test_median_depth_sees_through_a_veil():
+    """Faint discs 2 m above the middle of the ground: blended depth mixes the two, and no two views agree."""
+    ground, veil = flat_square(4.0, 0.5), flat_square(1.0, 2.5)
+    veil.opacity_logits[:] = -3.0
+    joined = {
+        name: torch.cat([values, veil.parameters()[name]]) for name, values in ground.parameters().items()
+    }
+    errors = {}
+    for mode in ("blended", "median"):
+        settings = Extract(voxel_size=0.15, coverage=0.0, depth_mode=mode)
+        points = extract_surface(Gaussians(**joined), data(), settings).cloud.point.positions.numpy()
+        errors[mode] = np.abs(points[np.abs(points[:, :2]).max(axis=1) < 3.5, 2] - 0.5)
+    assert errors["median"].max() < 0.05 and len(errors["median"]) > 1000
+    assert errors["blended"].max() > 0.2
+
+
 def test_nothing_to_see_is_said():
     with pytest.raises(Sc3dError, match="no view shows a surface"):
         extract_surface(flat_square(1.0, 50.0), data(), Extract())

@@ -24,6 +24,7 @@ from sc3d.georeferencing.georeference import (
     triple,
     write_georeference,
 )
+from sc3d.georeferencing.up_direction import tell_tilt
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import read_labelled, take_labels
@@ -122,6 +123,7 @@ def _warn(scene: Scene) -> None:
         "%s has no georeference: coordinates stay those of the scene, z is taken as up and 1 unit as 1 m",
         scene.path,
     )
+    tell_tilt(scene)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ import numpy as np
 
 LEVEL_SHARE = 0.9  # nearest share of the points that the ground plane is fitted to
 NUM_SUBSETS = 500  # at most, tried by the robust fit
-SAME_WAY = 30.0  # degrees: optical axes that differ by less, on average, belong to a flight that looks down
 
 
 @dataclass(frozen=True)
@@ -114,24 +113,3 @@ def roll_upright(normal: np.ndarray, axis: np.ndarray) -> np.ndarray:
     angle = np.arctan2(np.cross(flat, target) @ axis, flat @ target)
     cross = np.cross(np.eye(3), axis)
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
-def camera_up(rotations: np.ndarray) -> np.ndarray:
-    """(3,) up, in the world of cameras (N, 3, 3) cam_from_world, if people and gimbals hold them level.
-
-    Cameras that all look the same way look down; of others the sideways axes are horizontal.
-    """
-    across, down, along = rotations[:, 0], rotations[:, 1], rotations[:, 2]
-    mean = along.mean(axis=0)
-    if np.linalg.norm(mean) > np.cos(np.radians(SAME_WAY)):
-        return -mean / np.linalg.norm(mean)
-    up = np.linalg.svd(across, full_matrices=False)[2][2]
-    return up if (down + along).mean(axis=0) @ up < 0 else -up
-
-
-def upside_down(rotations: np.ndarray, fit: Similarity) -> bool:
-    """Whether a similarity puts cameras (N, 3, 3) cam_from_world on their heads: looking up, photos with the
-    ground on top.
-    """
-    up = fit.rotation[2]
-    return bool((rotations[:, 1:] @ up).sum() > 0)

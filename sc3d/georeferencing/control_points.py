@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 
 from sc3d.errors import InputError, examples
-from sc3d.georeferencing.alignment import Similarity, camera_up, upside_down
+from sc3d.georeferencing.alignment import Similarity
 from sc3d.georeferencing.control_fit import (
     EXCHANGED,
     MIN_POINTS,
@@ -25,7 +25,8 @@ from sc3d.georeferencing.control_fit import (
 from sc3d.georeferencing.gcp_list import is_title, parse_crs, parse_mark, read_lines
 from sc3d.georeferencing.georeference import crs_to_geodetic, geodetic_to_enu
 from sc3d.georeferencing.geotags import is_altitude
-from sc3d.io.colmap import cam_from_world, registered_images
+from sc3d.georeferencing.up_direction import find_up, model_poses, upside_down
+from sc3d.io.colmap import registered_images
 from sc3d.io.crs import split_crs
 from sc3d.scene.photo_names import PhotoNames
 
@@ -303,17 +304,19 @@ def align_to_control_points(
     points: ControlPoints,
     refine_focal: bool = True,
     accuracy: Accuracy | None = None,
+    images: Path | None = None,
 ) -> dict[str, object]:
     """Bring a model into ENU at `points.origin`: similarity, then, if the points are as good as the cameras,
     bundle adjustment with the points held fixed. Changes the model.
 
     accuracy: standard deviations of the points, m: horizontal, vertical; None = estimated
+    images: folder of the photos, for their orientation
     returns: figures: per point its residual east, north, up (m), reprojection error (px) and leave-one-out
         error (m); root mean squares; the same of those left out
     errors: InputError, before anything is changed, if the points do not fit
     """
     points = drop_wrong_marks(model, points)
-    found = match_control_points(model, points, accuracy)
+    found = match_control_points(model, points, accuracy, images)
     fit, rows = found.fit, found.rows
     transform(model, fit.similarity)
     if fit.exact:
@@ -371,7 +374,10 @@ class Matched:
 
 
 def match_control_points(
-    model: pycolmap.Reconstruction, points: ControlPoints, accuracy: Accuracy | None = None
+    model: pycolmap.Reconstruction,
+    points: ControlPoints,
+    accuracy: Accuracy | None = None,
+    images: Path | None = None,
 ) -> Matched:
     """Fit control points to a model, which stays as it is, and say in one line how well they do. InputError if
     they do not.
@@ -382,25 +388,27 @@ def match_control_points(
         raise InputError(
             f"{len(rows)} ground control points are seen by two or more registered photos: at least {MIN_POINTS} are needed"
         )
-    rotations = np.array([cam_from_world(image)[:3, :3] for image in registered_images(model)])
-    heights = points.geodetic[rows, 2]
+    poses, heights = model_poses(model, images), points.geodetic[rows, 2]
+    up = find_up(poses, np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3))
     fit = fit_control_points(
         Correspondences(
             source,
             target[rows],
-            camera_up(rotations),
+            up.up,
             MAX_ERROR * _distance(model, source, target[rows]),
             accuracy,
             np.where(points.measured[rows], heights, np.nan),
         ),
         [points.names[row] for row in rows],
     )
-    if upside_down(rotations, fit.similarity):
+    if upside_down(poses, fit.similarity.rotation[2]):
         raise InputError(
             f"the ground control points would turn the cameras upside down: {EXCHANGED}"
             if fits_exchanged(fit.points)
             else "the ground control points would turn the cameras upside down: check the order x y (east, north)"
         )
+    if fit.upright:
+        up.tell()
     _tell(fit, [points.names[row] for row in rows], heights)
     return Matched(fit, rows)
 

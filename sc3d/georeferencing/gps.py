@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,9 +16,7 @@ from sc3d.georeferencing.alignment import (
     fit_similarity,
     fit_similarity_robust,
     flight_shape,
-    main_plane,
     roll_upright,
-    upside_down,
 )
 from sc3d.georeferencing.georeference import (
     Georeference,
@@ -35,6 +34,7 @@ from sc3d.georeferencing.geotags import (
     enu_positions,
     read_geotags,
 )
+from sc3d.georeferencing.up_direction import settle_up, upside_down, view_poses
 from sc3d.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -245,12 +245,12 @@ def _share_exchanged(flight: Flight, names: list[str], source: np.ndarray) -> fl
     return float(fit_similarity_robust(source, target, _tolerance(flight, names))[1].mean())
 
 
-def place(flight: Flight, centers: dict[str, np.ndarray], points: np.ndarray) -> Similarity | None:
+def place(flight: Flight, centers: dict[str, np.ndarray], up: Callable[[], np.ndarray]) -> Similarity | None:
     """Similarity from a model's frame to the flight's ENU; of a flight that has been through `agree` all
     positions count.
 
-    centers: camera center (3,) by photo name, photos without GPS included; points: (P, 3) of the model, for
-        the level of a flight along a line
+    centers: camera center (3,) by photo name, photos without GPS included; up: finds (3,) up in the model's
+        frame, which is asked for a flight along a line
     returns: None if fewer than three cameras have GPS
     """
     names = [name for name in flight.tags if name in centers]
@@ -261,15 +261,13 @@ def place(flight: Flight, centers: dict[str, np.ndarray], points: np.ndarray) ->
         np.array([flight.positions[name] for name in names]),
     )
     fit = fit_similarity(source, target)
-    return _rolled(fit, target, points) if flight.shape == "line" else fit
+    return _rolled(fit, target, up()) if flight.shape == "line" else fit
 
 
-def _rolled(fit: Similarity, positions: np.ndarray, points: np.ndarray) -> Similarity:
-    """Turn about the flight line until the points' main plane is level, cameras above it."""
-    axes, middle = main_plane(fit.apply(points))
+def _rolled(fit: Similarity, positions: np.ndarray, up: np.ndarray) -> Similarity:
+    """Turn about the flight line until `up` (3,) of the model is as far up as that takes it."""
     line = np.linalg.svd(positions - positions.mean(axis=0), full_matrices=False)[2][0]
-    normal = axes[2] if axes[2] @ (positions.mean(axis=0) - middle) > 0 else -axes[2]
-    turn, pivot = roll_upright(normal, line), positions.mean(axis=0)
+    turn, pivot = roll_upright(fit.rotation @ up, line), positions.mean(axis=0)
     return Similarity(fit.scale, turn @ fit.rotation, turn @ (fit.translation - pivot) + pivot)
 
 
@@ -303,10 +301,14 @@ def georeference_photos(scene: Scene, epsg: int | None) -> Georeference:
         )
     flight = read_flight(scene.images, [view.name for view in views])
     centers = {view.name: view.center for view in views}
-    found = find_georeference(flight, centers, scene.model.points, epsg) if flight else None
-    rotations = np.array([view.cam_from_world[:3, :3] for view in views])
+    poses = view_poses(views, scene.images)
+    found = (
+        find_georeference(flight, centers, lambda: settle_up(poses, scene.model.points).up, epsg)
+        if flight
+        else None
+    )
     turn = np.array(found.local_from_world)[:3, :3] if found else np.eye(3)
-    if found is not None and upside_down(rotations, Similarity(1.0, turn, np.zeros(3))):
+    if found is not None and upside_down(poses, turn[2]):
         raise InputError(
             f"the GPS of the photos in {scene.images} would turn the cameras upside down, as where latitude and longitude are exchanged or of the wrong sign: correct it, or pass --epsg and --offset"
         )
@@ -318,18 +320,18 @@ def georeference_photos(scene: Scene, epsg: int | None) -> Georeference:
 
 
 def find_georeference(
-    flight: Flight, centers: dict[str, np.ndarray], points: np.ndarray, epsg: int | None
+    flight: Flight, centers: dict[str, np.ndarray], up: Callable[[], np.ndarray], epsg: int | None
 ) -> Georeference | None:
     """Georeference of a model whose photos have GPS, whatever frame it is in; the model stays as it is.
 
     A model in local ENU (as `reconstruct` makes it) or in a CRS is recognized; any other gets a similarity in
-    front. None if GPS and cameras do not fit.
+    front. None if GPS and cameras do not fit. up: as in `place`
     """
     crs = _in_crs(flight, centers, epsg)
     if crs is not None:
         return crs
     agreed = agree(flight, centers)
-    fit = place(agreed, centers, points) if agreed else None
+    fit = place(agreed, centers, up) if agreed else None
     if agreed is None or fit is None:
         return None
     flight = agreed

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sc3d.georeferencing.alignment import Similarity, main_plane, upside_down
+from sc3d.georeferencing.alignment import Similarity, main_plane
 from sc3d.georeferencing.control_fit import Accuracy
 from sc3d.georeferencing.control_points import (
     ControlPoints,
@@ -21,7 +21,8 @@ from sc3d.georeferencing.control_points import (
 from sc3d.georeferencing.focal import anchor_focal, tells_focal
 from sc3d.georeferencing.georeference import Georeference, from_origin
 from sc3d.georeferencing.gps import Flight, agree, place, residuals
-from sc3d.io.colmap import cam_from_world, registered_images
+from sc3d.georeferencing.up_direction import model_poses, settle_up, upside_down
+from sc3d.io.colmap import registered_images
 from sc3d.settings.reconstruction import Reconstruct
 
 logger = logging.getLogger(__name__)
@@ -55,22 +56,30 @@ def place_model(
     flight = agree(flight, _centers(model)) if flight else None
     free = settings.focal == "refine" or (settings.focal == "auto" and tells_focal(model))
     focal = {} if free else anchor_focal(model, images, flight)
-    georeference = _georeference(model, flight, control_points, settings)
-    return Placed(_summary(model, georeference) | focal | _heights(model, flight, georeference), georeference)
+    georeference = _georeference(model, images, flight, control_points, settings)
+    level = make_level(model, images) if georeference is None else {}
+    return Placed(
+        _summary(model, georeference) | level | focal | _heights(model, flight, georeference), georeference
+    )
 
 
 def _georeference(
     model: pycolmap.Reconstruction,
+    images: Path,
     flight: Flight | None,
     control_points: ControlPoints | None,
     settings: Reconstruct,
 ) -> Georeference | None:
-    """Bring a model into local ENU, from control points or else from GPS, or make it level at least; returns
-    what is then known of its place.
+    """Bring a model into local ENU, from control points or else from GPS; returns what is then known of its
+    place, None where neither says.
     """
     if control_points is not None:
         figures = align_to_control_points(
-            model, control_points, refine_focal=tells_focal(model), accuracy=settings.gcp_accuracy
+            model,
+            control_points,
+            refine_focal=tells_focal(model),
+            accuracy=settings.gcp_accuracy,
+            images=images,
         )
         return from_origin(
             control_points.origin,
@@ -78,14 +87,16 @@ def _georeference(
             settings.altitude_offset,
             {"control_points": figures},
         )
-    fit = place(flight, _centers(model), _points(model)) if flight else None
-    if fit is not None and upside_down(_rotations(model), fit):
+    if flight is None:
+        return None
+    poses = model_poses(model, images)
+    fit = place(flight, _centers(model), lambda: settle_up(poses, _points(model)).up)
+    if fit is not None and upside_down(poses, fit.rotation[2]):
         logger.warning(
             "the GPS would turn the cameras upside down, as where latitude and longitude are exchanged: it is not used"
         )
         fit = None
-    if flight is None or fit is None:
-        make_level(model)
+    if fit is None:
         return None
     moved = dict(zip(_centers(model), fit.apply(np.array(list(_centers(model).values())))))
     if (
@@ -103,14 +114,15 @@ def georeference_control_points(
     points: ControlPoints,
     epsg: int | None,
     accuracy: Accuracy | None = None,
+    images: Path | None = None,
 ) -> Georeference:
     """Georeference of a model by control points, with a similarity in front; `model` is moved, what lies in its
     frame elsewhere stays. InputError if they do not fit.
 
-    epsg: None = the CRS of the points, or the UTM zone
+    epsg: None = the CRS of the points, or the UTM zone; images: folder of the photos, for their orientation
     """
     points = drop_wrong_marks(model, points)
-    found = match_control_points(model, points, accuracy)
+    found = match_control_points(model, points, accuracy, images)
     transform(model, found.fit.similarity)
     figures = {"control_points": found.figures(model, points)}
     placed = from_origin(points.origin, epsg or points.epsg, figures=figures)
@@ -127,17 +139,21 @@ def _points(model: pycolmap.Reconstruction) -> np.ndarray:
     return np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
 
 
-def _rotations(model: pycolmap.Reconstruction) -> np.ndarray:
-    """(N, 3, 3) cam_from_world of the registered photos."""
-    return np.array([cam_from_world(image)[:3, :3] for image in registered_images(model)])
+def make_level(model: pycolmap.Reconstruction, images: Path) -> dict[str, object]:
+    """Without GPS: z up as the cameras have it, x along the longer side of the points, unit unknown. Changes
+    the model; returns figures on how sure that is.
 
-
-def make_level(model: pycolmap.Reconstruction) -> None:
-    """Without GPS: z up = normal of the main plane of the sparse points, towards the cameras; unit = unknown."""
-    axes, middle = main_plane(_points(model))
-    if axes[2] @ (np.mean(list(_centers(model).values()), axis=0) - middle) < 0:
-        axes = axes * [[1], [-1], [-1]]
-    transform(model, Similarity(1.0, axes, -axes @ middle))
+    images: folder of the photos
+    """
+    points = _points(model)
+    found = settle_up(model_poses(model, images), points)
+    axes, middle = main_plane(points)
+    along = axes[0] if abs(axes[0] @ found.up) < 0.9 else axes[1]
+    x = along - (along @ found.up) * found.up
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(found.up, x), found.up])
+    transform(model, Similarity(1.0, rotation, -rotation @ middle))
+    return found.figures
 
 
 def _summary(model: pycolmap.Reconstruction, georeference: Georeference | None) -> dict[str, object]:

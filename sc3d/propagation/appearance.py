@@ -224,7 +224,7 @@ def learn_appearance(graph: Graph, known: LabelledPoints) -> LearnedAppearance |
 
     known: in the order of the graph
     """
-    model = AppearanceModel.from_features(relief_features(graph, known.points), known.colors)
+    model = AppearanceModel.from_features(relief_features(graph, known.points, known.up), known.colors)
     start, examples = known.seed_labels, known.agreed
     folds = folds_of(known.points, known.points.min(axis=0), known.points.max(axis=0))
     halves = [model.statistics(start, examples & (folds == fold), known.num_classes) for fold in (0, 1)]

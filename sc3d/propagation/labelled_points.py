@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,19 +19,18 @@ class LabelledPoints:
 
     points: (N, 3) world; seeds: labels of fusion, which are channels (`sc3d.scene.channels`); votes: (N, C + 1)
         float32 or None, column 0 is ignored; colors: (N, 3) uint8 or None
+    up: (3,) of the cameras, None = not known
     """
 
     points: np.ndarray
     seeds: Labels
     votes: np.ndarray | None
     colors: np.ndarray | None
+    up: np.ndarray | None = None
 
     def ordered(self, order: np.ndarray) -> LabelledPoints:
-        return LabelledPoints(
-            self.points[order],
-            self.seeds[order],
-            *(None if part is None else part[order] for part in (self.votes, self.colors)),
-        )
+        votes, colors = (None if part is None else part[order] for part in (self.votes, self.colors))
+        return replace(self, points=self.points[order], seeds=self.seeds[order], votes=votes, colors=colors)
 
     @property
     def known_votes(self) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.geometry.graph import Graph, build_graph
+from sc3d.georeferencing.up_direction import scene_up
 from sc3d.io.clouds import write_geometry
 from sc3d.propagation.appearance import learn_appearance, plausible, uses_appearance
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
@@ -122,7 +123,7 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     channels = Channels.of_classes(np.unique(seeds.label).tolist()) if votes is None else votes.channels
     seeds = replace(seeds, label=channels.from_ids(seeds.label, path))
     values, positions = None if votes is None else votes.values, cloud.point.positions.numpy()
-    points = LabelledPoints(positions.astype(np.float64), seeds, values, colors)
+    points = LabelledPoints(positions.astype(np.float64), seeds, values, colors, scene_up(scene))
     normals = cloud.point.normals.numpy()
     labels = propagate(points, normals, settings)
     labels = replace(labels, label=channels.to_ids(labels.label))

@@ -15,6 +15,7 @@ from sc3d.propagation.quantile_sketch import QuantileSketch
 CELL = 4.0  # cell of the ground raster, point spacings
 WINDOWS = (9, 33)  # the ground is the lowest point within windows of this many cells
 MAX_CELLS = 4096  # per side of the raster
+GROUND_LEAN = 30.0  # degrees: a main direction of normals farther from the cameras' up is that of a wall
 NUM_FEATURES = 2 + len(WINDOWS)
 
 
@@ -45,8 +46,8 @@ class NormalStatistics:
 
 @dataclass(frozen=True)
 class GroundModel:
-    """A frame in which up is the main direction of the normals, so that no gravity has to be known, and a
-    raster over it.
+    """A frame and a raster over it. Up is the main direction of the normals if that is near the cameras' up,
+    as it is over ground of any slope; else, as before a facade, the cameras' up itself.
 
     low: (3,) world corner of the cloud; up: (3,); axes: (3, 2); corner: (2,) of the raster, in the frame;
         cell, spacing: world units; shape: of the raster
@@ -61,14 +62,21 @@ class GroundModel:
     shape: tuple[int, int]
 
     @classmethod
-    def from_statistics(cls, lean: NormalStatistics, low: np.ndarray, high: np.ndarray) -> GroundModel:
-        """low, high: (3,) corners of the whole cloud, world."""
+    def from_statistics(
+        cls, lean: NormalStatistics, low: np.ndarray, high: np.ndarray, camera_up: np.ndarray | None = None
+    ) -> GroundModel:
+        """low, high: (3,) corners of the whole cloud, world; camera_up: (3,) unit, None = not known: then the
+        main direction of the normals is taken
+        """
         axes = np.linalg.eigh(lean.products.astype(np.float64))[1][:, ::-1]
         up = axes[:, 0]
         leaning = lean.sums @ up
         up = up * np.sign(
             leaning if abs(leaning) > 1e-9 * lean.spacings.counts.sum() * 1024 else up[np.abs(up).argmax()]
         )
+        if camera_up is not None and abs(up @ camera_up) < np.cos(np.radians(GROUND_LEAN)):
+            up = camera_up
+            axes = np.linalg.svd(up[None])[2].T
         corners = (
             np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) @ axes[:, 1:]
         )
@@ -128,9 +136,14 @@ class GroundModel:
         return features
 
 
-def relief_features(graph: Graph, points: np.ndarray) -> np.ndarray:
-    """(N, 4) float32 features of a whole cloud; points: (N, 3) world, in the order of the graph."""
+def relief_features(graph: Graph, points: np.ndarray, camera_up: np.ndarray | None = None) -> np.ndarray:
+    """(N, 4) float32 features of a whole cloud; points: (N, 3) world, in the order of the graph; camera_up:
+    (3,), None = not known
+    """
     terrain = GroundModel.from_statistics(
-        NormalStatistics.from_normals(graph.normals, graph.spacings), points.min(axis=0), points.max(axis=0)
+        NormalStatistics.from_normals(graph.normals, graph.spacings),
+        points.min(axis=0),
+        points.max(axis=0),
+        camera_up,
     )
     return terrain.features(graph, points, terrain.grounds([terrain.lowest(points)]))

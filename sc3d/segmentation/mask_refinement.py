@@ -14,6 +14,7 @@ from tqdm import tqdm
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex
+from sc3d.georeferencing.up_direction import scene_up
 from sc3d.io.atomic import atomic_path, discard
 from sc3d.io.images import read_orientation, write_image
 from sc3d.labelling.cloud import Cloud
@@ -40,7 +41,7 @@ ReadMask = Callable[[View], Mask]
 class RefinementInputs:
     """A cloud with its surface, and the settings by which masks become labels.
 
-    colors: (N, 3) uint8 or None; seen: the surface, whatever labels it has; num_channels: classes + 1, as labels and masks here are channels
+    colors: (N, 3) uint8 or None; up: (3,) of the cameras, None = not known; seen: the surface, whatever labels it has; num_channels: classes + 1, as labels and masks here are channels
     """
 
     cloud: Cloud
@@ -49,12 +50,13 @@ class RefinementInputs:
     num_channels: int
     label: Label
     propagate: Propagate = Propagate()
+    up: np.ndarray | None = None
 
     def labels(self, views: list[View], read: ReadMask) -> Labels:
         """Labels of all points from the masks of some views."""
         fusion = fuse(self.cloud, views, read, self.seen.surface, self.num_channels, self.label)
         return propagate(
-            LabelledPoints(self.cloud.points, fusion.labels, fusion.votes, self.colors),
+            LabelledPoints(self.cloud.points, fusion.labels, fusion.votes, self.colors, self.up),
             self.cloud.normals,
             self.propagate,
         )
@@ -87,6 +89,7 @@ def load_refinement_inputs(scene: Scene, masks: Masks) -> RefinementInputs:
         seen,
         masks.channels.count,
         Label(voxel_size=default_voxel_size(points, masks)),
+        up=scene_up(scene),
     )
 
 

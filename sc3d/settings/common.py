@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
+
+DepthMode = Literal["blended", "median"]
+"""what Gaussians along a pixel's ray say of its depth: that of their planes' alpha-blended one, or where half
+of the light is gone
+"""
 
 
 @dataclass(frozen=True)

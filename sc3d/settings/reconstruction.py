@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, Suppress, arg
 
 from sc3d.errors import InputError
-from sc3d.settings.common import Workers
+from sc3d.settings.common import DepthMode, Workers
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,10 @@ class Extract:
     """Fuse depth into a truncated signed distance field: that which the Gaussians render, or that of `sc3d
     depth`, which needs no training and adds nothing that one photo alone says. Or take the Gaussians' centers
     as the cloud.
+    """
+    depth_mode: DepthMode = "blended"
+    """Depth that the Gaussians render: of the alpha-blended planes, or where half of the light is gone
+    (median): it does not mix surfaces that lie behind one another; any trained model will do (tsdf).
     """
     max_size: int = 800
     """Longest side of the depth maps, px."""

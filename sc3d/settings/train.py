@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Literal
 
 from sc3d.errors import InputError
-from sc3d.settings.common import Workers
+from sc3d.settings.common import DepthMode, Workers
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,10 @@ class TrainSettings:
     """weight of the patch similarity (NCC) between neighboring views"""
     surface_from: float = 0.25
     """when normal and multi-view terms begin, fraction of the run"""
+    depth_mode: DepthMode = "blended"
+    """depth that the normal and multi-view terms look at: of the alpha-blended planes, or where half of the
+    light is gone (median), which takes more time
+    """
     num_neighbors: int = 8
     """neighboring views to choose from"""
     num_patches: int = 8192

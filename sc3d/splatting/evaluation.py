@@ -9,12 +9,13 @@ import numpy as np
 import torch
 
 from sc3d.geometry.cameras import View
+from sc3d.settings.common import DepthMode
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses
 from sc3d.splatting.consistency import pixel_rays
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.gaussians import Gaussians
-from sc3d.splatting.rendering import render, unbiased_depth
+from sc3d.splatting.rendering import render, surface_depth
 
 
 @dataclass(frozen=True)
@@ -97,22 +98,24 @@ def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSet
 
 
 @torch.no_grad()
-def depth_map(gaussians: Gaussians, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def depth_map(
+    gaussians: Gaussians, view: View, mode: DepthMode = "blended"
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The surface a view sees.
 
     returns: (H, W) float32 depth z, world units, 0 where alpha < 0.5; (H, W) alpha; (H, W, 3) unit normals,
         camera frame, towards the camera, 0 where there is no depth
     """
-    rendering = render(gaussians, view)
-    depth = unbiased_depth(rendering, view)
+    rendering = render(gaussians, view, depth_mode=mode)
+    depth = surface_depth(rendering, view)
     present = (rendering.alpha >= 0.5) & torch.isfinite(depth) & (depth > 0)
     normals = torch.nn.functional.normalize(rendering.normal, dim=2) * present[..., None]
     return torch.where(present, depth, 0).cpu().numpy(), rendering.alpha.cpu().numpy(), normals.cpu().numpy()
 
 
-def facing_depth(gaussians: Gaussians, view: View, max_angle: float) -> np.ndarray:
+def facing_depth(gaussians: Gaussians, view: View, max_angle: float, mode: DepthMode) -> np.ndarray:
     """(H, W) float32 depth of `depth_map`, 0 where ray and normal are more than `max_angle` degrees apart."""
-    depth, _, normals_cam = depth_map(gaussians, view)
+    depth, _, normals_cam = depth_map(gaussians, view, mode)
     rays_cam = torch.nn.functional.normalize(pixel_rays(view), dim=2).numpy()
     facing = -(normals_cam * rays_cam).sum(axis=2) > np.cos(np.deg2rad(max_angle))
     return np.where(facing, depth, 0).astype(np.float32)

@@ -41,6 +41,8 @@ class Rendering:
     plane_distance: (H, W) sum w d, d = |n . mean_cam|, world units
     radii: (N,) float32 three-sigma radius, px; 0 = cannot touch the image; no gradient
     statistics: per-Gaussian sums; the gradients in it are filled by backward()
+    median_depth: (H, W) depth z at which the transmittance falls to 1/2 (`cpu.median_depth`), world units,
+        0 = it never does; None if it was not asked for
     """
 
     color: Tensor
@@ -49,3 +51,4 @@ class Rendering:
     plane_distance: Tensor
     radii: Tensor
     statistics: ViewStatistics
+    median_depth: Tensor | None = None

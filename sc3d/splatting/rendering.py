@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from sc3d.geometry.cameras import View
+from sc3d.settings.common import DepthMode
 from sc3d.splatting import device
 from sc3d.splatting.consistency import pinhole, ray_slopes
 from sc3d.splatting.cpu.backend import render_cpu
@@ -22,6 +23,7 @@ def render(
     sh_degree: int | None = None,
     background: Tensor | None = None,
     geometry: bool = True,
+    depth_mode: DepthMode = "blended",
 ) -> Rendering:
     """Render Gaussians, differentiable in all their tensors (eq. 1-3; rules in `cpu.projection` and
     `cpu.rasterization`).
@@ -33,6 +35,7 @@ def render(
     sh_degree: highest active degree, None = all that are stored; colors are clamped at 0 from below
     background: (3,) color seen through what is left of the transmittance, None = black; gets no gradient
     geometry: False leaves `normal` and `plane_distance` zero, which saves a few percent of the time
+    depth_mode: what `surface_depth` will ask for; median costs time of its own and needs geometry
     raises ValueError for a view with distortion or parameters that are not float32, MissingPackageError on a
     GPU without gsplat
     """
@@ -41,9 +44,16 @@ def render(
     if any(tensor.dtype != torch.float32 for tensor in gaussians.parameters().values()):
         raise ValueError("Gaussians must be float32 to be rendered")
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
-    if device.has_kernels(gaussians.means):
-        return render_cpu(gaussians, view, degree, background, geometry)
-    return render_gpu(gaussians, view, degree, background, geometry)
+    backend, median = (
+        render_cpu if device.has_kernels(gaussians.means) else render_gpu,
+        depth_mode == "median",
+    )
+    return backend(gaussians, view, degree, background, geometry, geometry and median)
+
+
+def surface_depth(rendering: Rendering, view: View) -> Tensor:
+    """(H, W) depth z of the mode that the view was rendered with, world units, 0 = none; differentiable."""
+    return unbiased_depth(rendering, view) if rendering.median_depth is None else rendering.median_depth
 
 
 def unbiased_depth(rendering: Rendering, view: View) -> Tensor:

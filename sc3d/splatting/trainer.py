@@ -23,7 +23,7 @@ from sc3d.splatting.evaluation import depth_map, held_out_scores, psnr
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.initialization import initial_gaussians
 from sc3d.splatting.rendered_view import Rendering
-from sc3d.splatting.rendering import render, unbiased_depth
+from sc3d.splatting.rendering import render, surface_depth
 from sc3d.splatting.strategy import DensifyLimits, Statistics
 
 log = logging.getLogger(__name__)
@@ -135,7 +135,7 @@ class Trainer:
         # A different color behind the surface each time: holes never pay off.
         background = torch.rand(3, generator=self.generator) if settings.random_background else None
         degree = settings.active_sh_degree(iteration)
-        rendering = render(gaussians, view, degree, background, shapes_surface)
+        rendering = render(gaussians, view, degree, background, shapes_surface, settings.depth_mode)
         image = rendering.color
         if settings.exposure:
             exposure = torch.nn.functional.embedding(torch.tensor(index), self.exposures, sparse=True)
@@ -147,7 +147,7 @@ class Trainer:
             flatness = losses.flatten_loss(gaussians.log_scales, rendering.radii > 0, self.extent)
             loss = loss + settings.flatten_weight * flatness
         if shapes_surface:
-            depth = unbiased_depth(rendering, view)
+            depth = surface_depth(rendering, view)
             depth = depth if mask is None else torch.where(mask, depth, 0)
             loss = loss + self._surface_terms(index, target, rendering, depth)
         loss.backward()
@@ -229,7 +229,7 @@ class Trainer:
             other = others[int(torch.randint(len(others), (1,), generator=self.generator))]
             other_view, other_target, _ = self.data.photo(other, device=self.device)
             if other not in self.depths:
-                known = torch.from_numpy(depth_map(self.gaussians, other_view)[0])
+                known = torch.from_numpy(depth_map(self.gaussians, other_view, settings.depth_mode)[0])
                 self.depths[other] = known.to(self.device)
             neighbor = losses.Neighbor(other_view, losses.to_gray(other_target), self.depths[other])
             source, draw = (losses.to_gray(target), view), (settings.num_patches, self.generator)

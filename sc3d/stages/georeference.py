@@ -64,4 +64,4 @@ def run(scene: Scene, settings: GeoreferenceOptions) -> dict[str, object]:
 def _from_control_points(scene: Scene, file: Path, settings: GeoreferenceOptions) -> Georeference:
     model = load_model(scene.sparse)
     points = read_control_points(file, [image.name for image in registered_images(model)])
-    return georeference_control_points(model, points, settings.epsg, settings.gcp_accuracy)
+    return georeference_control_points(model, points, settings.epsg, settings.gcp_accuracy, scene.images)

@@ -11,6 +11,7 @@ import numpy as np
 
 from sc3d.errors import InputError, examples
 from sc3d.georeferencing.georeference import georeference_path, projected_crs, write_georeference
+from sc3d.georeferencing.up_direction import tell_tilt
 from sc3d.importers.clouds import CLOUDS, MESHES, UNREAD, is_mesh, read_geometry, to_open3d
 from sc3d.importers.frames import frame_of_scene, near_origin, place_geometries
 from sc3d.importers.model import write_project
@@ -99,6 +100,8 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
         georeference_path(scene).unlink(missing_ok=True)
     if georeference is not None and (project is not None or not georeference_path(scene).exists()):
         write_georeference(scene, georeference)
+    elif project is not None:
+        tell_tilt(scene)
     for geometry, _ in placed.values():
         write_geometry(scene.cloud if geometry.triangles is None else scene.mesh, to_open3d(geometry))
     figures |= {"epsg": georeference.epsg if georeference else None}

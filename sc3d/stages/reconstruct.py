@@ -142,7 +142,7 @@ def _keep(scene: Scene, error: InputError) -> str:
     if scene.sparse.exists():
         return f"{error}. The cameras that were there stay as they are"
     model = load_model(scene.mapped)
-    make_level(model)
+    make_level(model, scene.images)
     write_model(scene.sparse, model)
     return (
         f"{error}. The cameras are kept in {scene.sparse}, without scale and place: "

@@ -19,6 +19,7 @@ def outputs(scene: Scene, settings: Synthesize) -> list[Path]:
     return [
         scene.images,
         scene.path / "truth_depth",
+        *([scene.path / "truth_sky"] if settings.kind == "street" else []),
         scene.truth,
         scene.masks,
         scene.confidence,

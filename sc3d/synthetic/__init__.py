@@ -1,1 +1,1 @@
-"""A synthetic aerial site: known geometry, cameras and labels, photographed as by a drone."""
+"""A synthetic site or street: known geometry, cameras and labels, photographed as by a drone or on foot."""

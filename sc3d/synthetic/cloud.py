@@ -8,6 +8,7 @@ import open3d as o3d
 from sc3d.geometry.cameras import View, in_image, project
 from sc3d.synthetic.mesh import LEAF
 from sc3d.synthetic.shading import display
+from sc3d.synthetic.walk import EYE_HEIGHT, PAVEMENT
 from sc3d.synthetic.world import World
 
 LIFT = 0.002  # rays start this far off the surface, m
@@ -16,6 +17,7 @@ LIFT = 0.002  # rays start this far off the surface, m
 def truth_cloud(world: World, num_points: int, rng: np.random.Generator) -> o3d.t.geometry.PointCloud:
     """Area-uniform samples of every surface of the site that shows from some direction above the horizon.
 
+    Of a street also what shows to somebody who walks along it.
     returns: `num_points` points: positions float64 (world, m), normals float32 (outward), colors uint8, label
         uint8 (0 = cars, walls)
     """
@@ -44,7 +46,11 @@ def sample_surface(world: World, num_points: int, rng: np.random.Generator) -> t
         points = np.einsum("nc,ncd->nd", weights, corners[triangles])
         inside = np.abs(points[:, :2]).max(1) <= world.ground.extent / 2
         kept = np.flatnonzero(inside)
-        kept = kept[_seen_from_above(world, points[kept], triangles[kept])]
+        seen = _seen_from_above(world, points[kept], triangles[kept])
+        if world.street:
+            rest = np.flatnonzero(~seen)
+            seen[rest] = _seen_on_foot(world, points[kept[rest]], triangles[kept[rest]])
+        kept = kept[seen]
         found_points.append(points[kept])
         found_triangles.append(triangles[kept])
         missing -= len(kept)
@@ -96,4 +102,23 @@ def _seen_from_above(world: World, points: np.ndarray, triangles: np.ndarray) ->
             visible[rest] = ~world.hidden(
                 points[rest] + LIFT * direction, np.broadcast_to(direction, (len(rest), 3))
             )
+    return visible
+
+
+def _seen_on_foot(world: World, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(N,) bool: somebody on a pavement, in front of the point or a few steps aside, can see it."""
+    normals = world.normals(triangles)
+    leaf = world.ints[triangles, 0] == LEAF
+    visible = np.zeros(len(points), bool)
+    for aside in (-6.0, 0.0, 6.0):
+        for pavement in (-PAVEMENT, PAVEMENT):
+            eyes = np.column_stack(
+                [points[:, 0] + aside, np.full(len(points), pavement), np.zeros(len(points))]
+            )
+            eyes[:, 2] = world.ground.height(eyes[:, :2]) + EYE_HEIGHT
+            ways = eyes - points
+            facing = leaf | ((normals * ways).sum(1) > 0.02 * np.linalg.norm(ways, axis=1))
+            rest = np.flatnonzero(~visible & facing)
+            if len(rest):
+                visible[rest] = ~world.hidden(points[rest] + LIFT * ways[rest], ways[rest], far=0.99)
     return visible

@@ -1,4 +1,4 @@
-"""EXIF that a drone would write: focal length, time and GPS."""
+"""EXIF that a drone or a camera would write: focal length, time and, if it has it, GPS."""
 
 from __future__ import annotations
 
@@ -19,14 +19,22 @@ def geodetic(centers: np.ndarray) -> np.ndarray:
     return np.asarray(pycolmap.GPSTransform().enu_to_ellipsoid(np.asarray(centers, np.float64), *REFERENCE))
 
 
-def drone_exif(position: np.ndarray, number: int) -> Image.Exif:
-    """EXIF block of photo `number` taken at `position` (latitude, longitude in degrees, height in m)."""
+def photo_exif(number: int, position: np.ndarray | None) -> Image.Exif:
+    """EXIF block of photo `number` taken at `position` (latitude, longitude in degrees, height in m); None =
+    without GPS.
+    """
     exif = Image.Exif()
     exif[Base.Make], exif[Base.Model], exif[Base.Orientation] = "sc3d", "synthetic", 1
     detail = exif.get_ifd(IFD.Exif)
     detail[Base.FocalLengthIn35mmFilm] = FOCAL_35MM
     detail[Base.FocalLength] = IFDRational(880, 100)
     detail[Base.DateTimeOriginal] = f"2025:06:21 11:{number * 3 // 60 % 60:02d}:{number * 3 % 60:02d}"
+    if position is not None:
+        _add_gps(exif, position)
+    return exif
+
+
+def _add_gps(exif: Image.Exif, position: np.ndarray) -> None:
     gps = exif.get_ifd(IFD.GPSInfo)
     gps[GPS.GPSVersionID] = b"\x02\x03\x00\x00"
     gps[GPS.GPSLatitudeRef], gps[GPS.GPSLatitude] = (
@@ -41,7 +49,6 @@ def drone_exif(position: np.ndarray, number: int) -> Image.Exif:
         b"\x00" if position[2] >= 0 else b"\x01",
         IFDRational(round(abs(position[2]) * 1000), 1000),
     )
-    return exif
 
 
 def _sexagesimal(angle: float) -> tuple[IFDRational, IFDRational, IFDRational]:

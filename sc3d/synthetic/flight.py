@@ -16,21 +16,19 @@ def focal_length(width: int, height: int) -> float:
 
 
 def fly(settings: Synthesize) -> list[View]:
-    """True cameras, `settings.views` of them: names view_000.jpg ..., pinhole, world = site center, z up,
+    """True cameras, `settings.num_views` of them: names view_000.jpg ..., pinhole, world = site center, z up,
     meters.
     """
     rng = np.random.default_rng([settings.seed, 2])
-    num_nadir = settings.views if settings.views < 8 else round(0.6 * settings.views)
-    num_ring = settings.views - num_nadir
+    num_nadir = settings.num_views if settings.num_views < 8 else round(0.6 * settings.num_views)
+    num_ring = settings.num_views - num_nadir
     num_low = num_ring // 2 if num_ring >= 10 else 0
     poses = _nadir_poses(num_nadir, settings, rng)
+    poses += _ring_poses(num_ring - num_low, (0.40 * settings.side, 0.80 * settings.altitude, 0.0), 0.0, rng)
     poses += _ring_poses(
-        num_ring - num_low, (0.40 * settings.extent, 0.80 * settings.altitude, 0.0), 0.0, rng
+        num_low, (0.42 * settings.side, 0.58 * settings.altitude, 0.12 * settings.side), 0.5, rng
     )
-    poses += _ring_poses(
-        num_low, (0.42 * settings.extent, 0.58 * settings.altitude, 0.12 * settings.extent), 0.5, rng
-    )
-    digits = max(3, len(str(settings.views - 1)))
+    digits = max(3, len(str(settings.num_views - 1)))
     size = (settings.width, settings.height)
     focal = focal_length(*size)
     calibration = (focal, focal, size[0] / 2, size[1] / 2)
@@ -40,7 +38,7 @@ def fly(settings: Synthesize) -> list[View]:
 def _nadir_poses(num: int, settings: Synthesize, rng: np.random.Generator) -> list[np.ndarray]:
     """Lines flown to and fro, image top in flight direction, with the unsteadiness of a real drone."""
     num_lines = max(1, round(np.sqrt(num / 1.5)))
-    reach = 0.25 * settings.extent
+    reach = 0.25 * settings.side
     poses = []
     for line, members in enumerate(np.array_split(np.arange(num), num_lines)):
         x = np.linspace(-reach, reach, num_lines)[line] if num_lines > 1 else 0.0

@@ -21,12 +21,13 @@ from sc3d.io.images import write_image
 from sc3d.io.json_files import write_json
 from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.cloud import find_tracks, truth_cloud
-from sc3d.synthetic.exif import drone_exif, geodetic
+from sc3d.synthetic.exif import geodetic, photo_exif
 from sc3d.synthetic.flight import fly
 from sc3d.synthetic.masks import noisy_mask
 from sc3d.synthetic.mesh import OTHER
 from sc3d.synthetic.photos import Photo, photograph
 from sc3d.synthetic.shading import display
+from sc3d.synthetic.street import build_street
 from sc3d.synthetic.world import World, build_world
 
 logger = logging.getLogger(__name__)
@@ -39,8 +40,9 @@ CLASSES = [
     {"id": 4, "name": "grass", "color": [170, 220, 110], "prompts": ["grass", "lawn"], "asprs": 3},
 ]
 # fmt: on
-FOLDERS = ("images", "truth_depth", "truth", "masks", "confidence")
-NUM_SPARSE = 16_000  # candidates for sparse points; those seen by three views are kept
+FOLDERS = ("images", "truth_depth", "truth", "truth_sky", "masks", "confidence")
+# candidates for sparse points; those seen by three views are kept, of a street fewer of them
+NUM_SPARSE, NUM_SPARSE_STREET = 16_000, 50_000
 
 
 def synthesize(
@@ -49,7 +51,7 @@ def synthesize(
     """Write a complete scene folder.
 
     Writes images/, truth_depth/<stem>.npy (float32 z, m), truth/, masks/, confidence/, sparse/0, truth.ply,
-    truth_mesh.ply and classes.json.
+    truth_mesh.ply and classes.json; of a street also truth_sky/ (255 = sky).
     progress: called with the finished share (0..1) and what is being done; None = silent
     returns: summary: num_views, num_triangles, num_buildings, mask_accuracy (over pixels with truth != 0),
         num_sparse_points, seconds_per_view
@@ -57,7 +59,10 @@ def synthesize(
     report = progress or (lambda share, text: None)
     _clear(scene_path)
     report(0.0, "building the world")
-    world, views = build_world(settings), fly(settings)
+    if settings.kind == "street":
+        world, views = build_street(settings)
+    else:
+        world, views = build_world(settings), fly(settings)
     positions = geodetic(_measured_centers(views, settings))
     started, right, labelled = time.perf_counter(), 0, 0
     for number, view in enumerate(views):
@@ -68,9 +73,13 @@ def synthesize(
         )
         right += int(((mask == photo.label) & (photo.label != OTHER)).sum())
         labelled += int((photo.label != OTHER).sum())
-        _write_view(
-            scene_path, Path(view.name), photo, (mask, confidence), drone_exif(positions[number], number)
-        )
+        exif = photo_exif(number, positions[number] if settings.gps else None)
+        _write_view(scene_path, Path(view.name), photo, (mask, confidence), exif)
+        if world.street:
+            write_image(
+                scene_path / "truth_sky" / f"{Path(view.name).stem}.png",
+                np.where(photo.depth > 0, 0, 255).astype(np.uint8),
+            )
     seconds = (time.perf_counter() - started) / len(views)
     report(0.9, "sparse points")
     num_sparse = _write_sparse(scene_path / "sparse" / "0", world, views, settings)
@@ -134,7 +143,10 @@ def _mesh(world: World) -> o3d.t.geometry.TriangleMesh:
 def _write_sparse(path: Path, world: World, views: list[View], settings: Synthesize) -> int:
     """Write the true cameras and points with tracks as a COLMAP model; returns the number of points."""
     points, triangles, observations = find_tracks(
-        world, views, NUM_SPARSE, np.random.default_rng([settings.seed, 7])
+        world,
+        views,
+        NUM_SPARSE_STREET if world.street else NUM_SPARSE,
+        np.random.default_rng([settings.seed, 7]),
     )
     colors = display(world.light(points.astype(np.float32), triangles, np.full(len(points), 0.1, np.float32)))
     write_model(path, build_model(views, points, colors, observations))

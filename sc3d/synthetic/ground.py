@@ -126,6 +126,21 @@ def plan_ground(extent: float, rng: np.random.Generator, level_edges: bool = Fal
     return Ground(extent, rasters, half, lines, hills, level_edges=level_edges)
 
 
+def plan_street(extent: float, rng: np.random.Generator) -> Ground:
+    """Nearly level ground and a straight road along the x axis."""
+    x = np.arange(-3.0 * extent, 3.0 * extent, 0.25)
+    line = np.stack([x, np.zeros_like(x)], 1)
+    ticks = np.arange(-extent, extent + RASTER_STEP / 2, RASTER_STEP)
+    along, offset = np.meshgrid(ticks, ticks)
+    angles, wave_lengths = rng.uniform(0, 2 * np.pi, 4), np.array([90.0, 37.0, 11.0, 4.3])
+    # fmt: off
+    hills = np.stack([np.cos(angles) * 2 * np.pi / wave_lengths, np.sin(angles) * 2 * np.pi / wave_lengths,
+                      rng.uniform(0, 2 * np.pi, 4), [0.3, 0.12, 0.06, 0.03]], 1)
+    # fmt: on
+    rasters = np.stack([offset, along - x[0]]).astype(np.float32)
+    return Ground(extent, rasters, extent, [line], hills)
+
+
 def add_ground(builder: MeshBuilder, ground: Ground) -> None:
     """Mesh the ground: 0.75 m cells on the site, growing outwards to the horizon."""
     inner = np.arange(-0.55 * ground.extent, 0.55 * ground.extent + 0.01, 0.75)

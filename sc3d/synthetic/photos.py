@@ -62,7 +62,9 @@ def _render_rows(
         footprints = (np.where(hit, range_, 1.0) * 0.5 / view.focal / np.sqrt(np.maximum(slope, 0.1))).astype(
             np.float32
         )
-        light += 0.25 * world.light(_points(view.center, directions, range_, hit), triangles, footprints)
+        seen = world.light(_points(view.center, directions, range_, hit), triangles, footprints)
+        seen[~hit] = world.sky(directions[~hit])
+        light += 0.25 * seen
     return light.reshape(*shape, 3), depth.reshape(shape), label.reshape(shape)
 
 

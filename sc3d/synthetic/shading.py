@@ -5,7 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from sc3d.synthetic.mesh import BRICK, FLAT_ROOF, GLASS, GROUND, LEAF, OTHER, PLAIN, ROAD, TILES, WALL
+from sc3d.synthetic.close_up import facade_color
+from sc3d.synthetic.mesh import (
+    BRICK,
+    FLAT_ROOF,
+    GLASS,
+    GROUND,
+    LEAF,
+    OTHER,
+    PLAIN,
+    PLASTER,
+    ROAD,
+    TILES,
+    WALL,
+)
 from sc3d.synthetic.texture import (
     LAWN,
     flat_roof_color,
@@ -18,6 +31,7 @@ from sc3d.synthetic.texture import (
 )
 
 SUN = np.array([-0.48, -0.42, 0.77]) / np.linalg.norm([-0.48, -0.42, 0.77])  # direction to the sun, world
+SKY = np.array([0.55, 0.68, 0.85], np.float32)
 
 
 def display(light: np.ndarray, exposure: float = 1.0, noise: np.ndarray | float = 0.0) -> np.ndarray:
@@ -52,6 +66,9 @@ def albedo(
     tint = (np.float64(column[12]), np.float64(column[13]), np.float64(column[14]))
     if material == WALL:
         return wall_color(u, v, column[15], column[16], seed, tint, fp)
+    if material >= PLASTER:
+        seed += int(31 * (column[0] + column[1]) + 17 * column[2])  # each window and wall has its own
+        return facade_color(material, u, v, (column[15], column[16]), seed, tint, fp)
     seed += int(90 * (column[3] + 2.0 * column[4]))  # each face of a roof has tiles of its own
     if material == TILES:
         return tile_color(u, v, column[15], column[16], seed, tint, fp)
@@ -94,7 +111,7 @@ def shade(
     for n in prange(len(points)):
         t = triangles[n]
         if t < 0:
-            out[n, 0], out[n, 1], out[n, 2] = 0.55, 0.68, 0.85
+            out[n, 0], out[n, 1], out[n, 2] = SKY[0], SKY[1], SKY[2]
             continue
         r, g, b = albedo(points[n], floats[t], ints[t], max(footprints[n], 1e-3), half, rasters, rects)
         nx, ny, nz = floats[t, 9], floats[t, 10], floats[t, 11]

@@ -8,11 +8,12 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.settings.synthesize import Synthesize
+from sc3d.synthetic.close_up import add_grain, cloudy_sky
 from sc3d.synthetic.ground import Ground, add_ground, plan_ground
 from sc3d.synthetic.layout import build_fences, park_cars, place_buildings, plant
 from sc3d.synthetic.mesh import LEAF, MeshBuilder, face_normals
 from sc3d.synthetic.objects import Building, add_building
-from sc3d.synthetic.shading import SUN, shade, surface_labels
+from sc3d.synthetic.shading import SKY, SUN, shade, surface_labels
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,7 @@ class World:
 
     corners: (T, 3, 3) float32 triangles; floats: (T, 17) float32 and ints: (T, 3) int32 as
         `MeshBuilder.finish` returns them
+    street: along the x axis, seen from near: surfaces have grain, the sky has clouds
     """
 
     seed: int
@@ -30,6 +32,7 @@ class World:
     floats: np.ndarray
     ints: np.ndarray
     scene: o3d.t.geometry.RaycastingScene = field(repr=False)
+    street: bool = False
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """First hits of rays (N, 3): (N,) float32 range in units of the direction, inf = none; (N,) int64
@@ -67,18 +70,15 @@ class World:
         offset = 0.02 * SUN + 0.01 * self.floats[triangles, 9:12]
         lit = ~self.hidden(points + offset, np.broadcast_to(SUN, points.shape))
         ground = self.ground
-        return shade(
-            points,
-            triangles,
-            lit.view(np.uint8),
-            footprints,
-            self.floats,
-            self.ints,
-            ground.half,
-            ground.rasters,
-            ground.rects,
-            SUN,
-        )
+        plan = (ground.half, ground.rasters, ground.rects)
+        light = shade(points, triangles, lit.view(np.uint8), footprints, self.floats, self.ints, *plan, SUN)
+        if self.street:
+            add_grain(light, points, triangles, footprints, self.floats, self.ints, *plan)
+        return light
+
+    def sky(self, directions: np.ndarray) -> np.ndarray:
+        """(N, 3) float32 linear RGB of the sky in unit directions (N, 3)."""
+        return cloudy_sky(directions) if self.street else np.tile(SKY, (len(directions), 1))
 
     def normals(self, triangles: np.ndarray) -> np.ndarray:
         """(N, 3) outward unit normals of triangles (N,); leaves have two sides, theirs point out of the
@@ -92,11 +92,11 @@ class World:
 
 
 def build_world(settings: Synthesize, level_edges: bool = False) -> World:
-    """Build the site of `settings.seed` and `settings.extent`: ground, roads, buildings, plants, cars.
+    """Build the site of `settings.seed` and `settings.side`: ground, roads, buildings, plants, cars.
     level_edges: as in `Ground`.
     """
     streams = np.random.default_rng([settings.seed, 1]).spawn(6)
-    ground = plan_ground(settings.extent, streams[0], level_edges)
+    ground = plan_ground(settings.side, streams[0], level_edges)
     buildings = place_buildings(ground, streams[1])
     builder = MeshBuilder()
     add_ground(builder, ground)
@@ -105,13 +105,20 @@ def build_world(settings: Synthesize, level_edges: bool = False) -> World:
     plant(builder, ground, buildings, streams[3])
     park_cars(builder, ground, streams[4])
     build_fences(builder, ground, buildings, streams[5])
+    return finish_world(settings.seed, ground, buildings, builder)
+
+
+def finish_world(
+    seed: int, ground: Ground, buildings: list[Building], builder: MeshBuilder, street: bool = False
+) -> World:
+    """The world of all triangles of `builder`."""
     corners, floats, ints = builder.finish()
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
         o3d.core.Tensor(corners.reshape(-1, 3)),
         o3d.core.Tensor(np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)),
     )
-    return World(settings.seed, ground, buildings, corners, floats, ints, scene)
+    return World(seed, ground, buildings, corners, floats, ints, scene, street)
 
 
 def ray_tensor(origins: np.ndarray, directions: np.ndarray) -> o3d.core.Tensor:

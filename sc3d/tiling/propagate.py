@@ -19,6 +19,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sc3d.errors import InputError
+from sc3d.georeferencing.up_direction import scene_up
 from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.ply import read_header, write_records
 from sc3d.propagation.appearance import (
@@ -89,7 +90,7 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
     margin = HOPS * EDGE * sample_spacing(store, statistics)[0]
     results, shared = Results(folder.subfolder("results"), store), folder.subfolder("shared")
-    job = PropagateJob(settings, statistics.extent, store, results, margin, channels, shared)
+    job = PropagateJob(settings, statistics.extent, store, results, margin, channels, shared, scene_up(scene))
     with open_executor(settings) as executor:
         _solve(job, executor, cloud.path)
     summary = _write(output, cloud, job)
@@ -152,7 +153,8 @@ def _learn(
     job: PropagateJob, executor: Executor, lean: NormalStatistics, least: int
 ) -> AppearanceStatistics | None:
     """What the agreed points of all tiles teach, if that does well on points held out."""
-    tiles, terrain = job.store.tiles, GroundModel.from_statistics(lean, job.extent.low, job.extent.high)
+    tiles = job.store.tiles
+    terrain = GroundModel.from_statistics(lean, job.extent.low, job.extent.high, job.up)
     for window, ground in zip(
         WINDOWS,
         terrain.grounds(executor.run("ground", partial(_lowest_task, job, terrain), tiles)),

@@ -36,7 +36,7 @@ KNOWN = ("points", "votes", *(field.name for field in fields(Labels)), "colors")
 @dataclass(frozen=True)
 class PropagateJob:
     """What the task of a tile needs to know. margin: world units; channels: of the votes; shared:
-    folder for what all tiles read
+    folder for what all tiles read; up: (3,) of the cameras, None = not known
     """
 
     settings: Propagate
@@ -46,6 +46,7 @@ class PropagateJob:
     margin: float
     channels: Channels
     shared: Path
+    up: np.ndarray | None = None
 
     @property
     def colored(self) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sc3d.geometry.cameras import View
+from sc3d.geometry.cameras import View, rays
 from sc3d.splatting.gaussians import Gaussians
 
 _NEAR, _DILATION, _MARGIN = 0.01, 0.3, 1.3
@@ -26,18 +26,8 @@ def render_reference(
 
     Memory grows with H * W * N: use a few thousand pixels and a few hundred Gaussians.
     """
+    order, weights, normals, distances = _fragments(gaussians, view)
     dtype = gaussians.means.dtype
-    rotation = torch.tensor(view.cam_from_world[:3, :3], dtype=dtype)
-    means_cam = gaussians.means @ rotation.T + torch.tensor(view.cam_from_world[:3, 3], dtype=dtype)
-    order = torch.argsort(means_cam[:, 2].detach(), stable=True)
-    order = order[means_cam[order, 2].detach() >= _NEAR]
-    means_cam = means_cam[order]
-    axes = rotation @ rotation_matrices(gaussians.quats[order])
-    opacities = torch.sigmoid(gaussians.opacity_logits[order])
-    alphas = _alphas(means_cam, axes, gaussians.log_scales[order].exp(), opacities, view)
-    reached = torch.cumprod(torch.cat([torch.ones_like(alphas[:, :1]), 1 - alphas], dim=1), dim=1)[:, :-1]
-    weights = alphas * torch.where(reached >= _MIN_TRANSMITTANCE, reached, 0.0)
-    normals, distances = _planes(means_cam, axes, gaussians.log_scales[order])
     directions = gaussians.means[order] - torch.tensor(view.center, dtype=dtype)
     colors = (
         0.5 + torch.einsum("nk,nkc->nc", *_basis_and_coefficients(directions, gaussians.sh[order], sh_degree))
@@ -53,6 +43,57 @@ def render_reference(
         (weights @ normals).reshape(*size, 3),
         (weights @ distances).reshape(size),
     )
+
+
+def median_depth_reference(gaussians: Gaussians, view: View) -> tuple[Tensor, Tensor]:
+    """(H, W) median depth as in `render.Rendering`, 0 = none, by torch autograd; (H, W) bool: it has a derivative,
+    as it neither jumps nor has a kink within a 50th of a footprint.
+
+    Bisection finds which fragments lie before, within and behind the footprint; with them, the depth is the
+    solution of a linear equation.
+    """
+    _, weights, normals, distances = _fragments(gaussians, view)
+    focal = float(np.sqrt(view.matrix[0, 0] * view.matrix[1, 1]))
+    directions, along = rays(view)
+    rays_cam = directions @ view.cam_from_world[:3, :3].T / along[:, None]
+    inverse = -(torch.from_numpy(rays_cam).to(weights) @ normals.T) / distances
+
+    def passed(depth: Tensor) -> Tensor:
+        return focal * (inverse * depth[:, None] - 1) + 0.5
+
+    near, far = torch.full_like(weights[:, 0], 1e-3), torch.full_like(weights[:, 0], 1e6)
+    with torch.no_grad():
+        for _ in range(80):
+            middle = (near * far).sqrt()
+            enough = (weights * passed(middle).clamp(0, 1)).sum(1) >= 0.5
+            near, far = torch.where(enough, near, middle), torch.where(enough, middle, far)
+        place = passed(far)
+        behind, within = place <= 0, (place > 0) & (place < 1)
+        kinks = torch.where(weights > 0, torch.minimum(place.abs(), (1 - place).abs()), 1).amin(1)
+    before = (weights * ~(behind | within)).sum(1)
+    share, slope = (weights * within).sum(1), focal * (weights * inverse * within).sum(1)
+    found = (far < 1e5) & (share > 0)
+    depth = (0.5 - before + (focal - 0.5) * share) / torch.where(found, slope, 1.0)
+    size = (view.height, view.width)
+    smooth = found & (kinks > 0.02) & (share > 0.01)
+    return torch.where(found, depth, 0.0).reshape(size), smooth.reshape(size)
+
+
+def _fragments(gaussians: Gaussians, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(M,) Gaussians before the camera, near to far; (H * W, M) weights; their planes, (M, 3) and (M,)."""
+    dtype = gaussians.means.dtype
+    rotation = torch.tensor(view.cam_from_world[:3, :3], dtype=dtype)
+    means_cam = gaussians.means @ rotation.T + torch.tensor(view.cam_from_world[:3, 3], dtype=dtype)
+    order = torch.argsort(means_cam[:, 2].detach(), stable=True)
+    order = order[means_cam[order, 2].detach() >= _NEAR]
+    means_cam = means_cam[order]
+    axes = rotation @ rotation_matrices(gaussians.quats[order])
+    opacities = torch.sigmoid(gaussians.opacity_logits[order])
+    alphas = _alphas(means_cam, axes, gaussians.log_scales[order].exp(), opacities, view)
+    reached = torch.cumprod(torch.cat([torch.ones_like(alphas[:, :1]), 1 - alphas], dim=1), dim=1)[:, :-1]
+    weights = alphas * torch.where(reached >= _MIN_TRANSMITTANCE, reached, 0.0)
+    normals, distances = _planes(means_cam, axes, gaussians.log_scales[order])
+    return order, weights, normals, distances
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from PIL import Image
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, look_at
-from sc3d.georeferencing.alignment import Similarity, camera_up, fit_similarity
+from sc3d.georeferencing.alignment import Similarity, fit_similarity
 from sc3d.georeferencing.control_fit import fit_upright, fit_weighted
 from sc3d.georeferencing.control_points import (
     ControlPoints,
@@ -27,7 +27,8 @@ from sc3d.georeferencing.control_points import (
 )
 from sc3d.georeferencing.georeference import enu_to_geodetic, from_origin, geodetic_to_enu, read_georeference
 from sc3d.georeferencing.placement import georeference_control_points
-from sc3d.io.colmap import cam_from_world, load_model, registered_images, write_model
+from sc3d.georeferencing.up_direction import find_up, model_poses
+from sc3d.io.colmap import load_model, registered_images, write_model
 from sc3d.scene.scene import Scene
 from tests.georeferencing.test_georeference import build_model, fly, pinhole_view, pixels_of, site
 
@@ -127,8 +128,7 @@ class TestHandheldGps:
         model = moved_model(views)
         figures = align_to_control_points(model, control(SURVEYED + noise * self.NOISE, views, level=True))
         assert figures["up_from_cameras"] and "heights are all 0" in caplog.text
-        up = camera_up(np.array([cam_from_world(image)[:3, :3] for image in registered_images(model)]))
-        assert up[2] > 0.999
+        assert find_up(model_poses(model, None), site()).up[2] > 0.999
         # level cameras stay level, though the points lie on a slope
         assert np.ptp([image.projection_center()[2] for image in registered_images(model)]) < 3
         points = np.array([model.point3D(point_id).xyz for point_id in sorted(model.point3D_ids())])

@@ -16,7 +16,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import look_at
-from sc3d.georeferencing.alignment import Similarity, fit_similarity, upside_down
+from sc3d.georeferencing.alignment import Similarity, fit_similarity
 from sc3d.georeferencing.georeference import (
     crs_to_geodetic,
     enu_to_geodetic,
@@ -27,6 +27,7 @@ from sc3d.georeferencing.georeference import (
 )
 from sc3d.georeferencing.geotags import Geotag, read_geotag
 from sc3d.georeferencing.gps import Flight, agree, find_georeference, place, read_flight
+from sc3d.georeferencing.up_direction import Poses, upside_down
 from sc3d.synthetic.exif import drone_exif
 
 MELBOURNE = (-37.9042, 144.9886, 20.0)
@@ -66,6 +67,10 @@ def write_flight(
         )
 
 
+def no_up() -> np.ndarray:
+    raise AssertionError("an area says itself where up is")
+
+
 def some_frame(positions: np.ndarray) -> dict[str, np.ndarray]:
     """Camera centers as structure from motion may find them, by name."""
     rotation = pycolmap.Rotation3d(np.array([0.4, -1.0, 0.7])).matrix()
@@ -99,7 +104,7 @@ class TestWrongPositions:
         agreed = agree(flight, centers)
         assert agreed is not None and agreed.shape == "area" and "line" not in caplog.text
         assert set(agreed.tags) == set(names(12)) - {names(12)[row] for row in wrong}
-        fit = place(agreed, centers, np.zeros((5, 3)))
+        fit = place(agreed, centers, no_up)
         assert fit is not None
         found = from_origin(agreed.origin)
         assert found.epsg == 32755
@@ -117,7 +122,7 @@ class TestWrongPositions:
         geodetic = enu_to_geodetic(grid() + random.normal(0, 2.0, (12, 3)), MELBOURNE)
         tags = {name: Geotag(triple(row)) for name, row in zip(centers, geodetic, strict=True)}
         flight = Flight(tags, "area", MELBOURNE)
-        fit = place(flight, centers, np.zeros((5, 3)))
+        fit = place(flight, centers, no_up)
         positions = np.array(list(flight.positions.values()))
         best = fit_similarity(np.array(list(centers.values())), positions)
         np.testing.assert_allclose(fit.matrix, best.matrix, atol=1e-6)
@@ -125,7 +130,7 @@ class TestWrongPositions:
     def test_an_imported_model_is_placed_by_the_others(self, tmp_path):
         write_flight(tmp_path, grid(), {0: STALE, 5: (0.003, 0, 0)})
         flight, centers = read_flight(tmp_path, names(12)), some_frame(grid())
-        found = find_georeference(flight, centers, np.zeros((5, 3)), None)
+        found = find_georeference(flight, centers, no_up, None)
         assert found.epsg == 32755 and found.figures["gps"]["photos"] == 10
         np.testing.assert_allclose(
             found.to_crs(np.array(list(centers.values()))), from_origin(MELBOURNE).to_crs(grid()), atol=0.01
@@ -141,7 +146,10 @@ class TestWrongPositions:
         )
         agreed = agree(flight, centers)
         assert agreed.shape == "line" and flight.shape == "area"
-        assert np.ptp(place(agreed, centers, moved.apply(ground)).apply(moved.apply(ground))[:, 2]) < 1.5
+        assert (
+            np.ptp(place(agreed, centers, lambda: moved.rotation[:, 2]).apply(moved.apply(ground))[:, 2])
+            < 1.5
+        )
 
     def test_long_lines_and_sites_side_by_side_are_no_outliers(self, tmp_path):
         line = np.outer(np.linspace(0, 9000, 40), [0.8, 0.6, 0]) + [0, 0, 80]
@@ -189,8 +197,9 @@ class TestWrongPositions:
             [look_at(np.array([x, y, 60.0]), np.array([x + 5, y, 0]))[:3, :3] for x, y in grid()[:, :2]]
         )
         flat = grid() * [1, 1, 0]
-        assert not upside_down(rotations, fit_similarity(flat, flat))
-        assert upside_down(rotations, fit_similarity(flat, flat[:, [1, 0, 2]]))
+        poses = Poses.from_cameras(rotations, flat)
+        assert not upside_down(poses, fit_similarity(flat, flat).rotation[2])
+        assert upside_down(poses, fit_similarity(flat, flat[:, [1, 0, 2]]).rotation[2])
 
 
 class TestFiles:

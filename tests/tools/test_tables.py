@@ -8,24 +8,31 @@ from pathlib import Path
 from typing import get_type_hints
 
 import numpy as np
+import open3d as o3d
 import pytest
 import torch
 
 from sc3d.cli import main as sc3d
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import local_origin
-from sc3d.io.clouds import read_cloud
+from sc3d.geometry.cameras import local_origin, pinhole_view
+from sc3d.io.clouds import read_cloud, write_geometry
+from sc3d.io.colmap import build_model, write_model
+from sc3d.io.images import write_image
+from sc3d.io.json_files import write_json
 from sc3d.io.mask_images import read_index_image
 from sc3d.io.splats import write_splat_ply
 from sc3d.labelling.cloud import Cloud
+from sc3d.scene.depth_map import depth_file
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label, Propagate
 from sc3d.splatting.gaussians import Gaussians
+from sc3d.synthetic.generate import CLASSES
 from tests.builders import ground, truth_mask, views, write_bare_scene
 from tests.test_cli import fails as command_fails
 from tools.benchmark import fusion_rivals, surface, tables
 from tools.benchmark.__main__ import main
 from tools.benchmark.fusion_page import markdown as fusion_markdown
+from tools.benchmark.settings import BenchmarkTables
 from tools.benchmark.surface_page import page, voxel_size_of
 from tools.benchmark.table_page import DIFFERENCES, markdown, spread
 from tools.benchmark.table_rows import DEFAULT, OURS, ablation, turned
@@ -61,6 +68,8 @@ def command(path: Path) -> list:
         path,
         "--scenes",
         scene,
+        "--kinds",
+        "aerial",
         "--seeds",
         "0",
         "--noises",
@@ -134,6 +143,18 @@ def test_scene_by_path_and_costs(record):
         for key, row in result["rows"].items():
             if key != "masks":
                 assert row["cpu_seconds"] >= row["label_cpu_seconds"] > 0 and row["peak_memory_mb"] > 50
+
+
+def test_both_kinds_of_site_are_scenes_of_their_own(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        tables, "synthetic_scene", lambda folder, settings: made.append((folder.name, settings.kind))
+    )
+    monkeypatch.setattr(tables, "with_masks", lambda base, folder, settings: Scene(folder))
+    wanted = BenchmarkTables(tmp_path, seeds=(0, 7), noises=(1.0,))
+    groups = [variant.group for _, variants in tables._scenes(wanted) for variant in variants]
+    assert made == [("seed0", "aerial"), ("seed7", "aerial"), ("street0", "street"), ("street7", "street")]
+    assert groups == ["synthetic, mask noise 1"] * 2 + ["street, mask noise 1"] * 2
 
 
 def test_rows_are_kept_and_only_missing_ones_computed(folder, record, monkeypatch):
@@ -294,6 +315,49 @@ def test_fusion_speed(folder, tmp_path):
     ) and f"| {ratio:.2f} |" in fusion_markdown(record)
 
 
+def test_walls_in_the_sky_spikes_and_stored_depth_are_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(surface, "NUM_SAMPLES", 20_000)
+    truth, scene = Scene(tmp_path / "truth"), Scene(tmp_path / "scene")
+    view = pinhole_view("a.jpg", (40, 40), (40, 40, 20, 20), np.eye(4))
+    for folder in (truth, scene):
+        write_model(folder.sparse, build_model([view, replace(view, name="b.jpg")]))
+    # a wall at depth 4 fills the lower half of the photos, the rest is sky; the mesh goes on into it, 1 m nearer
+    wall = np.array([[-2.0, 0, 4], [-2, 2, 4], [2, 2, 4], [2, 0, 4]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    both = np.concatenate([wall, wall * [1, -1, 0] + [0, 0, 3]])
+    for path, corners, triangles in (
+        (truth.path / "truth_mesh.ply", wall, faces),
+        (scene.mesh, both, np.concatenate([faces, faces + 4])),
+    ):
+        write_geometry(
+            path, o3d.t.geometry.TriangleMesh(o3d.core.Tensor(corners), o3d.core.Tensor(triangles))
+        )
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.array([[0.3, 0.5, 4], [0.4, 1.0, 4], [0, 1.5, 4]])))
+    cloud.point.normals = o3d.core.Tensor(np.tile(np.float32([0, 0, -1]), (3, 1)))
+    cloud.point.label = o3d.core.Tensor(np.array([[0], [1], [1]], np.uint8))
+    write_geometry(truth.path / "truth.ply", cloud)
+    write_json(truth.classes, CLASSES)
+    exact = np.zeros((40, 40), np.float32)
+    exact[20:] = 4.0
+    found = np.zeros((20, 20), np.float32)
+    found[10:] = 4.1  # half as large, 2.5 % too far
+    (truth.path / "truth_depth").mkdir()
+    for name in ("a", "b"):
+        np.save(truth.path / "truth_depth" / f"{name}.npy", exact)
+        label = (exact > 0).astype(np.uint8)
+        label[39] = 2  # trees
+        write_image(truth.truth / f"{name}.png", label)
+        file = depth_file(scene.depth, f"{name}.jpg")
+        file.parent.mkdir(exist_ok=True)
+        normals, num_views = np.zeros((20, 20, 3), np.int8), np.full((20, 20), 2, np.uint8)
+        np.savez(file, depth=found, normals=normals, num_views=num_views, sky=found == 0)
+    figures = surface.surface_figures(scene, truth, 0.1)
+    assert figures.depth_median == pytest.approx(0.025, rel=1e-4) and figures.opaque == 1
+    assert figures.sky_hit == 1 and figures.complete == 1 and figures.completeness == {"building": 1}
+    assert figures.accuracy == pytest.approx(0.5, abs=0.02) and figures.spikes == pytest.approx(0.5, abs=0.02)
+    assert "| pixels of sky that see the mesh | 100.00% |" in page("a", figures)
+
+
 def test_surface_of_the_truth_itself_is_perfect(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(surface, "NUM_SAMPLES", 5000)
     truth = Scene(folder / "seed0")
@@ -318,5 +382,8 @@ def test_surface_of_the_truth_itself_is_perfect(folder, tmp_path, monkeypatch, c
         and set(found["completeness"].values()) == {1.0}
         and found["voxel_size"] == 0.25
         and found["hit"] > 0.95
+        and found["complete"] == 1
+        and found["spikes"] == 0
+        and found["sky_hit"] is None
     )
     assert (tmp_path / "surface.md").read_text() == page("scene", surface.SurfaceFigures(**found))

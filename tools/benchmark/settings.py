@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
+from sc3d.settings.common import DepthMode
 from sc3d.settings.synthesize import SynthesizeCity as SynthesizeCity
 
 
@@ -47,8 +48,10 @@ class BenchmarkTables:
     ]
     scenes: tuple[Path, ...] = ()
     """Scene folders to add; each needs cloud.ply, masks/ and truth/."""
+    kinds: tuple[Literal["aerial", "street"], ...] = ("aerial", "street")
+    """Kinds of synthetic scenes, each with every seed: WORKDIR/seed<n> and WORKDIR/street<n>."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Synthetic scenes, in WORKDIR/seed<n>."""
+    """Seeds of the synthetic scenes."""
     noises: tuple[float, ...] = (0.5, 1.0, 1.5)
     """Strengths of the mask errors, for every seed."""
     views: int = 40
@@ -89,8 +92,8 @@ class BenchmarkFusionSpeed:
 
 @dataclass(frozen=True)
 class BenchmarkSurface:
-    """Compare gaussians.ply and mesh.ply of a scene with the exact depth and surface of the synthetic scene
-    that its photos come from.
+    """Compare gaussians.ply (without it depth/) and mesh.ply of a scene with the exact depth and surface of
+    the synthetic scene, of either kind, that its photos come from.
     """
 
     scene: Annotated[Positional[Path], arg(help="Reconstructed scene folder, with the true cameras.")]
@@ -99,6 +102,8 @@ class BenchmarkSurface:
     ]
     voxel_size: float = 0.0
     """Voxel of the mesh, world units; 0 = as in mesh.ply.json."""
+    depth_mode: DepthMode = "blended"
+    """Depth of the Gaussians to compare, as for extract."""
     output: Path | None = None
     """JSON file for the figures; a Markdown table is written beside it."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,25 +13,30 @@ from sc3d.geometry.cameras import View, local_origin, undistorted
 from sc3d.geometry.raycast import Surface, first_surface, see_points
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.mask_images import read_index_image
+from sc3d.scene.depth_map import depth_file, read_depth_map
 from sc3d.scene.scene import Scene
+from sc3d.settings.common import DepthMode
 from sc3d.splatting.dataset import load_gaussians
 from sc3d.splatting.evaluation import depth_map
-from sc3d.splatting.gaussians import Gaussians
 
 MIN_ALPHA = 0.9
 NUM_SAMPLES = 500_000  # of the mesh
-WITHIN = 2.0  # voxels
+WITHIN, FAR = 2.0, 5.0  # voxels
+MIN_VIEWS = 2  # that confirm a depth of `sc3d depth`
+
+# of a view: (H, W) depth z, and where it counts
+Depth = Callable[[View], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class SurfaceFigures:
-    """depth: relative errors of rendered depth where alpha > 0.9, trees apart; mesh: shares of surface within
-    2 voxels.
+    """depth: relative errors where it counts: rendered with alpha > 0.9, or, without Gaussians, what
+    `sc3d depth` found and two views confirm; sky and trees apart; mesh: shares of surface within 2 voxels.
 
-    depth_median, depth_p90: outside trees; tree_median: of trees; shares of pixels: opaque (alpha > 0.9), hit
-        (the ray meets the mesh), tree_hit
-    completeness: per class name, share of the true surface that two or more photos see; accuracy: share of
-        the mesh's area near the truth
+    depth_median, depth_p90: outside sky and trees; tree_median: of trees; shares of pixels: opaque (depth
+        counts), hit (the ray meets the mesh), tree_hit, sky_hit (None = no sky in the photos)
+    complete, completeness: share of the true surface that two or more photos see, all of it and per class
+        name; accuracy: share of the mesh's area near the truth; spikes: farther than 5 voxels from it
     voxel_size: of the mesh, world units
     """
 
@@ -40,12 +46,17 @@ class SurfaceFigures:
     opaque: float
     hit: float
     tree_hit: float
+    sky_hit: float | None
+    complete: float
     completeness: dict[str, float]
     accuracy: float
+    spikes: float
     voxel_size: float
 
 
-def surface_figures(scene: Scene, truth: Scene, voxel_size: float) -> SurfaceFigures:
+def surface_figures(
+    scene: Scene, truth: Scene, voxel_size: float, depth_mode: DepthMode = "blended"
+) -> SurfaceFigures:
     """Compare gaussians.ply and mesh.ply of `scene` with truth_depth/, truth/, truth.ply and truth_mesh.ply of
     `truth`, whose cameras it must have.
     """
@@ -53,16 +64,46 @@ def surface_figures(scene: Scene, truth: Scene, voxel_size: float) -> SurfaceFig
     views = [view.shifted(origin) for view in scene.model.views]
     mesh, true_mesh = _surface(scene.mesh, origin), _surface(truth.path / "truth_mesh.ply", origin)
     ids = {entry.name: entry.id for entry in truth.class_table()}
-    depth = _depth_errors(load_gaussians(scene)[0], mesh, views, truth, ids["tree"])
+    depth = _depth_errors(_depths_of(scene, depth_mode), mesh, views, truth, ids["tree"])
     completeness = _completeness(mesh, true_mesh, views, truth, WITHIN * voxel_size, origin)
-    accuracy = float((_distances(true_mesh, _samples(scene, origin)) <= WITHIN * voxel_size).mean())
-    return SurfaceFigures(**depth, completeness=completeness, accuracy=accuracy, voxel_size=voxel_size)
+    away = _distances(true_mesh, _samples(scene, origin)) / voxel_size
+    return SurfaceFigures(
+        **depth,
+        complete=completeness.pop(""),
+        completeness=completeness,
+        accuracy=float((away <= WITHIN).mean()),
+        spikes=float((away > FAR).mean()),
+        voxel_size=voxel_size,
+    )
+
+
+def _depths_of(scene: Scene, depth_mode: DepthMode) -> Depth:
+    """From the Gaussians if there are any, else from depth/."""
+    if not scene.gaussians.exists():
+        return lambda view: _stored_depth(scene, view)
+    gaussians = load_gaussians(scene)[0]
+
+    def rendered(view: View) -> tuple[np.ndarray, np.ndarray]:
+        depth, alpha, _ = depth_map(gaussians, view, depth_mode)
+        return depth, alpha > MIN_ALPHA
+
+    return rendered
+
+
+def _stored_depth(scene: Scene, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """As many pixels as the view has, each the nearest of the map."""
+    depth = read_depth_map(depth_file(scene.depth, view.name)).confirmed(MIN_VIEWS)
+    rows = ((np.arange(view.height) + 0.5) * depth.shape[0] / view.height).astype(int)
+    columns = ((np.arange(view.width) + 0.5) * depth.shape[1] / view.width).astype(int)
+    depth = depth[np.ix_(rows, columns)]
+    return depth, depth > 0
 
 
 def _depth_errors(
-    gaussians: Gaussians, mesh: Surface, views: list[View], truth: Scene, tree: int
-) -> dict[str, float]:
+    depth_of: Depth, mesh: Surface, views: list[View], truth: Scene, tree: int
+) -> dict[str, float | None]:
     errors, labels, shares = [], [], []
+    num_sky, num_walled = 0, 0
     for view in tqdm(views, desc="depth", unit="view", disable=None):
         stem = view.name.rsplit(".", 1)[0]
         exact, label = (
@@ -70,15 +111,16 @@ def _depth_errors(
             read_index_image(truth.truth / f"{stem}.png"),
         )
         small = undistorted(view, max(exact.shape))
-        depth, alpha, _ = depth_map(gaussians, small)
+        depth, counts = depth_of(small)
         known = np.isfinite(exact) & (exact > 0)
-        used = known & (alpha > MIN_ALPHA) & (depth > 0)
+        used = known & counts & (depth > 0)
         errors.append(np.abs(depth[used] - exact[used]) / exact[used])
         labels.append(label[used])
         hit = np.isfinite(first_surface(mesh, small).range)
+        num_sky, num_walled = num_sky + (~known).sum(), num_walled + hit[~known].sum()
         shares.append(
             [
-                (alpha > MIN_ALPHA)[known].mean(),
+                counts[known].mean(),
                 hit[known].mean(),
                 hit[label == tree].mean() if (label == tree).any() else np.nan,
             ]
@@ -93,19 +135,21 @@ def _depth_errors(
         "opaque": float(opaque),
         "hit": float(hit),
         "tree_hit": float(tree_hit),
+        "sky_hit": float(num_walled / num_sky) if num_sky else None,
     }
 
 
 def _completeness(
     mesh: Surface, true_mesh: Surface, views: list[View], truth: Scene, distance: float, origin: np.ndarray
 ) -> dict[str, float]:
+    """By class name; "" for all, those of no class included."""
     cloud = read_cloud(truth.path / "truth.ply")
     points, normals = cloud.point.positions.numpy() - origin, cloud.point.normals.numpy()
     seen = np.zeros(len(points), np.int32)
     for view in tqdm(views, desc="visible", unit="view", disable=None):
         seen[see_points(view, points, normals, first_surface(true_mesh, view), 0.05).points] += 1
     near, label = _distances(mesh, points) <= distance, cloud.point.label.numpy().ravel()
-    return {
+    return {"": float(near[seen >= 2].mean())} | {
         entry.name: float(near[(label == entry.id) & (seen >= 2)].mean())
         for entry in truth.class_table()
         if ((label == entry.id) & (seen >= 2)).any()

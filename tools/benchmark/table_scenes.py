@@ -75,7 +75,7 @@ def synthetic_scene(folder: Path, settings: Synthesize) -> Scene:
             synthesize(folder, settings, lambda share, _: bar.update(round(100 * share) - bar.n))
     views = scene.model.views
     found = len(views), views[0].width, len(read_cloud(folder / "truth.ply").point.positions)
-    wanted = settings.views, settings.width, settings.num_points
+    wanted = settings.num_views, settings.width, settings.num_points
     if found != wanted:
         raise InputError(
             f"{folder} has {found[0]} views of {found[1]} px and {found[2]} points, not {wanted}: choose another working folder, or its options"

@@ -151,7 +151,7 @@ def code_digest() -> str:
 
 
 def _check(command: BenchmarkTables) -> None:
-    if command.every < 1 or not (command.seeds and command.noises) and not command.scenes:
+    if command.every < 1 or not (command.kinds and command.seeds and command.noises) and not command.scenes:
         raise InputError("the tables need at least one scene, and --every of 1 or more")
     require_writable(command.workdir)
     require_writable(command.output or command.workdir)
@@ -168,14 +168,18 @@ def _check(command: BenchmarkTables) -> None:
 
 def _scenes(command: BenchmarkTables) -> Iterator[tuple[Scene, list[Variant]]]:
     """Each scene without masks, and its variants."""
-    for seed in command.seeds if command.noises else ():
-        settings = Synthesize(seed=seed, views=command.views, width=command.width, num_points=command.points)
-        base, variants = synthetic_scene(command.workdir / f"seed{seed}", settings), []
+    wanted = [(kind, seed) for kind in command.kinds for seed in command.seeds] if command.noises else []
+    for kind, seed in wanted:
+        settings = Synthesize(
+            kind=kind, seed=seed, views=command.views, width=command.width, num_points=command.points
+        )
+        folder, group = (f"seed{seed}", "synthetic") if kind == "aerial" else (f"{kind}{seed}", kind)
+        base, variants = synthetic_scene(command.workdir / folder, settings), []
         for noise in command.noises:
             scene = with_masks(
-                base, command.workdir / f"seed{seed}_noise{noise:g}", replace(settings, mask_noise=noise)
+                base, command.workdir / f"{folder}_noise{noise:g}", replace(settings, mask_noise=noise)
             )
-            variants.append(Variant(f"synthetic, mask noise {noise:g}", seed, scene))
+            variants.append(Variant(f"{group}, mask noise {noise:g}", seed, scene))
         yield variants[0].scene, variants
     for path in command.scenes:
         yield Scene(path), [Variant(path.resolve().name, None, Scene(path))]

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sc3d.geometry.cameras import View
 from sc3d.splatting.cpu import (
+    median_depth,
     projection,
     projection_backward,
     rasterization,
@@ -24,14 +25,14 @@ from sc3d.splatting.rendered_view import Rendering
 
 
 def render_cpu(
-    gaussians: Gaussians, view: View, sh_degree: int, background: Tensor | None, geometry: bool
+    gaussians: Gaussians, view: View, sh_degree: int, background: Tensor | None, geometry: bool, median: bool
 ) -> Rendering:
     """`rendering.render` with checked arguments. sh_degree: at most the stored one"""
     shade = np.zeros(3, np.float32) if background is None else background.detach().numpy().astype(np.float32)
-    frame = _Frame(camera_array(view), sh_degree, geometry, shade)
-    color, normal, plane_distance, alpha = _Render.apply(frame, *gaussians.parameters().values())
+    frame = _Frame(camera_array(view), sh_degree, geometry, median, shade)
+    color, normal, plane_distance, alpha, *depth = _Render.apply(frame, *gaussians.parameters().values())
     color, normal = color.permute(1, 2, 0), normal.permute(1, 2, 0)
-    return Rendering(color, alpha, normal, plane_distance, frame.radii, frame.statistics)
+    return Rendering(color, alpha, normal, plane_distance, frame.radii, frame.statistics, *depth)
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ class _Frame:
     camera: np.ndarray
     degree: int
     geometry: bool
+    median: bool
     background: np.ndarray
     tiles: TileLists = field(init=False)
     image: np.ndarray = field(init=False)
@@ -74,13 +76,17 @@ class _Render(torch.autograd.Function):
         )
         frame.radii, frame.statistics = torch.from_numpy(radii), statistics
         outputs = [torch.from_numpy(frame.image[planes]) for planes in (slice(0, 3), slice(3, 6), 6, 7)]
+        if frame.median:
+            depth = np.zeros((height, width), np.float32)
+            median_depth.solve(tiles, frame.camera, frame.image, depth)
+            outputs.append(torch.from_numpy(depth))
         ctx.save_for_backward(*parameters, *outputs)  # outputs too: autograd then refuses edits in place
         ctx.frame = frame
         ctx.set_materialize_grads(False)
         return tuple(outputs)
 
     @staticmethod
-    def backward(ctx, color, normal, plane_distance, alpha):
+    def backward(ctx, color, normal, plane_distance, alpha, depth=None):
         frame, parameters = ctx.frame, ctx.saved_tensors[:6]
         geometry = frame.geometry and not (normal is None and plane_distance is None)
         size = frame.image.shape[1:]
@@ -94,6 +100,9 @@ class _Render(torch.autograd.Function):
         rasterization_backward.rasterize_backward(
             frame.tiles, frame.background, geometry, frame.image, image_gradients, sums
         )
+        if depth is not None:
+            found = ctx.saved_tensors[-1].numpy()
+            median_depth.backward(frame.tiles, frame.camera, found, _plane_array(depth, size), sums)
         outputs = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in parameters]
         projection_backward.project_backward(
             frame.tiles,

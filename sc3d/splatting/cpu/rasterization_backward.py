@@ -54,7 +54,7 @@ def _add_channel(pixels, place, w, value, total, product):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _alpha_gradient(pixels, place, gain, alpha, exponent):
+def alpha_gradient(pixels, place, gain, alpha, exponent):
     """d loss / d ln(alpha) of 8 pixels, with gain = w g.f; takes it out of what is still to come."""
     rest = load(pixels, place + PLANE) - gain
     store(pixels, place + PLANE, rest)
@@ -120,7 +120,7 @@ def _backward_tile(tiles, tile, frame, geometry, pixels, gradients):
                     ny_sum, product = _add_channel(pixels, place + 7 * PLANE, w, ny, ny_sum, product)
                     nz_sum, product = _add_channel(pixels, place + 8 * PLANE, w, nz, nz_sum, product)
                     d_sum, product = _add_channel(pixels, place + 9 * PLANE, w, distance, d_sum, product)
-                s = _alpha_gradient(pixels, place, w * product, alpha, exponent)
+                s = alpha_gradient(pixels, place, w * product, alpha, exponent)
                 su = s * u
                 s_row, su_row, suu_sum = s_row + s, su_row + su, fma(su, u, suu_sum)
                 x_sum = x_sum + absolute(su)

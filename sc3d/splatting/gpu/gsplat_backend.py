@@ -3,18 +3,20 @@
 The rules are those of the CPU kernels: near plane 0.01, +0.3 px^2, Jacobian clamp at 1.3 tan(fov / 2) around
 the real principal point, pixel centers at +0.5, fragments from alpha 1/255 on. gsplat bins boxes of
 min(3.33, sqrt(2 ln(255 opacity))) standard deviations, rounded up to whole pixels; alpha is below 1/255
-outside of them, so no fragment is lost. It differs in four ways:
+outside of them, so no fragment is lost. It differs in five ways:
 - alpha is limited to 0.999 instead of 0.99;
 - a pixel ends before the fragment that would bring its transmittance to 1e-4 instead of after it;
 - a Gaussian is visible (radius > 0) if that box touches the image, the CPU's if the box without rounding
   holds a pixel center;
+- absolute gradients leave out what comes through the median depth;
 - sums are float32 in the order of the GPU's atomic additions: gradients vary in their last digits from run to
   run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 
@@ -23,6 +25,8 @@ from torch import Tensor
 
 from sc3d.errors import MissingPackageError
 from sc3d.geometry.cameras import View
+from sc3d.splatting.consistency import pixel_rays
+from sc3d.splatting.cpu.median_depth import MIN_SLOPE
 from sc3d.splatting.device import INSTALL
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.rendered_view import Rendering
@@ -32,6 +36,7 @@ NEAR = 0.01
 DILATION = 0.3
 MAX_ALPHA = 0.999  # of gsplat
 BAND_PIXELS = 65_536  # fragments are listed for so many pixels at once: about 100 MB
+HALVINGS = 40  # of the interval that holds a pixel's median depth
 _ALL = 1 << 30  # more batches of Gaussians than a tile has
 
 
@@ -141,7 +146,7 @@ class GsplatStatistics:
 
 
 def render_gpu(
-    gaussians: Gaussians, view: View, sh_degree: int, background: Tensor | None, geometry: bool
+    gaussians: Gaussians, view: View, sh_degree: int, background: Tensor | None, geometry: bool, median: bool
 ) -> Rendering:
     """`rendering.render` with checked arguments. sh_degree: at most the stored one"""
     functions = cuda_functions()
@@ -149,8 +154,8 @@ def render_gpu(
     differentiable = screen.means2d.requires_grad
     if differentiable:
         screen.means2d.retain_grad()
-    features = _features(gaussians, view, sh_degree, geometry, functions)[None]
-    splats = screen.means2d, screen.conics, features, screen.opacities
+    features = _features(gaussians, view, sh_degree, geometry, functions)
+    splats = screen.means2d, screen.conics, features[None], screen.opacities
     image, alpha = functions.rasterize_to_pixels(*splats, *screen.rasterization, absgrad=differentiable)
     image, alpha = image[0], alpha[0, ..., 0]
     color = image[..., :3]
@@ -160,8 +165,9 @@ def render_gpu(
         normal, plane_distance = image[..., 3:6], image[..., 6]
     else:
         normal, plane_distance = torch.zeros_like(color), torch.zeros_like(alpha)
+    depth = median_depth(screen, (features[:, 3:6], features[:, 6]), view, functions) if median else None
     statistics = GsplatStatistics(screen, functions)
-    return Rendering(color, alpha, normal, plane_distance, _three_sigma(screen), statistics)
+    return Rendering(color, alpha, normal, plane_distance, _three_sigma(screen), statistics, depth)
 
 
 def project(gaussians: Gaussians, view: View, functions: Functions) -> _Screen:
@@ -181,28 +187,83 @@ def project(gaussians: Gaussians, view: View, functions: Functions) -> _Screen:
 def contributions(screen: _Screen, functions: Functions) -> tuple[Tensor, Tensor]:
     """(N,) sum of each Gaussian's weights, and (N,) largest transmittance in front of its fragments, 0 =
     none; no gradients.
+    """
+    weight, largest = torch.zeros_like(screen.opacities[0]), torch.zeros_like(screen.opacities[0])
+    with torch.no_grad():
+        for ids, pixels in _fragments(screen, functions):
+            alphas = _alphas(screen, ids, pixels)
+            reached = transmittances(alphas, pixels)
+            weight.index_add_(0, ids, alphas * reached)
+            largest.scatter_reduce_(0, ids, reached, "amax")
+    return weight, largest
 
-    gsplat lists the fragments of a band of rows at a time, pixel by pixel and near to far: a pixel that
-    starts with transmittance 0 has none.
+
+def median_depth(screen: _Screen, planes: tuple[Tensor, Tensor], view: View, functions: Functions) -> Tensor:
+    """(H, W) twin of `cpu.median_depth`: bisection tells which fragments lie before, within and behind the
+    footprint of the solution; with them, it is that of a linear equation, which autograd differentiates.
+
+    planes: (N, 3) normals and (N,) plane distances, camera frame
+    """
+    normals, distances = planes
+    rays, focal = (
+        pixel_rays(view, normals.device).reshape(-1, 3),
+        math.sqrt(view.matrix[0, 0] * view.matrix[1, 1]),
+    )
+    depth = torch.zeros_like(rays[:, 0])
+    for ids, pixels in _fragments(screen, functions):
+        alphas = _alphas(screen, ids, pixels)
+        weights = alphas * transmittances(alphas, pixels)
+        inverse = -(normals[ids] * rays[pixels]).sum(1) / distances[ids].clamp_min(1e-30)
+        depth = depth + _half_depth(weights, inverse, pixels, depth.detach(), focal)
+    return depth.reshape(view.height, view.width)
+
+
+def _half_depth(weights: Tensor, inverse: Tensor, pixels: Tensor, like: Tensor, focal: float) -> Tensor:
+    """(P,) depth of the pixels of M fragments, 0 = none. weights, inverse depths, pixels: (M,); like: (P,)"""
+
+    def total(values: Tensor) -> Tensor:
+        return torch.zeros_like(like).index_add(0, pixels, values)
+
+    with torch.no_grad():
+        near, far = torch.full_like(like, 1 / NEAR), torch.zeros_like(like)
+        found = total(weights * (inverse > 0)) >= 0.5
+        for _ in range(HALVINGS):
+            middle = 0.5 * (near + far)
+            place = focal * (inverse / middle[pixels] - 1) + 0.5
+            enough = total(weights * place.clamp(0, 1)) >= 0.5
+            near, far = torch.where(enough, near, middle), torch.where(enough, middle, far)
+        place = focal * (inverse / (0.5 * (near + far))[pixels] - 1) + 0.5
+        within, before = (place > 0) & (place < 1), place >= 1
+    share, slope = total(weights * within), focal * total(weights * within * inverse)
+    # where the depth jumps from one surface to another, it has no gradient
+    smooth = found & (share >= MIN_SLOPE) & (slope > 0)
+    depth = (0.5 - total(weights * before) + (focal - 0.5) * share) / torch.where(smooth, slope, 1)
+    return torch.where(smooth, depth, torch.where(found, 1 / (0.5 * (near + far)), 0))
+
+
+def _fragments(screen: _Screen, functions: Functions) -> Iterator[tuple[Tensor, Tensor]]:
+    """(M,) Gaussians and (M,) pixels of all fragments by bands of rows, pixel by pixel and near to far.
+
+    gsplat lists those of a whole image, but a pixel that starts with transmittance 0 has none.
     """
     splats = [tensor.detach() for tensor in (screen.means2d, screen.conics, screen.opacities)]
-    means2d, conics, opacities = splats
-    weight, largest = torch.zeros_like(opacities[0]), torch.zeros_like(opacities[0])
     width, height = screen.size
     rows = max(1, BAND_PIXELS // width)
     for top in range(0, height if len(screen.ids) else 0, rows):
-        band = means2d.new_zeros(1, height, width)
+        band = splats[0].new_zeros(1, height, width)
         band[:, top : top + rows] = 1
         ids, pixels, _ = functions.rasterize_to_indices_in_range(
             0, _ALL, band, *splats, *screen.rasterization
         )
-        offsets = torch.stack([pixels % width, pixels // width], 1) + 0.5 - means2d[0, ids]
-        alphas = opacities[0, ids] * torch.exp(-0.5 * _squared_distance(offsets, conics[0, ids]))
-        alphas = alphas.clamp_max(MAX_ALPHA)
-        reached = transmittances(alphas, pixels)
-        weight.index_add_(0, ids, alphas * reached)
-        largest.scatter_reduce_(0, ids, reached, "amax")
-    return weight, largest
+        yield ids, pixels
+
+
+def _alphas(screen: _Screen, ids: Tensor, pixels: Tensor) -> Tensor:
+    """(M,) alpha of fragments, differentiable."""
+    width = screen.size[0]
+    offsets = torch.stack([pixels % width, pixels // width], 1) + 0.5 - screen.means2d[0, ids]
+    alphas = screen.opacities[0, ids] * torch.exp(-0.5 * _squared_distance(offsets, screen.conics[0, ids]))
+    return alphas.clamp_max(MAX_ALPHA)
 
 
 def transmittances(alphas: Tensor, pixels: Tensor) -> Tensor:

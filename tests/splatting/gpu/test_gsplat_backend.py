@@ -219,13 +219,31 @@ def test_image_and_gradients_equal_gsplat(reference, count, size, sh_degree):
         assert (gradient - truth).norm() < 1e-4 * truth.norm(), name
 
 
+def test_median_depth_and_its_gradients_equal_the_kernels(functions, monkeypatch):
+    monkeypatch.setattr(gsplat_backend, "BAND_PIXELS", 96 * 20)  # several bands
+    gaussians, view = make_scene(300, 1, seed=4, size=-1.4), make_view()
+    cpu, gpu = with_gradients(gaussians), with_gradients(gaussians)
+    expected = render(cpu, view, depth_mode="median").median_depth
+    found = render_gpu(gpu, view, 0, None, True, True).median_depth
+    both, focal = (expected > 0) & (found > 0), view.focal
+    assert both.double().mean() > 0.5 and ((expected > 0) == (found > 0)).double().mean() > 0.999
+    gap = ((found - expected).abs() / expected.clamp_min(1e-6)).detach() * focal
+    assert gap[both].quantile(0.99) < 0.02  # footprints
+    weight = torch.randn(found.shape, generator=torch.Generator().manual_seed(3)) * (both & (gap < 1e-4))
+    (expected * weight).sum().backward()
+    (found * weight).sum().backward()
+    for name in NAMES[:4]:
+        gradient, truth = getattr(gpu, name).grad, getattr(cpu, name).grad
+        assert (gradient - truth).norm() < 0.01 * truth.norm(), name
+
+
 @pytest.mark.parametrize("geometry", [True, False])
 def test_backend_composes_the_same_rendering(functions, monkeypatch, geometry):
     monkeypatch.setattr(gsplat_backend, "BAND_PIXELS", 96 * 20)  # several bands
     gaussians, view = make_scene(400, 9, seed=1, size=-2.0), make_view()
     cpu, gpu = with_gradients(gaussians), with_gradients(gaussians)
     expected = render(cpu, view, 2, BACKGROUND, geometry)
-    found = render_gpu(gpu, view, 2, BACKGROUND, geometry)
+    found = render_gpu(gpu, view, 2, BACKGROUND, geometry, False)
     assert torch.equal(found.statistics.gradient, torch.zeros(400)) and torch.equal(
         found.statistics.absolute_gradient, torch.zeros(400)
     )
@@ -247,12 +265,14 @@ def test_backend_composes_the_same_rendering(functions, monkeypatch, geometry):
 def test_backend_without_gradients_and_without_gaussians_in_view(functions, monkeypatch):
     gaussians, view = make_scene(50, 1, seed=2, size=-2.0), make_view()
     with torch.no_grad():
-        rendering = render_gpu(gaussians, view, 0, None, True)
+        rendering = render_gpu(gaussians, view, 0, None, True, True)
     assert not rendering.color.requires_grad and rendering.statistics.weight.sum() > 1
+    assert rendering.median_depth.max() > 0
     gaussians.means[:, 2] = -20.0  # behind the camera
     monkeypatch.setattr(gsplat_backend, "cuda_functions", lambda: empty_safe(functions))
-    rendering = render_gpu(with_gradients(gaussians), view, 0, BACKGROUND, True)
+    rendering = render_gpu(with_gradients(gaussians), view, 0, BACKGROUND, True, True)
     assert torch.allclose(rendering.color, BACKGROUND.expand(64, 96, 3))
+    assert not rendering.median_depth.any()
     assert (
         not rendering.radii.any()
         and not rendering.statistics.weight.any()
