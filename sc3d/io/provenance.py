@@ -56,7 +56,8 @@ def _version(file: Path) -> tuple[int, ...]:
     found = file.stat()
     if found.st_size > SOLID and getattr(found, "st_blocks", found.st_size) * 512 < found.st_size * HOLLOW:
         raise InputError(
-            f"{file} says that it has {found.st_size / 1e9:.1f} GB, but next to nothing is on the disk: it is not whole, copy it again"
+            f"{file} says that it has {found.st_size / 1e9:.1f} GB, but next to nothing is on the disk: "
+            "it is not whole, copy it again"
         )
     return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
 

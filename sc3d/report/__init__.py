@@ -42,7 +42,7 @@ def write_report(scene: Scene, path: Path) -> None:
         style=_resource("style.css"),
     )
     with atomic_path(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names that are no text
     logger.info("report: %d sections, %.1f MB", len(parts), len(page) / 1e6)
 
 

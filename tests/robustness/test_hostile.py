@@ -348,6 +348,15 @@ def test_pipes_and_devices_are_not_waited_for(tmp_path, caplog):
     assert caplog.text.count("left out of the report") == 3
 
 
+def test_records_with_names_that_are_no_text(tmp_path):
+    """A record may name a file whose name is not UTF-8."""
+    scene = write_bare_scene(tmp_path / "scene")
+    record = {"stage": "label", "settings": {"cloud": "a\udcff.ply"}, "summary": {}, "inputs": {}}
+    (scene / "seeds.ply.json").write_text(json.dumps(record))
+    main(["report", str(scene)])
+    assert b"a\\udcff.ply" in (scene / "report.html").read_bytes()
+
+
 def test_drawings_of_absurd_length(tmp_path):
     table = read_classes(write_bare_scene(tmp_path / "scene") / "classes.json")
     point = {"label": "road", "shape_type": "point", "points": [[1, 1]]}

@@ -207,7 +207,8 @@ def _check_amount(shapes: list, origin: Path | str) -> None:
     points = sum(len(found) for found in lists if isinstance(found, list))
     if len(shapes) > MAX_SHAPES or points > MAX_POINTS:
         raise InputError(
-            f"{origin} has {len(shapes)} shapes with {points} points: at most {MAX_SHAPES} with {MAX_POINTS} are drawn"
+            f"{origin} has {len(shapes)} shapes with {points} points: "
+            f"at most {MAX_SHAPES} with {MAX_POINTS} are drawn"
         )
 
 
