@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PhotoFrames:
-    """A folder of photos, of which only that counts which says how masks lie on them: names, sizes, EXIF
-    orientation and alpha. Much cheaper than their content, and other colors change no labels.
+    """A folder of photos, of which only that counts which says how masks and the world lie on them: names, sizes,
+    EXIF orientation, XMP and alpha. Much cheaper than their content, and other colors change no labels.
     """
 
     folder: Path

@@ -199,6 +199,7 @@ def test_frames_of_photos_are_names_sizes_orientation_and_alpha(tmp_path):
     for change in (
         lambda: colors[0].save(photos / "a.jpg"),
         lambda: turn(photos / "a.jpg"),
+        lambda: colors[0].save(photos / "a.jpg", xmp=b"<x:xmpmeta>pitch</x:xmpmeta>"),
         lambda: Image.new("RGB", (6, 8)).save(photos / "a.jpg"),
         lambda: Image.new("RGBA", (6, 8), (0, 0, 0, 255)).save(photos / "b.png"),
         lambda: Image.new("RGBA", (6, 8), (0, 0, 0, 0)).save(photos / "b.png"),
