@@ -94,7 +94,7 @@ def read_flight(folder: Path, names: list[str], quiet: bool = False) -> Flight |
         logger.log(
             level,
             "%s: the model gets no scale, no north and no position",
-            f"only {len(usable)} of {len(names)} photos have GPS{_counted(reasons)}"
+            f"{len(usable)} of {len(names)} photos have GPS, {MIN_GPS} are needed{_counted(reasons)}"
             if tags or len(set(reasons.values())) > 1
             else f"no photo has GPS{_counted(reasons)}",
         )

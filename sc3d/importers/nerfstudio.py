@@ -209,6 +209,12 @@ def _distortion_model(table: dict, size: tuple[int, int], where: str) -> Distort
     fisheye, (width, height) = is_fisheye or model in FISHEYE, size
     focal = _focal(table, size, where)
     listed = table.get("distortion_params")
+    if fisheye and isinstance(listed, list) and len(listed) == 4:
+        listed = [*listed, 0.0, 0.0]
+    if listed is not None and (not isinstance(listed, list) or len(listed) != 6):
+        raise InputError(
+            f"{where}: distortion_params has other than 6 values (k1 k2 k3 k4 p1 p2): write them as k1, k2, p1, p2"
+        )
     k1, k2, k3, k4, p1, p2 = (
         listed
         if listed is not None

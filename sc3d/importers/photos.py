@@ -61,6 +61,11 @@ def locate_photos(project: Project, images: Path | None) -> tuple[Project, Path 
     doubtful = _sharing(project, folder, [photos[0] for photos in found])
     shared = [row in doubtful for row in range(len(found))]
     project, found = _without(project, found, shared, "that share a photo with another camera")
+    if not project.views:
+        raise InputError(
+            f"no photo is left: {'; '.join(f'{len(gone)} {reason}' for reason, gone in project.left_out.items())};"
+            f" pass the folder that holds the photos of all cameras with --images, not {folder}"
+        )
     views = [replace(view, name=photos[0]) for view, photos in zip(project.views, found)]
     for view in views:
         _check_shape(view, image_size(folder / view.name), folder)
@@ -101,12 +106,12 @@ def _without(
 
 def _sharing(project: Project, folder: Path, files: list[str]) -> set[int]:
     """Rows of the views whose photo (of `files`) another view has too, and better or as well: the whole path
-    counts most, then the folders in common.
+    counts most, then the folders in common, the name of the photos' own folder included.
     """
     ranks = [
         (
             file == plain_name(view.name) or str(folder.absolute() / file) == full,
-            shared_folders(plain_name(view.name), file),
+            shared_folders(plain_name(view.name), (folder.absolute() / file).as_posix()),
         )
         for view, file, full in zip(project.views, files, _full_names(project))
     ]

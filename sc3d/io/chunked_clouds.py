@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.colors import COLORS, color_names, to_bytes
+from sc3d.io.colors import COLORS, color_names, color_unit, to_bytes
 from sc3d.io.crs import read_las_crs
-from sc3d.io.las import check_las, open_las
+from sc3d.io.las import open_las, warn_of_spare
 from sc3d.io.limits import FARTHEST
 from sc3d.io.ply import check_ply
 from sc3d.io.splats import SPLATS, is_splat_ply
@@ -39,7 +39,7 @@ class CloudFile:
         """InputError if the file is damaged, empty, or of a kind that cannot be read in chunks."""
         kind = path.suffix.lower()
         if kind in (".las", ".laz"):
-            las = check_las(path)
+            las = warn_of_spare(path)
             if not las.num_points:
                 raise InputError(f"{path} holds no points")
             return cls(path, np.dtype(LAS_FIELDS + LAS_COLORS * las.has_colors), las.num_points)
@@ -56,7 +56,9 @@ class CloudFile:
         if is_splat_ply(header):
             raise InputError(f"{path} {SPLATS}")
         cloud = cls(path, _with_bytes(record), header.elements[0].rows, header.size, record)
-        if not cloud.num_points or not {"x", "y", "z"} <= set(cloud.names):
+        if not {"x", "y", "z"} <= set(cloud.names):
+            raise InputError(f"{path} has no properties x, y and z: name its positions so")
+        if not cloud.num_points:
             raise InputError(f"{path} holds no points")
         return cloud
 
@@ -89,7 +91,7 @@ class CloudFile:
             records = np.empty(len(columns["x"]), self.dtype)
             for name in self.names:
                 source = columns[self._source(name)]
-                records[name] = to_bytes(source, self._brightest) if name in COLORS else source
+                records[name] = to_bytes(source, self.path, self._unit) if name in COLORS else source
             yield start, records
 
     def _stored(self, at_once: int) -> Iterator[tuple[int, Mapping[str, np.ndarray] | np.ndarray]]:
@@ -108,16 +110,12 @@ class CloudFile:
         return found[COLORS.index(name)] if found is not None and name in COLORS else name
 
     @cached_property
-    def _brightest(self) -> float:
-        """Of all colors of the file: they have one scale."""
-        names = [self._source(name) for name in COLORS if name in self.names]
-        return max(
-            (
-                float(np.nan_to_num(columns[name].astype(np.float64)).max(initial=0))
-                for _, columns in self._stored(self.rows_at_once)
-                for name in names
-            ),
-            default=0.0,
+    def _unit(self) -> float:
+        """Of all colors of the file, as `color_unit` says."""
+        names = [self._source(name) for name in COLORS]
+        stored = (columns for _, columns in self._stored(self.rows_at_once))
+        return color_unit(
+            (np.stack([columns[name] for name in names], axis=1) for columns in stored), self.path
         )
 
 

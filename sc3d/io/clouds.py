@@ -5,17 +5,17 @@ from __future__ import annotations
 import io
 import logging
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, examples
 from sc3d.io.atomic import atomic_path
 from sc3d.io.colors import COLORS, color_names, to_bytes
 from sc3d.io.limits import FARTHEST
-from sc3d.io.pcd import check_pcd
+from sc3d.io.pcd import check_pcd, read_fields
 from sc3d.io.ply import (
     RESERVED,
     TOGETHER,
@@ -30,9 +30,10 @@ from sc3d.io.splats import SPLATS, is_splat_ply
 logger = logging.getLogger(__name__)
 
 COARSE = 0.005  # steps of positions that are told, world units
+PCD_NORMALS = ["normal_x", "normal_y", "normal_z"]
 MAX_NAME = 200  # characters of an attribute
 TAKEN = {name for group in TOGETHER for name in group}  # columns of what Open3D reads together
-CHECKS = {".ply": check_ply, ".pcd": check_pcd}
+CHECKS: dict[str, Callable[[Path], object]] = {".ply": check_ply, ".pcd": check_pcd}
 
 
 def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported late
@@ -41,13 +42,16 @@ def read_cloud(path: Path):  # -> o3d.t.geometry.PointCloud; open3d is imported 
     """
     if path.suffix.lower() == ".ply" and path.is_file() and is_splat_ply(read_header(path)):
         raise InputError(f"{path} {SPLATS}")
-    cloud = _read_geometry(path, "read_point_cloud", {".ply", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts"})
+    own = {".pcd": _read_pcd, ".ply": _read_capitals}.get(path.suffix.lower())
+    cloud = own(path) if own is not None and path.is_file() else None
+    if cloud is None:
+        cloud = _read_geometry(path, "read_point_cloud", {".ply", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts"})
+        if path.suffix.lower() == ".ply":
+            _add_columns(cloud, path)
     if "positions" not in cloud.point or not len(cloud.point.positions):
         raise InputError(f"{path} holds no points")
     _check_positions(path, cloud.point.positions.numpy(), "remove those points first")
-    if path.suffix.lower() == ".ply":
-        _add_columns(cloud, path)
-    _unify_colors(cloud)
+    _unify_colors(cloud, path)
     return cloud
 
 
@@ -55,6 +59,8 @@ def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
     """Read a triangle mesh; InputError if it is damaged, empty or has vertices that are not finite or too far
     away, or triangles of other vertices.
     """
+    if path.is_file() and _has_capitals(read_header(path)):
+        raise InputError(f"{path} has its positions as X Y Z: name these properties of the mesh x y z")
     mesh = _read_geometry(path, "read_triangle_mesh", {".ply"})
     if "positions" not in mesh.vertex or "indices" not in mesh.triangle or not len(mesh.triangle.indices):
         raise InputError(f"{path} holds no triangles")
@@ -73,6 +79,59 @@ def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
     return mesh
 
 
+def _read_pcd(path: Path):
+    """A PCD with padding or with fields of several numbers, over which Open3D ends the process; None for any
+    other.
+    """
+    import open3d as o3d
+
+    header = check_pcd(path)
+    if header.is_plain:
+        return None
+    fields = read_fields(path, header)
+    if not set("xyz") <= fields.keys():
+        raise InputError(f"{path} holds no points: it has no fields x, y and z")
+    cloud = o3d.t.geometry.PointCloud()
+    for attribute, group in (("positions", list("xyz")), ("normals", PCD_NORMALS)):
+        if set(group) <= fields.keys():
+            columns = np.concatenate([fields.pop(name) for name in group], axis=1)
+            cloud.point[attribute] = o3d.core.Tensor(np.ascontiguousarray(columns))
+    for name, values in fields.items():
+        cloud.point[f"{name}_" if name in RESERVED - {"colors"} else name] = o3d.core.Tensor(
+            np.ascontiguousarray(_widened(values))
+        )
+    return cloud
+
+
+def _has_capitals(header: Header) -> bool:
+    vertex = header.element("vertex")
+    names = {entry.name for entry in vertex.properties} if vertex is not None else set()
+    return "x" not in names and set("XYZ") <= names
+
+
+def _read_capitals(path: Path):
+    """A PLY whose positions are called X Y Z, which Open3D does not know; None for any other."""
+    import open3d as o3d
+
+    header = read_header(path)
+    vertex = header.element("vertex")
+    if vertex is None or not _has_capitals(header):
+        return None
+    kinds = {entry.name: entry.dtype for entry in vertex.properties if not entry.length}
+    found = read_columns(path, check_ply(path), list(kinds))
+    if found is None:
+        raise InputError(f"{path} has its positions as X Y Z, and vertices with lists: name them x y z")
+    columns = {name: column.astype(kinds[name])[:, None] for name, column in zip(kinds, found.T, strict=True)}
+    cloud = o3d.t.geometry.PointCloud()
+    for attribute, group in (("positions", "XYZ"), ("normals", ("NX", "NY", "NZ"))):
+        if set(group) <= columns.keys():
+            values = np.concatenate([columns.pop(name) for name in group], axis=1)
+            cloud.point[attribute] = o3d.core.Tensor(np.ascontiguousarray(values))
+    for name, values in columns.items():
+        cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(_widened(values)))
+    return cloud
+
+
 def _add_columns(cloud, path: Path) -> None:
     """Give a cloud the columns of a checked PLY that Open3D passes over: those of the older names of
     types.
@@ -82,6 +141,9 @@ def _add_columns(cloud, path: Path) -> None:
     header = read_header(path)
     vertex = header.element("vertex")
     kinds = {entry.name: entry.dtype for entry in vertex.properties if not entry.length} if vertex else {}
+    lists = [entry.name for entry in vertex.properties if entry.length] if vertex else []
+    if lists:
+        logger.warning("%s: lists of its points are left out: %s", path, examples(lists))
     known = set(cloud.point)
     for group, attribute in zip(TOGETHER, ("positions", "normals", "colors"), strict=True):
         known |= set(group) if attribute in known else set()
@@ -91,7 +153,7 @@ def _add_columns(cloud, path: Path) -> None:
         cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(column.astype(kinds[name])[:, None]))
 
 
-def _unify_colors(cloud) -> None:
+def _unify_colors(cloud, path: Path) -> None:
     """Give a cloud its colors under the usual name, as (N, 3) uint8."""
     import open3d as o3d
 
@@ -104,7 +166,7 @@ def _unify_colors(cloud) -> None:
         columns = cloud.point.colors.numpy()
     else:
         return
-    cloud.point.colors = o3d.core.Tensor(np.ascontiguousarray(to_bytes(columns)))
+    cloud.point.colors = o3d.core.Tensor(np.ascontiguousarray(to_bytes(columns, path)))
 
 
 def _mesh_colors(path: Path, header: Header) -> np.ndarray | None:
@@ -117,7 +179,7 @@ def _mesh_colors(path: Path, header: Header) -> np.ndarray | None:
     found = read_columns(path, header, names)
     if found is None:
         return None
-    return to_bytes(found.astype(types[names[0]])).astype(np.float32) / 255
+    return to_bytes(found.astype(types[names[0]]), path).astype(np.float32) / 255
 
 
 def _read_geometry(path: Path, reader: str, suffixes: set[str]):

@@ -69,6 +69,11 @@ def load_model(folder: Path) -> pycolmap.Reconstruction:
         raise
     # pycolmap raises bare RuntimeError, ValueError, IndexError, MemoryError and UnicodeDecodeError for broken
     # files
+    except IndexError:
+        raise InputError(
+            f"cannot read the COLMAP model in {folder}: its points (points3D) name keypoints that its photos (images) do"
+            " not list: empty the file of points too, or export the model again"
+        ) from None
     except Exception as error:
         raise InputError(
             f"cannot read the COLMAP model in {folder}: {(str(error).splitlines() or [type(error).__name__])[0]}"

@@ -10,6 +10,8 @@ Layout: ASPRS LAS 1.4 R15; LASzip's VLR and layered chunks as in https://github.
 from __future__ import annotations
 
 import io
+import logging
+import math
 import mmap
 import struct
 from collections.abc import Iterator
@@ -22,6 +24,8 @@ from sc3d.io.limits import DamagedFileError
 
 if TYPE_CHECKING:
     import laspy
+
+logger = logging.getLogger(__name__)
 
 HEADER, HEADER_14 = 227, 375  # bytes, of versions up to 1.2 and of 1.4
 VLR, EVLR = 54, 60  # bytes of the header of a record
@@ -41,7 +45,8 @@ STREAMED = -1  # the chunk table's position is at the end of the file
 class LasHeader(NamedTuple):
     """size: bytes, then num_vlrs records up to `offset`, where the points begin; form: point format, 128 more
     if they are compressed; record: bytes of a point; evlrs: position and number of extended records;
-    stream: where LASzip's record begins, if the points are compressed without chunks, else 0.
+    stream: where LASzip's record begins, if the points are compressed without chunks, else 0; spare: points
+    more than are counted for which there is room, if they are not compressed.
     """
 
     size: int
@@ -52,6 +57,7 @@ class LasHeader(NamedTuple):
     num_points: int
     evlrs: tuple[int, int]
     stream: int = 0
+    spare: int = 0
 
     @property
     def has_colors(self) -> bool:
@@ -70,6 +76,19 @@ def check_las(path: Path) -> LasHeader:
         except (DamagedFileError, struct.error) as error:
             what = str(error) if isinstance(error, DamagedFileError) else "is cut off"
             raise InputError(f"cannot read {path}: it {what}; write or copy it again") from None
+
+
+def warn_of_spare(path: Path) -> LasHeader:
+    """The header of a checked LAS; a warning if there are more points than it counts."""
+    header = check_las(path)
+    if header.spare:
+        logger.warning(
+            "%s: its header counts %d points, but there is room for %d more behind them, which are not read: write it again if they are points",
+            path,
+            header.num_points,
+            header.spare,
+        )
+    return header
 
 
 @contextmanager
@@ -115,11 +134,7 @@ def _check(data: mmap.mmap) -> LasHeader:
     _walk_evlrs(data, *header.evlrs)
     room = len(data) - header.offset
     if header.form < 128:
-        if header.num_points * header.record > room:
-            raise DamagedFileError(
-                f"announces {header.num_points} points of {header.record} bytes, {room} bytes are there"
-            )
-        return header
+        return header._replace(spare=_spare(data, header))
     if header.num_points * header.record > RATIO * room + SLACK:
         raise DamagedFileError(
             f"announces {header.num_points} points in {room} compressed bytes, which cannot be"
@@ -134,6 +149,23 @@ def _check(data: mmap.mmap) -> LasHeader:
     return header
 
 
+def _spare(data: mmap.mmap, header: LasHeader) -> int:
+    """Points more than are counted that fit between the first and what follows the last."""
+    room = len(data) - header.offset
+    if header.num_points * header.record > room:
+        raise DamagedFileError(
+            f"announces {header.num_points} points of {header.record} bytes, {room} bytes are there"
+        )
+    waveforms = struct.unpack_from("<Q", data, 227)[0] if data[25] >= 3 and len(data) >= 235 else 0
+    ends = [start for start in (header.evlrs[0] * bool(header.evlrs[1]), waveforms) if start > header.offset]
+    spare = (min([*ends, len(data)]) - header.offset) // header.record - header.num_points
+    if spare > 0 and not header.num_points:
+        raise DamagedFileError(
+            f"counts 0 points in its header, but has room for {spare}: its writer did not finish it"
+        )
+    return max(spare, 0)
+
+
 def _read_header(data: mmap.mmap) -> LasHeader:
     if data[:4] != b"LASF":
         raise DamagedFileError("is not a LAS file")
@@ -141,12 +173,22 @@ def _read_header(data: mmap.mmap) -> LasHeader:
     size, offset, num_vlrs, form, record, count = struct.unpack_from("<HIIBHI", data, 94)
     evlrs = (0, 0)
     if minor >= 4:
+        older = count
         start, number, count = struct.unpack_from("<QIQ", data, 235)
         evlrs = (start, number)
+        if older and not count:
+            raise DamagedFileError(
+                f"counts 0 points in the header of version 1.{minor}, but {older} in its older field"
+            )
     if size < (HEADER_14 if minor >= 4 else HEADER) or not size <= offset <= len(data):
         raise DamagedFileError("has a header of an impossible size")
     if form & 63 >= len(POINT_SIZES) or record < POINT_SIZES[form & 63]:
         raise DamagedFileError(f"has points of an impossible format ({form & 63}, {record} bytes)")
+    scales = struct.unpack_from("<6d", data, 131)
+    if not all(math.isfinite(value) for value in scales) or not all(scales[:3]):
+        raise DamagedFileError(
+            f"has a scale of 0, or none that is finite ({scales[0]:g} {scales[1]:g} {scales[2]:g})"
+        )
     return LasHeader(size, offset, num_vlrs, form, record, count, evlrs)
 
 

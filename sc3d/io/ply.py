@@ -155,6 +155,8 @@ def _count(word: str) -> int:
 def _property(words: list[str]) -> Property:
     if "\ufffd" in words[-1]:  # no text
         raise ValueError(words[-1])
+    if len(words) != (5 if words[1] == "list" else 3):
+        raise ValueError(words)
     if words[1] != "list":
         return Property(words[2], TYPES[words[1]])
     count = TYPES[words[2]]

@@ -16,7 +16,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.limits import FARTHEST
-from sc3d.io.ply import Header, read_header, read_records, write_records
+from sc3d.io.ply import Header, check_ply, read_columns, read_header, read_records, write_records
 
 logger = logging.getLogger(__name__)
 
@@ -88,7 +88,7 @@ def read_splat_ply(
     Raises InputError for another file, and for values that cannot be rendered.
     """
     _refuse_compressed(path)
-    table, comments = read_records(path)
+    table, comments = _read_table(path)
     columns = _Columns(path, table)
     num_rest = columns.count("f_rest_")
     if num_rest not in DEGREES:
@@ -115,6 +115,20 @@ def read_splat_ply(
     _repair_turns(arrays, path)
     _doubt_activated(arrays, path)
     return arrays, list(comments)
+
+
+def _read_table(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    """As `read_records`, also of a text PLY."""
+    header = check_ply(path)
+    vertex = header.elements[0] if header.elements else None
+    if header.order or vertex is None or vertex.name != "vertex" or vertex.has_lists:
+        return read_records(path)
+    names = [entry.name for entry in vertex.properties]
+    columns = read_columns(path, header, names)
+    table = np.empty(vertex.rows, [(entry.name, entry.dtype) for entry in vertex.properties])
+    for name, column in zip(names, columns.T if columns is not None else (), strict=True):
+        table[name] = column
+    return table, header.comments
 
 
 def is_splat_ply(header: Header) -> bool:

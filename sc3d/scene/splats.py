@@ -7,7 +7,7 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.io.splats import ORIGIN, origin_comment, read_splat_ply
-from sc3d.scene.frame_check import check_frame
+from sc3d.scene.frame_check import check_frame, check_scale
 from sc3d.scene.scene import Scene
 
 
@@ -27,11 +27,10 @@ def read_scene_splats(scene: Scene) -> tuple[dict[str, np.ndarray], np.ndarray]:
             f"{scene.gaussians} was trained with other cameras than those in {scene.sparse}:"
             f" run `sc3d train {scene.path} --overwrite`"
         )
-    if len(arrays["means"]):
-        check_frame(
-            scene.gaussians,
-            arrays["means"].astype(np.float64) + origin,
-            scene.model.views,
-            scene.model.points,
-        )
+    if not len(arrays["means"]):
+        raise InputError(f"{scene.gaussians} holds no Gaussians: run `sc3d train {scene.path} --overwrite`")
+    points = arrays["means"].astype(np.float64) + origin
+    is_near = check_frame(scene.gaussians, points, scene.model.views, scene.model.points)
+    if is_near and not any(line.startswith(ORIGIN) for line in comments):
+        check_scale(scene.gaussians, points, scene.model.views, scene.model.points)
     return arrays, origin

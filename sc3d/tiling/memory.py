@@ -23,6 +23,10 @@ def memory_of(resources: Resources) -> int:
         found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?", resources.max_memory.strip(), re.IGNORECASE)
         if not found:
             raise InputError(f"--max-memory {resources.max_memory}: an amount such as 6G or 800M is expected")
+        if not found[2] and float(found[1]) < UNITS["M"]:
+            raise InputError(
+                f"--max-memory {resources.max_memory}: the unit is missing, such as {found[1]}M or {found[1]}G"
+            )
         total = int(float(found[1]) * UNITS[found[2].upper()])
     else:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2

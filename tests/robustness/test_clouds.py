@@ -25,11 +25,13 @@ from sc3d.io.clouds import read_cloud, read_mesh, write_geometry
 from sc3d.labelling.label import label_scene
 from sc3d.labelling.normal_sides import Sides, judge_sides
 from sc3d.scene.scene import Scene
+from sc3d.settings.common import Resources
 from sc3d.settings.labels import Label
 from sc3d.settings.outputs import Export
 from sc3d.settings.reconstruction import Import
 from sc3d.stages import import_project, label
 from sc3d.tiling.label import label_scene as label_scene_by_tiles
+from sc3d.tiling.memory import memory_of
 from tests.builders import ORIGIN, ground, views, write_bare_scene, write_model
 
 RED, GREEN, BLUE = 68, 77, 72
@@ -282,6 +284,329 @@ def test_float32_at_utm_size_is_told(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         read_cloud(tmp_path / "a.ply")
     assert "steps of 0.5" in caplog.text
+
+
+def read_text(folder, text, suffix=".txt"):
+    (folder / f"a{suffix}").write_text(text, encoding="utf-8")
+    return read_geometry(folder / f"a{suffix}")
+
+
+NUMBERED = "".join(f"{-9 - n},{x},{y},{z}\n" for n, (x, y, z) in enumerate(POINTS))
+HEADERS = {
+    "blank in a name": "Point ID,X,Y,Z\n" + NUMBERED,
+    "blank in a quoted name": '"Point ID","X","Y","Z"\n' + NUMBERED,
+    "blank in a name, semicolons": commas("Point ID;X;Y;Z\n" + NUMBERED.replace(",", ";")),
+    "blank in a name, tabs": "Point ID\tX\tY\tZ\n" + NUMBERED.replace(",", "\t"),
+    "blank in a name, bars": "Point ID | X | Y | Z\n" + NUMBERED.replace(",", " | "),
+    "units in brackets": "No [-],X [m],Y [m],Z [m]\n" + NUMBERED,
+    "units below": "No,X,Y,Z\n-,m,m,m\n" + NUMBERED,
+    "German": "Nr;Hochwert;Rechtswert;H\u00f6he\n"
+    + commas("".join(f"{n};{y};{x};{z}\n" for n, (x, y, z) in enumerate(POINTS))),
+    "French": "No,Nord,Est,Altitude\n" + "".join(f"{n},{y},{x},{z}\n" for n, (x, y, z) in enumerate(POINTS)),
+    "ArcGIS": "OID_,POINT_X,POINT_Y,POINT_Z\n" + NUMBERED,
+    "empty lines of a spreadsheet": "No;X;Y;Z\n" + NUMBERED.replace(",", ";") + ";;;\n;;;\n",
+    "an empty column": "No,Code,X,Y,Z\n" + "".join(f"1,,{x},{y},{z}\n" for x, y, z in POINTS),
+    "own coordinates beside those of a CRS": "x_utm,y_utm,z_utm,x,y,z\n" + lines("1,2,3,{},{},{}"),
+    "decimal commas with a comma and a blank between": commas(lines("{}; {}; {}")).replace(";", ","),
+    "decimal commas in quotes": commas(lines('"{}";"{}";"{}"')).replace(";", ","),
+    "all in quotes": lines('"{}","{}","{}"'),
+    "thousandths behind semicolons": commas(lines("{:.3f};{:.3f};{:.3f}")),
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_columns_are_found_by_their_header(tmp_path, name):
+    np.testing.assert_array_equal(read_text(tmp_path, HEADERS[name], ".csv").positions, POINTS)
+
+
+def test_a_header_in_a_western_encoding(tmp_path):
+    (tmp_path / "a.csv").write_bytes(HEADERS["German"].encode("cp1252"))
+    np.testing.assert_array_equal(read_geometry(tmp_path / "a.csv").positions, POINTS)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("1.234,5;2.345,6;100,1\n1.235,5;2.346,6;100,1\n", "between thousands"),
+        ("1.234,5 2.345,6 100,1\n1.235,5 2.346,6 100,1\n", "between thousands"),
+        ('"1,234.5","2,345.6","100.1"\n', "between thousands"),
+        ("1.234 2.345 100,1\n", "with commas .* and numbers with points"),
+        ("1,2,3;4,5,6;7,8,9\n", "is no number"),
+        ("ncols 3\nnrows 2\nxllcorner 5\nyllcorner 5\ncellsize 1\n1 2 3\n4 5 6\n", "gdal_translate"),
+        ("DSAA\n3 2\n0 2\n0 1\n1 6\n1 2 3\n4 5 6\n", "gdal_translate"),
+        ("north: 2\nsouth: 0\neast: 3\nwest: 0\nrows: 2\ncols: 3\n1 2 3\n4 5 6\n", "gdal_translate"),
+        ("latitude,longitude,altitude\n48.1,11.5,500\n", "degrees: convert"),
+        ("Punkt,Lage1,Lage2,Lage3\n1,2,3,4\n", "name those columns x y z"),
+        ("Hochwert,Lage,Tiefe\n1,2,3\n", "name those columns x y z"),
+        ("id,x,y,z\n1,2,3,4,5\n", "4 columns .* have 5"),
+        ("id,x,y,z,label\nP1,1,2,3,4\n", "column 'id': .* 'P1'"),
+        ("x,y,z,class\n1,2,3,building\n", "line 2, column 'class'"),
+        ("time;x;y;z\n12:00:01;1;2;3\n", "column 'time'"),
+        ("1_0 2 3\n4 5 6\n", "line 1, column 1"),
+    ],
+)
+def test_text_that_may_be_misread_is_refused(tmp_path, text, match):
+    with pytest.raises(InputError, match=match):
+        read_text(tmp_path, text)
+
+
+def test_a_header_that_is_not_used_is_told(tmp_path, caplog):
+    read_text(tmp_path, "x y z of the roof\n" + lines("{} {} {}"))
+    assert "is no header of 3 columns" in caplog.text
+
+
+def test_pts_with_fewer_points_than_announced_is_told(tmp_path, caplog):
+    read_text(tmp_path, "5\n" + lines("{} {} {} 1 2 3 4"), ".pts")
+    assert "announces 5 points, 3 are there" in caplog.text
+
+
+def test_empty_fields_are_nan(tmp_path):
+    found = read_text(tmp_path, "x,y,z,intensity\n1,2,3,\n4,5,6,7\n", ".csv")
+    np.testing.assert_array_equal(found.attributes["intensity"], [np.nan, 7])
+
+
+@pytest.mark.parametrize("shading", [True, False])
+@pytest.mark.parametrize("first", [True, False])
+def test_intensity_before_or_behind_colors(tmp_path, caplog, first, shading):
+    """Colors go together, an intensity goes its own way; where it does not, the reading is told."""
+    rng = np.random.default_rng(0)
+    gray = rng.integers(20, 200, 400)
+    rgb = np.stack([gray + 30, gray + 10, gray], axis=1) + rng.integers(0, 8, (400, 3))
+    intensity = rng.integers(0, 200, 400) if shading else gray + 1
+    rest = np.column_stack([intensity, rgb] if first else [rgb, intensity])
+    rows = np.column_stack([rng.uniform(0, 9, (400, 3)).round(2), rest])
+    text = "".join(" ".join(f"{value:g}" for value in row) + "\n" for row in rows)
+    colors = read_text(tmp_path, text).colors
+    if shading:
+        np.testing.assert_array_equal(colors, rgb)
+    assert ("may be r g b and another one" in caplog.text) == (not shading or first)
+
+
+def test_normals_of_xyzn_are_no_colors(tmp_path):
+    found = read_text(tmp_path, "1 2 3 0 0 1\n4 5 6 0 0 2.5\n7 8 9 0 0 0\n", ".xyzn")
+    assert found.colors is None
+    np.testing.assert_allclose(found.attributes["normals"], [[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+
+
+def test_classes_that_are_none_are_counted(tmp_path, caplog):
+    text = "x,y,z,classification\n" + "".join(f"1,2,3,{value}\n" for value in (300, -1, "nan", 2.6, 5))
+    assert read_text(tmp_path, text).attributes["classification"].tolist() == [0, 0, 0, 0, 5]
+    assert "4 of 5 points have a classification" in caplog.text and "300" in caplog.text
+
+
+# ---- colors by most of the points
+
+
+@pytest.mark.parametrize("name", ["text", "LAS", "LAS in parts", "PLY of floats", "PLY of fractions", "PCD"])
+def test_one_bright_point_makes_no_others_black(tmp_path, caplog, name):
+    rgb = np.full((8, 3), (RED, GREEN, BLUE), np.float64)
+    rgb[0, 0] = 65535
+    if name == "text":
+        text = "".join(f"{x} {y} {z} {r:g} {g:g} {b:g}\n" for (x, y, z), (r, g, b) in zip(small(), rgb))
+        colors = read_text(tmp_path, "x y z r g b\n" + text).colors
+    elif name == "PCD":
+        head = "FIELDS x y z r g b\nSIZE 4 4 4 2 2 2\nTYPE F F F U U U\nCOUNT 1 1 1 1 1 1\nWIDTH 8\nHEIGHT 1\nDATA ascii\n"
+        rows = "".join(f"1 2 3 {r:g} {g:g} {b:g}\n" for r, g, b in rgb)
+        (tmp_path / "a.pcd").write_text("VERSION 0.7\n" + head + rows)
+        colors = read_geometry(tmp_path / "a.pcd").colors
+    elif name.startswith("LAS"):
+        path = write_las(tmp_path / "a.las", small(), colors=rgb.astype(np.uint16))
+        (_, records), *_ = CloudFile.open(path).chunks()
+        parts = np.stack([records[axis] for axis in ("red", "green", "blue")], 1)
+        colors = parts if "parts" in name else read_geometry(path).colors
+    else:
+        if "fractions" in name:
+            rgb /= 255
+            rgb[0, 0] = 30.0
+        columns = {n: ("float", "<f4", rgb[:, k]) for k, n in enumerate(("red", "green", "blue"))}
+        colors = read_geometry(write_ply(tmp_path / "a.ply", small(), columns)).colors
+    assert (colors[1:] == (RED, GREEN, BLUE)).all() and colors[0, 0] == 255
+    assert "1 of 8 points have colors beyond" in caplog.text
+
+
+@pytest.mark.parametrize("top", [255.6, 256.0])
+def test_colors_a_little_beyond_a_byte(tmp_path, top):
+    rgb = np.tile([top, GREEN, BLUE], (8, 1))
+    columns = {n: ("float", "<f4", rgb[:, k]) for k, n in enumerate(("red", "green", "blue"))}
+    assert (read_geometry(write_ply(tmp_path / "a.ply", small(), columns)).colors == (255, GREEN, BLUE)).all()
+    text = "x y z r g b\n" + f"1 2 3 {top} {GREEN} {BLUE}\n" * 3
+    assert (read_text(tmp_path, text).colors == (255, GREEN, BLUE)).all()
+
+
+# ---- PCD
+
+
+def write_pcd(path, fields, sizes, types, counts, body, points, kind="ascii"):
+    head = f"FIELDS {fields}\nSIZE {sizes}\nTYPE {types}\nCOUNT {counts}\nWIDTH {points}\nHEIGHT 1\nDATA {kind}\n"
+    path.write_bytes(f"VERSION 0.7\n{head}".encode() + body)
+    return path
+
+
+PLAIN = ("x y z", "4 4 4", "F F F", "1 1 1")
+
+
+@pytest.mark.parametrize(
+    ("body", "match"),
+    [
+        ("10.25 20.5 30.125\n" * 2, "9 numbers|3 points of 3 numbers are announced, 6"),
+        ("10.25 20.5 30.125\n" * 2 + "10.25 20", "are announced, 8"),
+        ("10.25 20.5 30.125\n" * 4, "are announced, 12"),
+        ("1,5 2,5 3\n" * 3, "not numbers with a point"),
+    ],
+)
+def test_pcd_of_other_words_is_refused(tmp_path, body, match):
+    path = write_pcd(tmp_path / "a.pcd", *PLAIN, body.encode(), 3)
+    with pytest.raises(InputError, match=match):
+        read_geometry(path)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+def test_pcd_with_padding_and_fields_of_several_numbers(tmp_path, kind):
+    """As PCL and ROS write them."""
+    fields = ("x y z _ rgb normal_x normal_y normal_z hist _", "4 4 4 1 4 4 4 4 4 1", "F F F U U F F F F U")
+    dtype = [(n, "<f4") for n in "xyz"] + [("a", "u1", 4), ("rgb", "<u4")]
+    dtype += [("n", "<f4", 3), ("hist", "<f4", 3), ("b", "u1", 12)]
+    table = np.zeros(2, dtype)
+    table["x"], table["y"], table["z"] = np.float32(POINTS[:2].T % 1000)
+    table["rgb"], table["n"], table["hist"] = (RED << 16) + (GREEN << 8) + BLUE, (0, 0, 1), (7, 8, 9)
+    body = table.tobytes()
+    if kind == "ascii":
+        rows = [np.concatenate([np.atleast_1d(value) for value in row]) for row in table.tolist()]
+        body = "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows).encode()
+    path = write_pcd(tmp_path / "a.pcd", *fields, "1 1 1 4 1 1 1 1 3 12", body, 2, kind)
+    found = read_geometry(path)
+    np.testing.assert_allclose(found.positions, POINTS[:2] % 1000)
+    assert (found.colors == (RED, GREEN, BLUE)).all() and (found.attributes["normals"] == (0, 0, 1)).all()
+    assert (found.attributes["hist"] == (7, 8, 9)).all()
+    write_geometry(tmp_path / "b.ply", to_open3d(found))
+    assert (read_cloud(tmp_path / "b.ply").point["hist_2"].numpy() == 9).all()
+
+
+def test_compressed_pcd_with_padding_is_refused(tmp_path):
+    body = struct.pack("<II", 40, 32) + bytes(40)
+    path = write_pcd(
+        tmp_path / "a.pcd", "x y z _", "4 4 4 1", "F F F U", "1 1 1 4", body, 2, "binary_compressed"
+    )
+    with pytest.raises(InputError, match="without compression"):
+        read_geometry(path)
+
+
+def test_binary_pcd_with_more_points_than_announced_is_told(tmp_path, caplog):
+    path = write_pcd(tmp_path / "a.pcd", *PLAIN, np.ones((5, 3), "<f4").tobytes(), 3, "binary")
+    assert len(read_geometry(path).positions) == 3
+    assert "announces 3 points, but there is room for 2 more" in caplog.text
+
+
+# ---- PLY and OBJ dialects
+
+
+def test_lists_of_points_are_told(tmp_path, caplog):
+    head = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    (tmp_path / "a.ply").write_text(head + "property list uchar int ids\nend_header\n1 2 3 2 7 8\n")
+    assert len(read_geometry(tmp_path / "a.ply").positions) == 1
+    assert "lists of its points are left out: ids" in caplog.text
+
+
+def test_normals_named_as_pcl_does_turn_with_their_cloud(site, tmp_path):
+    names = ("normal_x", "normal_y", "normal_z")
+    columns = {name: ("float", "<f4", value) for name, value in zip(names, (0, 0, 1), strict=True)}
+    path = write_ply(tmp_path / "a.ply", ground(1.0), columns)
+    import_project.run(site, Import(project=path, cloud=(path,), epsg=32615))
+    normals = read_cloud(site.cloud).point.normals.numpy()
+    np.testing.assert_allclose(normals, np.tile([0, 0, 1], (len(normals), 1)), atol=1e-3)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_ply_with_capitals(tmp_path, form):
+    path = write_ply(
+        tmp_path / "a.ply", small(), {"Red": ("uchar", "u1", RED), "q": ("int", "<i4", 5)}, form=form
+    )
+    content = path.read_bytes()
+    for axis in "xyz":
+        content = content.replace(f"double {axis}\n".encode(), f"double {axis.upper()}\n".encode(), 1)
+    path.write_bytes(content)
+    found = read_geometry(path)
+    np.testing.assert_array_equal(found.positions, small())
+    assert (found.attributes["q"] == 5).all()
+
+
+def test_mesh_with_capitals_is_refused(tmp_path):
+    path = write_ply(tmp_path / "a.ply", small(), {}, faces=[(0, 1, 2)])
+    for axis in b"xyz":
+        path.write_bytes(path.read_bytes().replace(b"double %c\n" % axis, b"double %c\n" % (axis - 32)))
+    with pytest.raises(InputError, match="as X Y Z"):
+        read_geometry(path)
+
+
+def test_ply_with_blanks_in_a_name_says_which_line(tmp_path):
+    path = write_ply(tmp_path / "a.ply", small(), {"Original cloud index": ("float", "<f4", 1)})
+    with pytest.raises(InputError, match="property float Original cloud index"):
+        read_geometry(path)
+
+
+def test_obj_with_tabs_comments_and_continued_lines(tmp_path):
+    (tmp_path / "a.obj").write_text(
+        "v\t0 0 0 # a corner\nv 1\t0 0\nv 1 1 0\nv 0 1 0\nf\t1//1 2//1 \\\n 3//1 4//1 # a face\n"
+    )
+    found = read_geometry(tmp_path / "a.obj")
+    assert found.positions.shape == (4, 3) and found.triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
+
+
+# ---- what a LAS header says
+
+
+def patched(path, kind, offset, *values):
+    content = bytearray(path.read_bytes())
+    struct.pack_into(kind, content, offset, *values)
+    path.write_bytes(content)
+    return path
+
+
+def test_las_with_more_points_than_it_counts_is_told(tmp_path, caplog):
+    path = patched(write_las(tmp_path / "a.las", small(), form=3, version="1.2"), "<I", 107, 5)
+    assert len(read_geometry(path).positions) == 5
+    assert "counts 5 points" in caplog.text and "3 more" in caplog.text
+    caplog.clear()
+    CloudFile.open(path)
+    assert "3 more" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("version", "kind", "offset", "values", "match"),
+    [
+        ("1.2", "<I", 107, (0,), "room for 8"),
+        ("1.4", "<Q", 247, (0,), "counts 0 points in the header of version 1.4, but 8"),
+        ("1.2", "<3d", 131, (0.0, 0.0, 0.0), "a scale of 0"),
+        ("1.2", "<d", 155, (float("nan"),), "finite"),
+    ],
+)
+def test_las_whose_header_cannot_be_right_is_refused(tmp_path, version, kind, offset, values, match):
+    path = patched(write_las(tmp_path / "a.las", small(), form=3, version=version), "<I", 107, 8)
+    path = patched(path, kind, offset, *values)
+    with pytest.raises(InputError, match=match):
+        read_geometry(path)
+
+
+def test_all_dimensions_of_las_are_kept(tmp_path, caplog):
+    kept = {
+        "gps_time": 1e5,
+        "user_data": 3,
+        "point_source_id": 40000,
+        "scan_angle": -500,
+        "nir": 60000,
+        "withheld": 1,
+    }
+    header = laspy.LasHeader(version="1.4", point_format=8)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = small().T
+    for name, value in kept.items():
+        las[name] = np.full(8, value)
+    las.write(tmp_path / "a.laz")
+    write_geometry(tmp_path / "b.ply", to_open3d(read_geometry(tmp_path / "a.laz")))
+    cloud = read_cloud(tmp_path / "b.ply")
+    for name, value in kept.items():
+        assert (cloud.point[name].numpy() == value).all(), name
+    assert "8 of 8 points are marked as withheld" in caplog.text
 
 
 # ---- attributes of LAS and PLY
@@ -643,3 +968,9 @@ def test_the_winding_of_a_mesh_does_not_matter(site, winding):
     write_geometry(site.mesh, mesh)
     figures = label.run(site, Label(voxel_size=0.5))
     assert float(str(figures["unseen"]).rstrip("%")) < 15
+
+
+@pytest.mark.parametrize("amount", ["2500", "4", "3.5"])
+def test_an_amount_of_memory_without_a_unit_is_refused(amount):
+    with pytest.raises(InputError, match=f"the unit is missing, such as {amount}M"):
+        memory_of(Resources(max_memory=amount))

@@ -10,16 +10,19 @@ import numpy as np
 import pycolmap
 import pyproj
 import pytest
+from PIL import Image
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View
 from sc3d.georeferencing.georeference import from_origin, read_georeference, write_georeference
+from sc3d.georeferencing.gps import read_flight
 from sc3d.importers.metashape import largest_correction
 from sc3d.importers.photos import locate_photos
 from sc3d.importers.project import Project, read_project
 from sc3d.io.colmap import build_model, load_model
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Import
+from sc3d.synthetic.exif import photo_exif
 from tests.importers.test_importers import (
     PLACE,
     SIZE,
@@ -311,6 +314,28 @@ class TestPhotos:
         with pytest.raises(InputError, match="none of the 4 photos"):
             read(file, photos)
 
+    @pytest.mark.parametrize("kind", ["colmap", "transforms"])
+    def test_photos_of_one_of_two_folders(self, tmp_path, kind):
+        """Cameras count photos anew: the name of the folder given tells which of two are meant."""
+        views = [
+            replace(view, name=f"{'ab'[row % 2]}/DJI_{row // 2}.JPG") for row, view in enumerate(small(fly()))
+        ]
+        folder = write_photos(tmp_path / "shots", views)
+        path = save_model(tmp_path / "m", views) if kind == "colmap" else transforms(tmp_path / "m", views)
+        project, found = read(path, folder / "a")
+        assert names(project) == ["DJI_0.JPG", "DJI_1.JPG", "DJI_2.JPG"] and found == folder / "a"
+        np.testing.assert_allclose(
+            [view.center for view in project.views], [view.center for view in views[::2]], atol=1e-9
+        )
+
+    def test_no_photo_is_left(self, tmp_path):
+        views = [
+            replace(view, name=f"{'ab'[row % 2]}/DJI_{row // 2}.JPG") for row, view in enumerate(small(fly()))
+        ]
+        photos = write_photos(tmp_path / "c", rename(views[:3], "DJI_{}.JPG"))
+        with pytest.raises(InputError, match="no photo is left: 6 that share a photo"):
+            read(save_model(tmp_path / "m", views), photos)
+
     def test_images_that_are_no_folder(self, tmp_path):
         with pytest.raises(InputError, match="is not a folder"):
             read(transforms(tmp_path, fly()), tmp_path / "nothing")
@@ -467,6 +492,15 @@ class TestLenses:
         with pytest.raises(InputError, match="'dual' has no COLMAP model"):
             read(tmp_path)
 
+    def test_distortion_of_four_values(self, tmp_path):
+        """k1 to k4 of a fisheye; for others it may be k1 k2 p1 p2 as well."""
+        values = [0.01, 0.002, 0.0, 0.0]
+        file = transforms(tmp_path, small(fly()), distortion_params=values)
+        with pytest.raises(InputError, match="other than 6 values"):
+            read(file, write_photos(tmp_path / "p", small(fly())))
+        change(file, lambda content: content.update(camera_model="OPENCV_FISHEYE"))
+        assert read(file, tmp_path / "p")[0].views[0].camera.params[4:6].tolist() == values[:2]
+
 
 class TestMetashape:
     def write(self, folder: Path, *edits: tuple[str, str]) -> Path:
@@ -573,6 +607,15 @@ class TestMetashape:
 
 
 class TestFrames:
+    def test_gps_of_all_of_two_photos(self, tmp_path, caplog):
+        """All have it, and still it is too little: it says how many are needed."""
+        for row in range(2):
+            exif = photo_exif(row, np.array([-37.8, 144.96 + row / 1e4, 50.0]))
+            Image.new("RGB", SMALL).save(tmp_path / f"{row}.jpg", exif=exif)
+        with caplog.at_level("WARNING"):
+            assert read_flight(tmp_path, ["0.jpg", "1.jpg"]) is None
+        assert "2 of 2 photos have GPS, 3 are needed" in caplog.text and "only 2 of 2" not in caplog.text
+
     def opensfm(self, folder: Path, reference: tuple, **shot) -> Project:
         content = opensfm_json(fly(), probe(3), reference)
         for view in content[1]["shots"].values():
@@ -678,6 +721,15 @@ class TestPartialModels:
         assert len(project.views) == 6 and not len(project.points)
         (folder / f"images.{'txt' if text else 'bin'}").unlink()
         with pytest.raises(InputError, match="no file of photos"):
+            read(folder)
+
+    def test_points_of_keypoints_that_are_gone(self, tmp_path):
+        """An editor has emptied the lines of keypoints, but not the file of points."""
+        folder = save_model(tmp_path / "model", fly(), text=True)
+        lines = (folder / "images.txt").read_text().splitlines()
+        heads = [line if line.startswith("#") or ".jpg" in line else "" for line in lines]
+        (folder / "images.txt").write_text("\n".join(heads) + "\n")
+        with pytest.raises(InputError, match="name keypoints that its photos .* do not list"):
             read(folder)
 
     def test_one_camera_per_photo(self, tmp_path):

@@ -11,10 +11,12 @@ import pytest
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import local_origin
 from sc3d.importers.clouds import read_geometry
+from sc3d.io.colmap import build_model
+from sc3d.io.ply import read_records
 from sc3d.io.splats import origin_comment, read_splat_ply, write_splat_ply
 from sc3d.scene.scene import Scene
 from sc3d.scene.splats import read_scene_splats
-from tests.builders import ORIGIN, views, write_model
+from tests.builders import ORIGIN, ground, views, write_model
 
 SCALES, TURN = ["scale_0", "scale_1", "scale_2"], ["rot_0", "rot_1", "rot_2", "rot_3"]
 BASE = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *SCALES, *TURN]
@@ -65,6 +67,63 @@ def test_splats_that_lie_elsewhere_are_told_with_both_boxes(scene, caplog):
     with caplog.at_level(logging.WARNING):
         read_scene_splats(scene)
     assert "elsewhere than the cameras" in caplog.text and "512344" in caplog.text
+
+
+@pytest.mark.parametrize("sparse", [True, False])
+@pytest.mark.parametrize("kind", ["same", "small", "upright", "ours"])
+def test_splats_of_another_scale_or_direction_are_told(tmp_path, caplog, kind, sparse):
+    """As nerfstudio normalizes them: about the same middle, so that the boxes overlap."""
+    points = ground(1.0)
+    model_views = [view.shifted(ORIGIN) for view in views()]
+    rows = np.arange(len(points))
+    model = (
+        build_model(
+            model_views,
+            points - ORIGIN,
+            np.zeros((len(points), 3)),
+            [(rows, np.ones((len(rows), 2)))] * 2 + [(rows[:0], np.ones((0, 2)))] * (len(model_views) - 2),
+        )
+        if sparse
+        else build_model(model_views)
+    )
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    model.write_binary(str(tmp_path / "sparse" / "0"))
+    scene, means = Scene(tmp_path), points - ORIGIN
+    if kind in ("small", "ours"):
+        means = means / 100
+    elif kind == "upright":
+        means = means[:, [0, 2, 1]] * [1, -1, 1]
+    comments = [origin_comment(local_origin(scene.model.views))] if kind == "ours" else []
+    write(scene.gaussians, means, comments=comments)
+    with caplog.at_level(logging.WARNING):
+        read_scene_splats(scene)
+    told = "another scale or frame than the cameras" in caplog.text
+    assert told == (kind == "small" or kind == "upright" and sparse)
+
+
+def test_no_gaussians_are_refused(scene):
+    write(scene.gaussians, np.zeros((0, 3)))
+    with pytest.raises(InputError, match="holds no Gaussians"):
+        read_scene_splats(scene)
+
+
+def test_one_camera_tells_no_extent(tmp_path, caplog):
+    write_model(tmp_path / "sparse" / "0", views()[:1])
+    scene = Scene(tmp_path)
+    write(scene.gaussians, views()[0].center + np.random.default_rng(0).normal(size=(80, 3)) - [0, 0, 90])
+    read_scene_splats(scene)
+    assert not caplog.text
+
+
+def test_splats_as_text_are_read(tmp_path):
+    binary = write(tmp_path / "a.ply", np.random.default_rng(0).normal(size=(5, 3)).round(3), opacity=0.5)
+    table, _ = read_records(binary)
+    head = binary.read_bytes().partition(b"end_header")[0].replace(b"binary_little_endian", b"ascii")
+    rows = "".join(" ".join(f"{value:.9g}" for value in row) + "\n" for row in table.tolist())
+    (tmp_path / "b.ply").write_bytes(head + b"end_header\n" + rows.encode())
+    (expected, _), (found, _) = read_splat_ply(binary), read_splat_ply(tmp_path / "b.ply")
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values)
 
 
 # ---- variants
