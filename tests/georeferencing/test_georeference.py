@@ -41,7 +41,7 @@ from sc3d.georeferencing.georeference import (
 from sc3d.georeferencing.geotags import Geotag, read_geotag
 from sc3d.georeferencing.gps import Flight, find_georeference, place, read_flight, residuals
 from sc3d.scene.scene import Scene
-from sc3d.synthetic.exif import drone_exif
+from sc3d.synthetic.exif import photo_exif
 
 BRIGHTON = (46.84269, -91.99443, 198.6)
 MELBOURNE = (-37.9042, 144.9886, 20.0)
@@ -152,7 +152,7 @@ XMP = '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description {attributes
 def write_photo(
     path: Path, position: tuple[float, float, float] | None, xmp: str = "", size: tuple[int, int] = (40, 30)
 ) -> Path:
-    exif = drone_exif(np.array(position), 0) if position else Image.Exif()
+    exif = photo_exif(np.array(position), 0) if position else Image.Exif()
     Image.new("RGB", size).save(path, exif=exif, **({"xmp": xmp.encode()} if xmp else {}))
     return path
 

@@ -28,7 +28,7 @@ from sc3d.georeferencing.georeference import (
 from sc3d.georeferencing.geotags import Geotag, read_geotag
 from sc3d.georeferencing.gps import Flight, agree, find_georeference, place, read_flight
 from sc3d.georeferencing.up_direction import Poses, upside_down
-from sc3d.synthetic.exif import drone_exif
+from sc3d.synthetic.exif import photo_exif
 
 MELBOURNE = (-37.9042, 144.9886, 20.0)
 ROME = (41.9, 12.5, 50.0)
@@ -37,7 +37,7 @@ XMP = '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description {}/></rdf:R
 
 def write_photo(path: Path, position: tuple, xmp: str = "", **changes: object) -> Path:
     """A photo at latitude, longitude, height; `changes` of GPS tags by name, None = leave out."""
-    exif = drone_exif(np.array(position, float), 0)
+    exif = photo_exif(np.array(position, float), 0)
     block = exif.get_ifd(IFD.GPSInfo)
     for name, value in changes.items():
         block.pop(GPS[name], None)
