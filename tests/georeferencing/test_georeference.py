@@ -152,7 +152,7 @@ XMP = '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description {attributes
 def write_photo(
     path: Path, position: tuple[float, float, float] | None, xmp: str = "", size: tuple[int, int] = (40, 30)
 ) -> Path:
-    exif = photo_exif(np.array(position), 0) if position else Image.Exif()
+    exif = photo_exif(0, np.array(position)) if position else Image.Exif()
     Image.new("RGB", size).save(path, exif=exif, **({"xmp": xmp.encode()} if xmp else {}))
     return path
 
