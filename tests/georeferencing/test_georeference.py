@@ -186,7 +186,7 @@ class TestGeotags:
             ([[0, 0], [60, 0], [0, 60], [60, 60]], "area", None),
             ([[0, 0], [30, 0.4], [60, -0.4], [90, 0]], "line", "one line"),
             ([[0, 0], [0.5, 0], [0, 0.5], [0.3, 0.3]], None, "within"),
-            ([[0, 0], [60, 0]], None, "only 2 of 3"),
+            ([[0, 0], [60, 0]], None, "2 of 3 photos have GPS, 3 are needed"),
             ([], None, "no photo has GPS"),
         ],
     )
