@@ -28,6 +28,7 @@ NUMBA_FILE = ".numba_config.yaml"
 
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and exit: 0 done, 1 failed, 2 bad input, 130 interrupted by Ctrl-C."""
+    open_closed_streams()
     arguments = expanded(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         with ending_with_reader():
@@ -60,6 +61,22 @@ def expanded(arguments: list[str]) -> list[str]:
         (match[1] or "") + os.path.expanduser(match[2]) if match else argument
         for match, argument in zip(found, arguments, strict=True)
     ]
+
+
+def open_closed_streams() -> None:
+    """Lead input, output and errors that are closed, as by `>&-`, to nowhere. Else the next file that is opened
+    gets their number, and what a native library prints goes into it.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            opened = os.open(os.devnull, os.O_RDWR)
+            if opened != number:
+                os.dup2(opened, number)
+                os.close(opened)
+    sys.stdout = sys.stdout or open(os.devnull, "w")
+    sys.stderr = sys.stderr or open(os.devnull, "w")
 
 
 def start_logging() -> None:
@@ -169,11 +186,9 @@ def _dispatch(name: str, command: Any) -> None:
     if name in COMMANDS:
         importlib.import_module(MODULES.get(name, f"sc3d.commands.{name}")).main(command)
         return
-    from sc3d.io.atomic import require_writable
     from sc3d.runner import execute
     from sc3d.scene.scene import Scene
 
-    require_writable(command.scene)
     execute(name, Scene(command.scene), command.settings, command.overwrite)
 
 

@@ -1,11 +1,11 @@
 """The stages: each reads files of a scene folder, has the packages below compute, and writes files.
 
 A stage module `sc3d/stages/<name>.py` offers three functions of (scene, settings):
-    inputs   -> paths whose content decides whether the stage must run again
+    inputs   -> what decides whether the stage must run again: the content of paths, or `PhotoFrames`
     outputs  -> paths that it writes
     run      -> does the work; returns the figures for the summary and the sidecar
 and, where that is not all, one more:
-    besides  -> folders that it writes into without being known by them
+    besides  -> files, and folders, that it writes without being known by them
 Stages never import one another; `execute` below is what they share: skip finished work, time it, write the
 sidecars.
 """
@@ -25,9 +25,16 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from sc3d.errors import InputError, Sc3dError
-from sc3d.io.atomic import full_folder, remove_leftovers, require_inside, require_writable, temporary_name
+from sc3d.io.atomic import (
+    full_folder,
+    remove_leftovers,
+    require_inside,
+    require_replaceable,
+    require_writable,
+    temporary_name,
+)
 from sc3d.io.json_files import read_json, write_json
-from sc3d.io.provenance import digest, peak_memory_mb, reset_peak_memory, versions
+from sc3d.io.provenance import Input, PhotoFrames, digest, peak_memory_mb, reset_peak_memory, versions
 from sc3d.scene.scene import Scene
 from sc3d.settings.common import Resources, Workers
 
@@ -46,7 +53,7 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
     record: dict[str, Any] = {
         "stage": name,
         "settings": _decisive(settings, scene),
-        "inputs": {_portable(path, scene): digest(path) for path in stage.inputs(scene, settings)},
+        "inputs": {_named(item, scene): digest(item) for item in stage.inputs(scene, settings)},
     }
     outputs = stage.outputs(scene, settings)
     previous = _finished(record, outputs, scene, _path_fields(settings))
@@ -54,7 +61,7 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
         logger.info("%s: up to date (--overwrite runs it again)", name)
         return previous["summary"]
     besides = stage.besides(scene, settings) if hasattr(stage, "besides") else []
-    _prepare(scene, outputs, besides)
+    _prepare(scene, outputs, besides, getattr(settings, "output", None))
     started = time.perf_counter()
     reset_peak_memory()
     with _replacing(outputs), _room(scene, outputs):
@@ -72,14 +79,16 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
     return summary
 
 
-def _prepare(scene: Scene, outputs: list[Path], besides: list[Path]) -> None:
+def _prepare(scene: Scene, outputs: list[Path], besides: list[Path], named: Path | None) -> None:
     """Refuse outputs that cannot be written, or only through a link to elsewhere; remove what killed runs left
-    behind.
+    behind. named: the output that the user has named, a file; of the others, folders have no suffix.
     """
     for output in outputs:
         require_writable(output.parent)
+        require_replaceable(sidecar(output), is_folder=False)
     for path in [*outputs, *besides]:
         require_inside(scene.path, path)
+        require_replaceable(path, is_folder=not path.suffix and path != named)
     for folder in {scene.path, Path(tempfile.gettempdir()), *outputs, *(output.parent for output in outputs)}:
         remove_leftovers(folder)
 
@@ -145,6 +154,12 @@ def _decisive(settings: Any, scene: Scene) -> dict[str, object]:
 
 def _path_fields(settings: Any) -> set[str]:
     return {field.name for field in fields(settings) if "Path" in str(field.type)}
+
+
+def _named(item: Input, scene: Scene) -> str:
+    if isinstance(item, PhotoFrames):
+        return f"{_portable(item.folder, scene)} (frames)"
+    return _portable(item, scene)
 
 
 def _portable(path: Path, scene: Scene) -> str:

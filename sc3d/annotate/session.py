@@ -13,6 +13,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import require_inside
+from sc3d.io.folders import resolved
 from sc3d.io.images import read_image
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.photo_folder import find_photos, require_within
@@ -43,8 +44,8 @@ class Session:
         read.
         """
         scene.require(scene.classes, scene.images, hint="the page needs classes.json and images/")
-        require_inside(scene.path, scene.strokes / "any.json")
         self._scene = scene
+        self._check_folder()
         self._settings = settings
         self.class_table = scene.class_table()
         photos = find_photos(scene.images)
@@ -61,6 +62,10 @@ class Session:
         self._jpeg = lru_cache(maxsize=4)(self._encode)
         for key in self.photos:
             self.read(key)
+
+    def _check_folder(self) -> None:
+        """InputError if the folder of strokes has become a link that leads out of the scene."""
+        require_inside(self._scene.path, self._scene.strokes / "any.json")
 
     def describe(self) -> dict[str, object]:
         """Everything the page shows at its start, as JSON."""
@@ -79,7 +84,7 @@ class Session:
                 }
             )
         return {
-            "scene": self._scene.path.resolve().name,
+            "scene": resolved(self._scene.path).name,
             "start": self._start,
             "classes": classes,
             "photos": photos,
@@ -91,6 +96,7 @@ class Session:
         """
         name, folder = photo_name(self.photos[key], self._scene.images), self._scene.strokes
         file = self._names.find(folder, name, ".json") or self._names.path(folder, name, ".json")
+        self._check_folder()
         require_within(file.parent, folder)
         return file
 
@@ -148,6 +154,7 @@ class Session:
         if not self._trying.acquire(blocking=False):
             raise BusyError("still learning: wait for the last run to end")
         try:
+            self._check_folder()
             state = digest(self._scene.strokes)
             if self._learned is None or self._learned[0] != state:
                 self._learned = (

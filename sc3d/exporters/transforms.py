@@ -10,6 +10,7 @@ import open3d as o3d
 from sc3d.errors import InputError
 from sc3d.exporters.projected_cloud import copy_georeference
 from sc3d.geometry.cameras import View
+from sc3d.georeferencing.georeference import georeference_path
 from sc3d.importers.nerfstudio import OPENGL, camera_parameters
 from sc3d.io.clouds import write_geometry
 from sc3d.io.json_files import write_json
@@ -19,6 +20,11 @@ from sc3d.settings.outputs import Export
 
 def outputs(scene: Scene, settings: Export) -> list[Path]:
     return [scene.export / "transforms" / "transforms.json"]
+
+
+def besides(scene: Scene, settings: Export) -> list[Path]:
+    folder = outputs(scene, settings)[0].parent
+    return [folder / "sparse_pc.ply", georeference_path(Scene(folder))]
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:

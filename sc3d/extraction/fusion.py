@@ -179,6 +179,7 @@ def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
     known = store.read(row, "known")
     as_known = np.abs(known / np.where(np.isfinite(hit), hit, 1) - 1) < MARGIN
     covered = _unlike_surface(data, store, row, (known > 0) & np.isfinite(hit) & as_known)
+    empty = _large(empty | covered) & empty  # a few pixels at a border say nothing
     far = np.where(covered, (1 - MARGIN) * hit, np.where(empty, data.depth_range[1], 0)).astype(np.float32)
     others, nearest = _others(data, store, row), NEAREST * data.depth_range[0]
     depth = farthest_free(far, nearest, view, *others)
@@ -208,12 +209,17 @@ def _unlike_surface(data: DepthViews, store: EvidenceStore, row: int, hit: np.nd
     photo, shown = data.image(row).astype(np.float32), store.read(row, "colors").astype(np.float32)
     gap = np.abs(cv2.blur(photo, (9, 9)) - cv2.blur(shown, (9, 9))).max(axis=2)
     unlike = hit & ~confirmed & (gap > np.quantile(gap[confirmed], UNLIKE))
-    _, labels, sizes, _ = cv2.connectedComponentsWithStats(unlike.astype(np.uint8))
-    large = sizes[:, cv2.CC_STAT_AREA] >= OCCLUDER * hit.size
-    large[0] = False
-    seeds = large[labels]
+    seeds = _large(unlike)
     source, _ = nearest_by_color(data.image(row), seeds | confirmed | ~hit)
     return seeds.ravel()[source] & hit & ~confirmed
+
+
+def _large(region: np.ndarray) -> np.ndarray:
+    """(H, W) bool: connected parts of at least OCCLUDER of the pixels."""
+    _, labels, sizes, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8))
+    large = sizes[:, cv2.CC_STAT_AREA] >= OCCLUDER * region.size
+    large[0] = False
+    return large[labels]
 
 
 def _joined(parts: list[Part]) -> Part:

@@ -7,7 +7,6 @@ which a cloud comes from outside.
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -57,8 +56,6 @@ def cloud_in_world(scene: Scene, path: Path, resources: Resources, output: Path)
             write_geometry(target, to_open3d(replace(moved, triangles=None)))
         else:
             _write_in_parts(target, path, epsg, georeference)
-        found = path.stat()  # finished tiles of it are known by its time
-        os.utime(target, ns=(found.st_atime_ns, found.st_mtime_ns))
         logger.info("%s is read as %s", path, "world" if epsg is None else f"EPSG:{epsg}")
         yield target
     finally:

@@ -11,6 +11,7 @@ from sc3d.geometry.cameras import View, in_image, project
 from sc3d.importers.clouds import Geometry
 from sc3d.importers.project import Project
 from sc3d.io.colmap import build_model, registered_images, write_model
+from sc3d.io.folders import resolved
 from sc3d.io.photo_folder import link_photos
 from sc3d.scene.scene import Scene
 
@@ -50,7 +51,7 @@ def write_project(
         "left_out": project.counts_left_out(),
         "points": len(points),
         "points_are": told if len(points) else "none",
-        "images": str(photos.resolve()) if photos else "not found: link them to SCENE/images",
+        "images": str(resolved(photos)) if photos else "not found: link them to SCENE/images",
     } | project.notes
 
 

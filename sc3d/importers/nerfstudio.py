@@ -24,6 +24,7 @@ from sc3d.geometry.distortion import DistortionModel, Lenses
 from sc3d.importers.photos import names_in, photo_folder, plain_name
 from sc3d.importers.project import Project, rigid
 from sc3d.io.clouds import read_cloud
+from sc3d.io.folders import resolved
 from sc3d.io.images import image_size
 from sc3d.io.json_files import read_json
 from sc3d.settings.reconstruction import Import
@@ -281,7 +282,7 @@ def _points(folder: Path, content: dict) -> tuple[np.ndarray, np.ndarray]:
     """(P, 3) points of `ply_file_path` in the original frame, (P, 3) colors; none without such a file."""
     original, scale = _original_from_saved(content, folder)
     file = folder / plain_name(str(content.get("ply_file_path") or ""))
-    if not file.resolve().is_relative_to(folder.resolve()):
+    if not resolved(file).is_relative_to(resolved(folder)):
         logger.warning("%s: ply_file_path leads out of the project, it is not read: %r", folder, str(file))
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not file.is_file():

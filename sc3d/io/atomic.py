@@ -19,6 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sc3d.errors import InputError
+from sc3d.io.folders import resolved
 
 logger = logging.getLogger(__name__)
 
@@ -205,12 +206,23 @@ def require_inside(folder: Path, path: Path) -> None:
     if folder not in path.parents:
         return
     if path.is_symlink() and path.is_dir():
-        raise InputError(f"{path} is a link to {path.resolve()}, which would be overwritten: remove the link")
+        raise InputError(f"{path} is a link to {resolved(path)}, which would be overwritten: remove the link")
     outer = next((parent for parent in path.parents if parent.exists()), folder)
-    if folder in (outer, *outer.parents) and not outer.resolve().is_relative_to(folder.resolve()):
+    if folder in (outer, *outer.parents) and not resolved(outer).is_relative_to(resolved(folder)):
         raise InputError(
             f"{outer} is a link that leads out of {folder}: what lies there is not overwritten, remove the link"
         )
+
+
+def require_replaceable(path: Path, is_folder: bool) -> None:
+    """InputError, before any work, if a folder cannot be replaced as it is something else, or a file as it is a
+    folder.
+    """
+    if is_folder and os.path.lexists(path) and (path.is_symlink() or not path.is_dir()):
+        kind = "link" if path.is_symlink() else "file" if path.is_file() else "pipe or device"
+        raise InputError(f"{path} is a {kind}, but a folder is to be written there: remove it")
+    if not is_folder and path.is_dir() and not path.is_symlink():
+        raise InputError(f"{path} is a folder, but a file is to be written there: remove it or rename it")
 
 
 def _is_writable(folder: Path) -> bool:
@@ -281,6 +293,6 @@ def _sync_one(path: Path) -> None:
 
 def require_writable(folder: Path) -> None:
     """Raise InputError, before any work, if a scene folder cannot be written."""
-    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    existing = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     if not existing.is_dir() or not _is_writable(existing):
         raise InputError(f"cannot write to {existing}: check its permissions or choose another folder")

@@ -12,6 +12,11 @@ OUTPUTS = ("masks", "confidence", "confidence_refined", "instances", "strokes", 
 PICTURES = ("train.jpg",)
 
 
+def resolved(path: Path) -> Path:
+    """As `Path.resolve`, which fails before Python 3.13 for a link to itself."""
+    return Path(os.path.realpath(path))
+
+
 def files_below(folder: Path) -> tuple[list[Path], list[Path]]:
     """Files of a folder and its subfolders, ordered; and the folders and files in it that sc3d has written,
     scenes among them, which are not looked into. Links to folders are not followed.
@@ -33,7 +38,7 @@ def is_scene(folder: Path) -> bool:
     with suppress(OSError):
         sidecars = [*folder.glob("*.json"), *(folder / "sparse").glob("*.json")]
         images = folder / "images"
-        around = images.is_symlink() and folder.resolve().is_relative_to(images.resolve())
+        around = images.is_symlink() and resolved(folder).is_relative_to(resolved(images))
         return around or any(map(_is_sidecar, sidecars))
     return False
 

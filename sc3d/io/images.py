@@ -50,6 +50,7 @@ OTHER_FORMATS: dict[str, Callable[[bytes], bool]] = {
     "PSD": lambda head: head[:4] == b"8BPS",
 }
 STRIPS_AND_TILES = (273, 279), (324, 325)  # tags of TIFF: offsets and lengths
+XMP = 700  # tag of TIFF
 END_OF_IMAGE, START_OF_SCAN = b"\xff\xd9", 0xDA
 
 
@@ -209,6 +210,21 @@ def read_opaque(path: Path) -> np.ndarray | None:
         orientation = orientation_of(image) if image.format == "TIFF" else 1
         opaque = np.array(image.convert("RGBA").getchannel("A")) > 0
     return None if opaque.all() else np.ascontiguousarray(turned(opaque, inverse(orientation)))
+
+
+def frame_of_photo(path: Path) -> tuple | None:
+    """How masks and the world lie on a photo, by its header: its size as stored, its EXIF orientation and XMP,
+    where drones write how they held it; None where that is not all, as it has alpha or cannot be read.
+    """
+    with suppress(InputError), open_image(path, "photo") as image:
+        return None if _has_alpha(image) else (*stored_size(image), orientation_of(image), *_xmp(image))
+    return None
+
+
+def _xmp(image: Image.Image) -> list[object]:
+    """XMP of an opened Pillow image, wherever JPEG, PNG and TIFF keep it; None where there is none."""
+    segments = [data for name, data in getattr(image, "applist", []) if b"ns.adobe.com/xap" in data[:40]]
+    return [*segments, image.info.get("XML:com.adobe.xmp"), getattr(image, "tag_v2", {}).get(XMP)]
 
 
 def has_alpha(path: Path) -> bool:

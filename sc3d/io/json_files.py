@@ -24,6 +24,7 @@ def read_text(path: Path) -> str:
     Europe. InputError if it is missing or no text.
     """
     try:
+        _require_file(path)
         content = path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
@@ -32,6 +33,11 @@ def read_text(path: Path) -> str:
         with suppress(UnicodeDecodeError):
             return content.decode(encoding)
     raise InputError(f"{path} is no text file")
+
+
+def _require_file(path: Path) -> None:
+    if not path.is_file():  # a pipe could be waited for, and a device has no end
+        raise FileNotFoundError(errno.ENOENT, "No such file")
 
 
 def whole_number(value: object) -> int | None:
@@ -59,8 +65,7 @@ def read_json(path: Path, max_bytes: int | None = None) -> object:
     as much).
     """
     try:
-        if not path.is_file():  # a pipe could be waited for
-            raise FileNotFoundError(errno.ENOENT, "No such file")
+        _require_file(path)
         if max_bytes is not None and path.stat().st_size > max_bytes:
             raise InputError(f"{path} is larger than {max_bytes >> 20} MiB: that is no file of this kind")
         return json.loads(path.read_bytes())  # UTF-8, 16 or 32, with or without a byte order mark

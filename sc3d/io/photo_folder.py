@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
-from sc3d.io.folders import files_below
+from sc3d.io.folders import files_below, resolved
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
@@ -98,7 +98,7 @@ def find_photos(folder: Path) -> list[Path]:
 
 def require_place(photos: Path, images: Path) -> None:
     """InputError if `images` already holds other photos than those of the folder `photos`."""
-    if images.exists() and not images.is_symlink() and images.resolve() != photos.resolve():
+    if images.exists() and not images.is_symlink() and resolved(images) != resolved(photos):
         raise InputError(f"{images} already holds other photos: choose another scene folder")
 
 
@@ -107,18 +107,18 @@ def link_photos(photos: Path, images: Path) -> None:
     folder. InputError if it already holds others.
     """
     require_place(photos, images)
-    if images.exists() and images.resolve() == photos.resolve():
+    if images.exists() and resolved(images) == resolved(photos):
         return
     with atomic_path(images) as temporary:
         try:
-            os.symlink(photos.resolve(), temporary, target_is_directory=True)
+            os.symlink(resolved(photos), temporary, target_is_directory=True)
         except (OSError, NotImplementedError):  # Windows asks for a privilege
             shutil.copytree(photos, temporary)
 
 
 def require_within(file: Path, folder: Path) -> None:
     """InputError if a file of a folder is a link to a file outside of it; the folder itself may be a link."""
-    if not file.resolve().is_relative_to(folder.resolve()):
+    if not resolved(file).is_relative_to(resolved(folder)):
         raise InputError(
             f"{file} is a link that leads out of {folder}: copy the file there, or make the whole folder a link"
         )

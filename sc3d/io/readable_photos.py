@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import left_out
+from sc3d.io.folders import resolved
 from sc3d.io.images import (
     has_alpha,
     image_size,
@@ -68,6 +69,6 @@ def tell_of_transparent(photos: Mapping[str, Path], what: str) -> list[str]:
 
 def _link(photo: Path, target: Path) -> None:
     try:
-        os.symlink(photo.resolve(), target)
+        os.symlink(resolved(photo), target)
     except (OSError, NotImplementedError):  # Windows asks for a privilege
         shutil.copyfile(photo, target)

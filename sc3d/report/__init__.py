@@ -9,6 +9,7 @@ from importlib import resources
 from pathlib import Path
 
 from sc3d.io.atomic import atomic_path
+from sc3d.io.folders import resolved
 from sc3d.report.data import load_report_data
 from sc3d.report.sections import headline, sections, summary_line
 from sc3d.scene.scene import Scene
@@ -30,7 +31,7 @@ def write_report(scene: Scene, path: Path) -> None:
     parts = [(anchor, title, body) for anchor, title, body in sections(data) if body]
     template = string.Template(_resource("page.html"))
     page = template.substitute(
-        title=html.escape(scene.path.resolve().name),
+        title=html.escape(resolved(scene.path).name),
         summary=summary_line(data),
         headline=headline(data),
         navigation="".join(f'<a href="#{anchor}">{html.escape(title)}</a>' for anchor, title, _ in parts),
@@ -41,7 +42,7 @@ def write_report(scene: Scene, path: Path) -> None:
         style=_resource("style.css"),
     )
     with atomic_path(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names that are no text
     logger.info("report: %d sections, %.1f MB", len(parts), len(page) / 1e6)
 
 

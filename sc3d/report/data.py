@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.raster import Raster, highest_points, spacing_of_all
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.json_files import read_json
+from sc3d.runner import MAX_SIDECAR, sidecar
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene, find_masks
 
@@ -79,11 +81,7 @@ class ReportData:
     @cached_property
     def truth(self) -> Path:
         """The folder of truth masks that was evaluated against, else the scene's own."""
-        used = next(
-            (record.get("settings") for record in self.records if record["stage"] == "evaluate"), None
-        )
-        folder = used.get("truth") if isinstance(used, dict) else None
-        return Path(folder) if isinstance(folder, str) and Path(folder).is_dir() else self.scene.truth
+        return evaluated_truth(self.scene)
 
     @cached_property
     def truth_files(self) -> dict[str, Path]:
@@ -122,13 +120,29 @@ def load_report_data(scene: Scene) -> ReportData:
     )
 
 
+def evaluated_truth(scene: Scene) -> Path:
+    """The folder of truth masks that metrics.json was made with, else the scene's own."""
+    with suppress(InputError):
+        record: Any = read_json(sidecar(scene.metrics), MAX_SIDECAR)
+        used = record.get("settings") if isinstance(record, dict) else None
+        told = used.get("truth") if isinstance(used, dict) else None
+        if isinstance(told, str) and (scene.path / told).is_dir():
+            return scene.path / told
+    return scene.truth
+
+
+def sidecar_files(folder: Path) -> list[Path]:
+    """JSON files of a scene folder that may be records of the stages."""
+    return sorted([*folder.glob("*.json"), *folder.glob("sparse/*.json")])
+
+
 def _read_sidecars(folder: Path) -> list[dict]:
     """Records of the stages; outputs of one run count once."""
     records: dict[str, dict] = {}
-    for file in sorted([*folder.glob("*.json"), *folder.glob("sparse/*.json")]):
+    for file in sidecar_files(folder):
         try:
-            record = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
+            record = read_json(file, MAX_SIDECAR)
+        except InputError:
             logger.warning("%s is not valid JSON and is left out of the report", file)
             continue
         if isinstance(record, dict) and isinstance(record.get("stage"), str):
@@ -157,7 +171,8 @@ def class_areas(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
 def read_features(file: Path) -> list[dict] | None:
     """Properties of the features of a GeoJSON file; None if it does not exist or is another kind of file."""
     try:
-        features = json.loads(file.read_text(encoding="utf-8"))["features"]
+        content: Any = read_json(file)
+        features = content["features"]
         return [feature["properties"] for feature in features if isinstance(feature["properties"], dict)]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    except (InputError, KeyError, TypeError):
         return None

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
 from sc3d.errors import InputError, left_out
+from sc3d.io.arrays import read_arrays
 from sc3d.io.atomic import atomic_path
+from sc3d.io.limits import DamagedFileError
 
 FEW = 0.05  # of a photo's pixels; with fewer confirmed ones it hardly counts
 
@@ -89,10 +91,9 @@ def read_depth_map(path: Path) -> DepthMap:
 
 
 def _read(path: Path, *names: str) -> list[np.ndarray]:
+    if not os.path.lexists(path):
+        raise InputError(f"{path} is missing: run `sc3d depth` first")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return [file[name] for name in names]
-    except FileNotFoundError:
-        raise InputError(f"{path} is missing: run `sc3d depth` first") from None
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        return read_arrays(path, names)
+    except DamagedFileError as error:
         raise InputError(f"{path} is damaged ({error}): run `sc3d depth --overwrite`") from None

@@ -22,6 +22,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from urllib.parse import unquote
 
 from sc3d.errors import InputError
+from sc3d.io.folders import resolved
 from sc3d.io.photo_folder import IMAGE_SUFFIXES
 
 # of a foreign name; all others belong to the name
@@ -154,7 +155,7 @@ class PhotoNames:
         told = key if self.pattern is None else path
         found = self.match(told, changed)
         if len(found) > 1 and folder is not None:
-            found = self.match(f"{folder.resolve().as_posix()}/{told}", changed)
+            found = self.match(f"{resolved(folder).as_posix()}/{told}", changed)
         return found
 
     def match(self, foreign: str, changed: bool = True) -> tuple[str, ...]:

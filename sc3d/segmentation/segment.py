@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import os
@@ -12,7 +11,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from sc3d.io.atomic import claim, discard, remove_leftovers
+from sc3d.io.atomic import claim, discard, remove_leftovers, require_replaceable
 from sc3d.io.images import image_size, read_image, read_opaque, read_orientation, write_image
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.mask_images import index_image_size
@@ -107,17 +106,10 @@ def segment_scene(
 
 
 def _state(scene: Scene, settings: Segment, class_table: ClassTable) -> object:
-    """What decides the masks, as JSON: everything but where the models lie and run. Photos are told by size
-    and time, as they are read often.
-    """
+    """What decides the masks, as JSON: everything but where the models lie and run."""
     decisive = replace(settings, device="auto", download=False, model_dir=None, strokes=None)
     strokes = digest(settings.strokes or scene.strokes) if settings.backend == "strokes" else ""
-    photos = [
-        (photo_name(photo, scene.images), photo.stat().st_size, photo.stat().st_mtime_ns)
-        for photo in find_photos(scene.images)
-    ]
-    seen = hashlib.blake2b(repr(photos).encode(), digest_size=16).hexdigest()
-    return json.loads(json.dumps([repr(decisive), class_table.as_json(), strokes, seen]))
+    return json.loads(json.dumps([repr(decisive), class_table.as_json(), strokes, digest(scene.images)]))
 
 
 def _set_aside(folders: Folders, suffix: str) -> None:
@@ -128,6 +120,7 @@ def _set_aside(folders: Folders, suffix: str) -> None:
         aside = folder.with_name(f"{folder.name}.{suffix}")
         if folder.is_dir():
             discard(aside)
+            require_replaceable(aside, is_folder=True)
             folder.rename(aside)
             logger.info("%s is now %s", folder, aside)
 

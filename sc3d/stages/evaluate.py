@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.metrics import evaluate_scene
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Evaluate
@@ -11,9 +12,10 @@ from sc3d.tiling.evaluate import evaluate_fits
 from sc3d.tiling.evaluate import evaluate_scene as evaluate_scene_by_tiles
 
 
-def inputs(scene: Scene, settings: Evaluate) -> list[Path]:
+def inputs(scene: Scene, settings: Evaluate) -> list[Input]:
     truth, labelled = settings.truth or scene.truth, settings.labelled or scene.labelled
-    return [scene.sparse, scene.classes, scene.masks, scene.mesh, truth, labelled]
+    frames = PhotoFrames(scene.images)
+    return [scene.sparse, scene.classes, scene.masks, scene.mesh, truth, labelled, frames]
 
 
 def outputs(scene: Scene, settings: Evaluate) -> list[Path]:

@@ -31,11 +31,19 @@ def inputs(scene: Scene, settings: Export) -> list[Path]:
         settings.labelled or scene.labelled,
         scene.gaussians,
         georeference_path(scene),
+        *([scene.images, scene.masks] if "masks" in settings.format else []),  # which are shown beside
     ]
 
 
 def outputs(scene: Scene, settings: Export) -> list[Path]:
     return [path for name in settings.format for path in _module(name).outputs(scene, settings)]
+
+
+def besides(scene: Scene, settings: Export) -> list[Path]:
+    modules = [_module(name) for name in settings.format]
+    return [
+        path for module in modules if hasattr(module, "besides") for path in module.besides(scene, settings)
+    ]
 
 
 def run(scene: Scene, settings: Export) -> dict[str, object]:

@@ -25,7 +25,9 @@ from sc3d.settings.reconstruction import GeoreferenceOptions
 
 
 def inputs(scene: Scene, settings: GeoreferenceOptions) -> list[Path]:
-    return [scene.sparse] + ([settings.gcp] if settings.gcp else [])
+    if settings.gcp is not None:
+        return [scene.sparse, settings.gcp]
+    return [scene.sparse] if settings.offset is not None else [scene.sparse, scene.images]  # whose GPS counts
 
 
 def outputs(scene: Scene, settings: GeoreferenceOptions) -> list[Path]:

@@ -19,7 +19,9 @@ from sc3d.importers.photos import locate_photos
 from sc3d.importers.project import Project, project_files, read_project, warn_of_left_out
 from sc3d.io.atomic import require_writable
 from sc3d.io.clouds import write_geometry
+from sc3d.io.colmap import is_model
 from sc3d.io.photo_folder import find_photos, require_place
+from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.runner import execute
 from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
@@ -50,10 +52,12 @@ def is_geometry(path: Path, settings: Import) -> bool:
     )
 
 
-def inputs(scene: Scene, settings: Import) -> list[Path]:
-    return list(settings.cloud) + (
-        [] if settings.project in settings.cloud else project_files(settings.project, settings)
-    )
+def inputs(scene: Scene, settings: Import) -> list[Input]:
+    if settings.project not in settings.cloud:
+        photos = [PhotoFrames(settings.images)] if settings.images else []  # whose names and sizes count
+        return [*settings.cloud, *project_files(settings.project, settings), *photos]
+    # the frame of a geometry alone is that of the cameras; without any, the place is made of it
+    return [*settings.cloud, *([scene.sparse, georeference_path(scene)] if is_model(scene.sparse) else [])]
 
 
 def outputs(scene: Scene, settings: Import) -> list[Path]:
@@ -94,7 +98,7 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
         figures = write_project(scene, project, photos, [geometry for geometry, _ in placed.values()])
         figures |= _without_camera(project, photos)
         georeference_path(scene).unlink(missing_ok=True)
-    if georeference is not None:
+    if georeference is not None and (project is not None or not georeference_path(scene).exists()):
         write_georeference(scene, georeference)
     elif project is not None:
         tell_tilt(scene)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from sc3d.georeferencing.georeference import georeference_path
 from sc3d.importers.given_cloud import cloud_in_world
+from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.labelling.inputs import best_confidence
 from sc3d.labelling.label import label_scene
 from sc3d.scene.scene import Scene
@@ -14,10 +16,12 @@ from sc3d.tiling.label import label_fits
 from sc3d.tiling.label import label_scene as label_scene_by_tiles
 
 
-def inputs(scene: Scene, settings: Label) -> list[Path]:
+def inputs(scene: Scene, settings: Label) -> list[Input]:
     splats = [scene.gaussians] if settings.resolved.mechanisms.density else []
-    cloud = settings.cloud or scene.cloud
-    return [scene.sparse, scene.classes, scene.masks, best_confidence(scene), scene.mesh, cloud, *splats]
+    cloud = [settings.cloud, georeference_path(scene)] if settings.cloud else [scene.cloud]
+    frames = PhotoFrames(scene.images)
+    confidence = best_confidence(scene)
+    return [scene.sparse, scene.classes, scene.masks, confidence, scene.mesh, *cloud, *splats, frames]
 
 
 def outputs(scene: Scene, settings: Label) -> list[Path]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.propagation.propagate import propagate_scene
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
@@ -11,8 +12,8 @@ from sc3d.tiling.propagate import propagate_fits
 from sc3d.tiling.propagate import propagate_scene as propagate_scene_by_tiles
 
 
-def inputs(scene: Scene, settings: Propagate) -> list[Path]:
-    return [settings.seeds or scene.seeds]
+def inputs(scene: Scene, settings: Propagate) -> list[Input]:
+    return [settings.seeds or scene.seeds, scene.sparse, PhotoFrames(scene.images)]  # which tell up
 
 
 def outputs(scene: Scene, settings: Propagate) -> list[Path]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sc3d.report import write_report
+from sc3d.report.data import evaluated_truth, sidecar_files
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Report
 
@@ -20,9 +21,10 @@ def inputs(scene: Scene, settings: Report) -> list[Path]:
         scene.classes,
         scene.mesh,
         scene.images,
-        scene.truth,
+        evaluated_truth(scene),
         scene.path / "train.jpg",
         *sorted(scene.export.glob("*.geojson")),  # not the folder: the report may be written there
+        *(file for file in sidecar_files(scene.path) if not file.name.endswith(".html.json")),  # not its own
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sc3d.io.atomic import discard
+from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.segmentation.grounded_sam import GroundedSam
@@ -16,12 +17,13 @@ from sc3d.segmentation.text_prompts import replace_prompts
 from sc3d.settings.labels import Segment
 
 
-def inputs(scene: Scene, settings: Segment) -> list[Path]:
+def inputs(scene: Scene, settings: Segment) -> list[Input]:
+    frames = PhotoFrames(scene.images)
     if settings.refine:
-        return [scene.classes, scene.sparse, scene.masks, scene.confidence, scene.cloud, scene.mesh]
+        return [scene.classes, scene.sparse, scene.masks, scene.confidence, scene.cloud, scene.mesh, frames]
     given = [path for path in (settings.masks, settings.confidence, settings.mapping) if path is not None]
     if settings.backend == "files":
-        return [scene.classes, *given]
+        return [scene.classes, *given, frames, *([] if settings.masks else [scene.sparse])]
     return [
         scene.classes,
         scene.images,

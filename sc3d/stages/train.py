@@ -34,6 +34,10 @@ def outputs(scene: Scene, settings: Train) -> list[Path]:
     return [scene.gaussians]
 
 
+def besides(scene: Scene, settings: Train) -> list[Path]:
+    return [scene.path / "train.csv", scene.path / "train.jpg"]
+
+
 def run(scene: Scene, settings: Train) -> dict[str, object]:
     in_blocks = settings.blocks > 1
     if not (in_blocks and settings.cluster):  # whose workers may have the GPU that this machine lacks

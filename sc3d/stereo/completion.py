@@ -24,6 +24,7 @@ MOST = 300  # of them tried
 TILTED = 10.0  # degrees between ground as a whole and level
 FLAT = 0.05  # of the height of the cameras above the ground, how flat that is
 MIN_GROUND = 50  # points
+STRIP = 0.1  # least width of ground for its length
 CELLS = 24  # of the map of its relief, along each side
 SMOOTH = 0.3  # weight of the relief's second differences against the heights in a cell
 RIDGE = 0.05  # weight of the relief itself: without points around, the ground is the plane
@@ -154,7 +155,10 @@ def fit_ground(points: np.ndarray, centers: np.ndarray, up: np.ndarray) -> Groun
     if found is None or best < MIN_GROUND:
         return None
     middle = chosen[found].mean(axis=0)
-    normal = np.linalg.svd(chosen[found] - middle, full_matrices=False)[2][2]
+    spread, directions = np.linalg.svd(chosen[found] - middle, full_matrices=False)[1:]
+    if spread[1] < STRIP * spread[0]:  # the foot of a wall, no ground
+        return None
+    normal = directions[2]
     normal *= np.sign(normal @ up)
     heights = (chosen - middle) @ normal
     clearance = float(np.median((centers - middle) @ normal))

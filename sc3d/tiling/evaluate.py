@@ -15,6 +15,7 @@ from sc3d.geometry.cameras import View, camera_rays, local_origin, may_see
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import FirstSurface, first_surface, surface_points
 from sc3d.io.chunked_clouds import CloudFile, positions
+from sc3d.io.provenance import PhotoFrames
 from sc3d.metrics import EvaluationSummary, judge, truth_masks
 from sc3d.scene.labelled_cloud import REACH
 from sc3d.scene.labels import Labels
@@ -81,10 +82,8 @@ def evaluate_fits(scene: Scene, settings: Evaluate) -> bool:
 def evaluate_scene(scene: Scene, settings: Evaluate) -> EvaluationSummary:
     """As `metrics.evaluate_scene`, tile by tile, here or on the workers that the settings ask for."""
     cloud, output = CloudFile.open(settings.labelled or scene.labelled), settings.output or scene.metrics
-    labels, decisive = (
-        read_labels(cloud),
-        [scene.sparse, scene.mesh, settings.truth or scene.truth, cloud.path],
-    )
+    labels, truth = read_labels(cloud), settings.truth or scene.truth
+    decisive = (scene.sparse, scene.mesh, truth, cloud.path, PhotoFrames(scene.images))
     folder = WorkFolder(output, "evaluate", decisive, settings)
     with open_executor(settings) as executor:
         surface = find_points(scene, settings, cloud, folder, executor)

@@ -17,6 +17,7 @@ from sc3d.geometry.neighbors import NeighborIndex, point_spacing
 from sc3d.geometry.voxels import BLOCK, VOXELS, file_header, sort_by_voxel, unpack_blocks, voxel_origin
 from sc3d.io.chunked_clouds import CloudFile, columns, positions, rows_at_once
 from sc3d.io.ply import write_records
+from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.labelling.cloud import Cloud, CloudExtent
 from sc3d.labelling.fusion import Fusion, fuse
 from sc3d.labelling.inputs import (
@@ -106,13 +107,14 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     cloud = CloudFile.open(settings.cloud or scene.cloud)
     confidence = best_confidence(scene) if settings.use_confidence else None
     masks, output = Masks.load(scene, confidence), settings.output or scene.seeds
-    decisive = [
+    decisive: list[Input] = [
         scene.sparse,
         scene.classes,
         scene.masks,
         *([confidence] if confidence else []),
         scene.mesh,
         cloud.path,
+        PhotoFrames(scene.images),
     ]
     folder = WorkFolder(output, "label", decisive, settings)
     statistics = CloudStatistics.from_cloud(cloud)

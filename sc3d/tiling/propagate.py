@@ -22,6 +22,7 @@ from sc3d.errors import InputError
 from sc3d.georeferencing.up_direction import scene_up
 from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.ply import read_header, write_records
+from sc3d.io.provenance import PhotoFrames
 from sc3d.propagation.appearance import (
     AppearanceModel,
     AppearanceStatistics,
@@ -82,7 +83,7 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     if channels is None:
         raise InputError(f"{cloud.path} has votes of no class: it was not written by `sc3d label`")
     folder, statistics = (
-        WorkFolder(output, "propagate", [cloud.path], settings),
+        WorkFolder(output, "propagate", [cloud.path, scene.sparse, PhotoFrames(scene.images)], settings),
         CloudStatistics.from_cloud(cloud),
     )
     room = max_points(settings, bytes_per_point(channels.count))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 from sc3d.io.atomic import claim, reject, remove, require_room
 from sc3d.io.json_files import write_text
+from sc3d.io.provenance import Input, PhotoFrames, digest
 from sc3d.settings.common import Resources
 
 MADE = "made-here"  # file that says where its folder was made
@@ -21,7 +23,7 @@ class WorkFolder:
     content, and removed with the last output.
     """
 
-    def __init__(self, output: Path, stage: str, inputs: list[Path], settings: Any) -> None:
+    def __init__(self, output: Path, stage: str, inputs: Sequence[Input], settings: Any) -> None:
         ignored = {field.name for field in fields(Resources)}
         decisive = [
             sorted(
@@ -31,7 +33,7 @@ class WorkFolder:
             )
         ]
         state = hashlib.sha256(
-            repr((stage, decisive, [_identity(path) for path in inputs])).encode()
+            repr((stage, decisive, [_identity(item) for item in inputs])).encode()
         ).hexdigest()[:12]
         self.folder = output.absolute().parent / f".{output.name}.{state}.parts"
         for other in self.folder.parent.glob(f".{glob.escape(output.name)}.*.parts"):
@@ -63,11 +65,6 @@ class WorkFolder:
         remove(self.folder)
 
 
-def _identity(path: Path) -> tuple:
-    """Of a file, or of all files of a folder: names from there on, sizes and times; wherever it lies."""
-    files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    return path.name, tuple(
-        (file.relative_to(path).as_posix(), file.stat().st_size, file.stat().st_mtime_ns)
-        for file in files
-        if file.is_file()
-    )
+def _identity(item: Input) -> tuple[str, str]:
+    """Name and content, wherever it lies."""
+    return item.folder.name if isinstance(item, PhotoFrames) else item.name, digest(item)

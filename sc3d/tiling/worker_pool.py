@@ -70,7 +70,7 @@ class _Worker:
     def end(self) -> None:
         self.connection.close()
         if self.index is not None:
-            self._process.terminate()
+            self._process.kill()  # a native library could answer a gentler signal with a trace of its own
         self._process.join(SECONDS)
         if self._process.exitcode is None:
             self._process.kill()

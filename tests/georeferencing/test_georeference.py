@@ -152,7 +152,7 @@ XMP = '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description {attributes
 def write_photo(
     path: Path, position: tuple[float, float, float] | None, xmp: str = "", size: tuple[int, int] = (40, 30)
 ) -> Path:
-    exif = photo_exif(np.array(position), 0) if position else Image.Exif()
+    exif = photo_exif(0, np.array(position)) if position else Image.Exif()
     Image.new("RGB", size).save(path, exif=exif, **({"xmp": xmp.encode()} if xmp else {}))
     return path
 
@@ -186,7 +186,7 @@ class TestGeotags:
             ([[0, 0], [60, 0], [0, 60], [60, 60]], "area", None),
             ([[0, 0], [30, 0.4], [60, -0.4], [90, 0]], "line", "one line"),
             ([[0, 0], [0.5, 0], [0, 0.5], [0.3, 0.3]], None, "within"),
-            ([[0, 0], [60, 0]], None, "only 2 of 3"),
+            ([[0, 0], [60, 0]], None, "2 of 3 photos have GPS, 3 are needed"),
             ([], None, "no photo has GPS"),
         ],
     )

@@ -5,11 +5,13 @@ many classes; and what is left out is told.
 from __future__ import annotations
 
 import errno
+import importlib
 import json
 import logging
 import os
 import re
 import shutil
+import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass, replace
@@ -25,11 +27,13 @@ from sc3d.errors import InputError, Sc3dError
 from sc3d.exporters.packages import load
 from sc3d.io import atomic, caches, requirements
 from sc3d.io.clouds import read_cloud, write_geometry
+from sc3d.io.provenance import PhotoFrames, digest
 from sc3d.runner import execute, sidecar
 from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import read_votes, vote_channels
 from sc3d.scene.scene import Scene, SparseModel, require_views
-from sc3d.settings.labels import Evaluate, Label, Propagate
+from sc3d.settings.labels import Evaluate, Label, Propagate, Segment
+from sc3d.settings.reconstruction import Import
 from sc3d.stages.extract import _depth_range, _require_room
 from sc3d.tiling import label as tiled_label
 from sc3d.tiling import propagate as tiled_propagate
@@ -161,6 +165,135 @@ def test_unfinished_tiles_are_found_by_every_path(site, tmp_path):
         Path("site/seeds.ply"), "label", [Path("site/cloud.ply"), Path("site/images")], Label(cloud=Path("x"))
     )
     assert here.folder == made.folder and (here.folder / "tiles").is_dir()
+
+
+def test_unfinished_tiles_go_with_the_content_of_their_inputs(tmp_path):
+    """Another file of the same size, to which `cp -p` has given the same time."""
+    cloud = tmp_path / "cloud.ply"
+    cloud.write_bytes(b"1")
+    found = cloud.stat()
+    made = WorkFolder(tmp_path / "seeds.ply", "label", [cloud], Label())
+    cloud.write_bytes(b"2")
+    os.utime(cloud, ns=(found.st_atime_ns, found.st_mtime_ns))
+    assert WorkFolder(tmp_path / "seeds.ply", "label", [cloud], Label()).folder != made.folder
+
+
+def turn(photo: Path) -> None:
+    with Image.open(photo) as image:
+        exif = image.getexif()
+        exif[0x0112] = 3
+        image.save(photo, exif=exif)
+
+
+def test_frames_of_photos_are_names_sizes_orientation_and_alpha(tmp_path):
+    photos = tmp_path / "images"
+    photos.mkdir()
+
+    def state() -> str:
+        return digest(PhotoFrames(photos))
+
+    assert state() == ""
+    seen = {state()}
+    colors = Image.new("RGB", (8, 6), "red"), Image.new("RGB", (8, 6), "blue")
+    for change in (
+        lambda: colors[0].save(photos / "a.jpg"),
+        lambda: turn(photos / "a.jpg"),
+        lambda: colors[0].save(photos / "a.jpg", xmp=b"<x:xmpmeta>pitch</x:xmpmeta>"),
+        lambda: Image.new("RGB", (6, 8)).save(photos / "a.jpg"),
+        lambda: Image.new("RGBA", (6, 8), (0, 0, 0, 255)).save(photos / "b.png"),
+        lambda: Image.new("RGBA", (6, 8), (0, 0, 0, 0)).save(photos / "b.png"),
+        lambda: (photos / "b.png").rename(photos / "c.png"),
+        lambda: (photos / "d.jpg").write_bytes(b"damaged"),
+        lambda: (photos / "d.jpg").write_bytes(b"Damaged"),
+    ):
+        change()
+        assert state() not in seen
+        seen.add(state())
+    (photos / "d.jpg").unlink()
+    colors[0].save(photos / "a.jpg")
+    before = state()
+    colors[1].save(photos / "a.jpg")  # other colors: no label changes
+    assert state() == before
+
+
+@pytest.mark.parametrize("stage", ["label", "evaluate", "refine", "masks"])
+def test_photos_that_were_turned_are_looked_at_again(tmp_path, caplog, monkeypatch, stage):
+    scene = builders.labelled_scene(tmp_path / "scene")
+    name, settings = {
+        "label": ("label", Label()),
+        "evaluate": ("evaluate", Evaluate()),
+        "refine": ("segment", Segment(refine=True)),
+        "masks": ("segment", Segment(masks=scene.truth)),
+    }[stage]
+    module, times = importlib.import_module(f"sc3d.stages.{name}"), []
+    run = module.run if stage != "evaluate" else lambda *_: scene.metrics.write_text("{}") and {}
+    monkeypatch.setattr(module, "run", lambda *both: (times.append(1), run(*both))[1])
+    if stage == "refine":
+        from sc3d.segmentation.mask_refinement import Refinement
+
+        monkeypatch.setattr(Refinement, "helps", True)
+    for photo in (None, None, scene.images / "photo_1.jpg", None):
+        if photo is not None:
+            turn(photo)
+        execute(name, scene, settings)
+    assert len(times) == 2
+
+
+def test_a_cloud_from_outside_goes_with_the_place_of_the_scene(tmp_path):
+    """By its CRS it is brought into the world, which the georeference says."""
+    scene = builders.labelled_scene(tmp_path / "scene")
+    cloud = scene.labelled
+    label = importlib.import_module("sc3d.stages.label").inputs
+    assert scene.path / "georeference.json" in label(scene, Label(cloud=cloud))
+    imports = importlib.import_module("sc3d.stages.import_project").inputs
+    settings = Import(source="cloud", project=cloud, cloud=(cloud,))
+    assert {scene.sparse, scene.path / "georeference.json"} <= set(imports(scene, settings))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="holes are made otherwise elsewhere")
+def test_files_of_holes_are_not_read_for_hours(tmp_path):
+    file = tmp_path / "cloud.ply"
+    file.write_bytes(b"ply\n")
+    os.truncate(file, 1 << 40)
+    with pytest.raises(InputError, match="next to nothing is on the disk"):
+        digest(file)
+    file.unlink()
+    file.write_bytes(bytes(1 << 12))
+    os.truncate(file, 1 << 20)  # small: some disks keep few bytes of what is alike
+    assert digest(file)
+
+
+def test_a_scene_that_cannot_be_written_is_still_read(tmp_path, monkeypatch, caplog, capsys):
+    """From an archive or another user: what is finished is finished, and outputs may lie elsewhere."""
+    scene = builders.labelled_scene(tmp_path / "scene")
+    cli.main(["label", str(scene.path)])
+    before = atomic._is_writable
+    monkeypatch.setattr(
+        atomic, "_is_writable", lambda folder: scene.path not in (folder, *folder.parents) and before(folder)
+    )
+    cli.main(["label", str(scene.path)])
+    assert "up to date" in caplog.text
+    cli.main(["propagate", str(scene.path), "--method", "knn", "--output", str(tmp_path / "labelled.ply")])
+    assert (tmp_path / "labelled.ply").is_file()
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["propagate", str(scene.path)])
+    assert stopped.value.code == 2 and "cannot write to" in capsys.readouterr().err
+
+
+def test_closed_streams_lead_to_nowhere(tmp_path):
+    """Else the next file that is opened gets the number of standard output, and what libraries print."""
+    command = f"{sys.executable} -c 'from sc3d.cli import main; main()'"
+    environment = os.environ | {"PYTHONPATH": str(builders.ROOT)}
+    for rest, status in ((" --help >&-", 0), (" --help >&- 2>&- <&-", 0), (" nothing 2>&-", 2)):
+        done = subprocess.run(command + rest, shell=True, env=environment, capture_output=True, cwd=tmp_path)
+        assert done.returncode == status and not done.stderr
+    program = (
+        "import os, sys; from sc3d.cli import open_closed_streams as fill; fill(); "
+        "file = open('out', 'w'); os.write(1, b'printed'); print(file.fileno() > 2)"
+    )
+    shell = f'{sys.executable} -c "{program}" >&- 2>&-'
+    assert subprocess.run(shell, shell=True, env=environment, cwd=tmp_path).returncode == 0
+    assert (tmp_path / "out").read_text() == ""
 
 
 def test_home_is_meant_by_a_tilde():

@@ -7,7 +7,10 @@ from __future__ import annotations
 import ast
 import json
 import os
+import shutil
 import struct
+import sys
+import zipfile
 import zlib
 from dataclasses import fields
 from pathlib import Path
@@ -20,11 +23,15 @@ import sc3d
 from sc3d.cli import main
 from sc3d.errors import InputError
 from sc3d.io.images import image_size, read_image
-from sc3d.io.json_files import read_json
+from sc3d.io.json_files import read_json, read_text
 from sc3d.io.mask_images import read_index_image
 from sc3d.io.photo_folder import find_photos
+from sc3d.report.data import _read_sidecars, read_features
+from sc3d.runner import MAX_SIDECAR
 from sc3d.scene.class_table import read_classes
+from sc3d.scene.depth_map import depth_map_size
 from sc3d.scene.scene import match_masks, read_sparse_model
+from sc3d.segmentation.strokes.files import MAX_POINTS, MAX_SHAPES, parse_shapes
 from sc3d.settings.outputs import ViewCommand
 from tests.builders import views, write_bare_scene, write_model
 from tests.robustness.hostile_files import patch, picture, refused, tracked_model
@@ -282,6 +289,99 @@ def test_json_that_is_deep_large_or_no_file(tmp_path):
     os.mkfifo(tmp_path / "pipe.json")
     refused("cannot read", read_json, tmp_path / "pipe.json")  # and does not wait for somebody to write
     refused("cannot read", read_classes, tmp_path / "pipe.json")
+
+
+def npz(path: Path, shape: tuple[int, ...], kind: str = "|u1", content: bytes = bytes(9)) -> Path:
+    """A compressed depth map whose arrays announce a shape."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("depth", "normals", "num_views", "sky"):
+            with archive.open(f"{name}.npy", "w") as file:
+                header = {"descr": kind, "fortran_order": False, "shape": shape}
+                np.lib.format.write_array_header_1_0(file, header)
+                file.write(content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        ((60_000, 60_000), "|u1"),
+        ((1, 10**6), "|u1"),
+        ((3, 3, 10**9), "|u1"),
+        ((3, 3), "|S99"),
+        ((3, 3), "|O"),
+    ],
+)
+def test_arrays_that_announce_too_much(tmp_path, monkeypatch, shape, kind):
+    """A few compressed bytes hold gigabytes of zeros: refused by the header, before room is made."""
+    monkeypatch.setattr(np.lib.format, "read_array", lambda *_, **__: pytest.fail("was read"))
+    refused("damaged", depth_map_size, npz(tmp_path / "a.jpg.npz", shape, kind))
+
+
+def test_depth_that_is_no_archive(tmp_path):
+    file = tmp_path / "a.jpg.npz"
+    refused("missing", depth_map_size, file)
+    assert depth_map_size(npz(file, (3, 3))) == 3
+    with file.open("wb") as stream:  # an array that is not packed; numpy would make room for it
+        np.lib.format.write_array_header_1_0(
+            stream, {"descr": "|u1", "fortran_order": False, "shape": (10**6, 10**6)}
+        )
+    refused("damaged", depth_map_size, file)
+    for make in (os.mkfifo, Path.mkdir, lambda path: path.symlink_to("/dev/zero")):
+        file.unlink()
+        make(file)
+        refused("damaged", depth_map_size, file)
+        if file.is_dir():
+            file.rmdir()
+            file.touch()
+
+
+def test_pipes_and_devices_are_not_waited_for(tmp_path, caplog):
+    """In a report's records and features, and in every text."""
+    for number, make in enumerate((os.mkfifo, lambda path: path.symlink_to("/dev/zero"))):
+        for suffix in ("json", "geojson", "txt"):
+            make(tmp_path / f"{number}.{suffix}")
+        refused("cannot read", read_text, tmp_path / f"{number}.txt")
+        assert read_features(tmp_path / f"{number}.geojson") is None
+    (tmp_path / "big.json").write_text('{"stage": "label"}' + " " * MAX_SIDECAR)
+    assert not _read_sidecars(tmp_path)
+    assert caplog.text.count("left out of the report") == 3
+
+
+def test_records_with_names_that_are_no_text(tmp_path):
+    """A record may name a file whose name is not UTF-8."""
+    scene = write_bare_scene(tmp_path / "scene")
+    record = {"stage": "label", "settings": {"cloud": "a\udcff.ply"}, "summary": {}, "inputs": {}}
+    (scene / "seeds.ply.json").write_text(json.dumps(record))
+    main(["report", str(scene)])
+    assert b"a\\udcff.ply" in (scene / "report.html").read_bytes()
+
+
+def test_drawings_of_absurd_length(tmp_path):
+    table = read_classes(write_bare_scene(tmp_path / "scene") / "classes.json")
+    point = {"label": "road", "shape_type": "point", "points": [[1, 1]]}
+    line = {"label": "road", "shape_type": "linestrip", "points": [[1, 1]] * (MAX_POINTS + 1)}
+    for shapes in ([point] * (MAX_SHAPES + 1), [line]):
+        refused("at most", parse_shapes, {"shapes": shapes}, "the drawing", (100, 100), table)
+    assert len(parse_shapes({"shapes": [point] * 9}, "the drawing", (100, 100), table)) == 9
+
+
+def test_masks_that_are_a_link_to_themselves(tmp_path, capsys):
+    scene = write_bare_scene(tmp_path / "scene")
+    (scene / "images").mkdir()
+    for view in views():
+        (scene / "images" / view.name).write_bytes(picture("JPEG", size=(view.width, view.height)))
+    for name in ("masks", "truth", "images"):
+        attacked = tmp_path / name
+        shutil.copytree(scene, attacked)
+        shutil.rmtree(attacked / name)
+        (attacked / name).symlink_to(name)
+        for arguments in (["segment", "--masks", str(scene / "truth")], ["evaluate"], ["label"]):
+            with pytest.raises(SystemExit) as stopped:
+                main([arguments[0], str(attacked), *arguments[1:]])
+                sys.exit(0)
+            assert stopped.value.code in (0, 2)
+    assert "Traceback" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["a\nb", "\x1b[2J", "\ud800", "n" * 300, " "])

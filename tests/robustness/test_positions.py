@@ -37,7 +37,7 @@ XMP = '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description {}/></rdf:R
 
 def write_photo(path: Path, position: tuple, xmp: str = "", **changes: object) -> Path:
     """A photo at latitude, longitude, height; `changes` of GPS tags by name, None = leave out."""
-    exif = photo_exif(np.array(position, float), 0)
+    exif = photo_exif(0, np.array(position, float))
     block = exif.get_ifd(IFD.GPSInfo)
     for name, value in changes.items():
         block.pop(GPS[name], None)

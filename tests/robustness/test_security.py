@@ -4,6 +4,8 @@ the user's is reached through them.
 
 from __future__ import annotations
 
+import ctypes
+import importlib
 import json
 import logging
 import os
@@ -138,6 +140,23 @@ def test_what_a_worker_raises_is_told():
         with pytest.raises(RuntimeError, match=r"(?s)in wrong.*KeyError: 3"):
             executor.run("wrong", wrong, [2, 3])
         assert executor.run("right", wrong, [2]) == ["b"]
+
+
+def told_to_end(folder: Path) -> None:
+    signal.signal(signal.SIGTERM, lambda *_: (folder / "trace").touch())  # as a native library prints one
+    hang(folder)
+
+
+@linux
+def test_busy_workers_end_without_a_word(tmp_path):
+    pool = worker_pool.WorkerPool(1)
+    worker = worker_pool._Worker(1)
+    pool._workers.append(worker)
+    worker.give(told_to_end, 0, tmp_path)
+    wait_until(lambda: list(tmp_path.iterdir()))
+    started = time.monotonic()
+    pool.close()
+    assert time.monotonic() - started < worker_pool.SECONDS and not (tmp_path / "trace").exists()
 
 
 @linux
@@ -389,6 +408,151 @@ def test_no_stage_writes_through_a_link(packed, here, tmp_path, name):
         attack.run(stage, settings)
 
 
+class Opened:
+    """Files below a folder that are opened in the block, by whatever library; relative to the folder."""
+
+    OPEN, FOLDER = 0x20, 0x40000000  # of inotify
+
+    def __init__(self, folder: Path) -> None:
+        system = ctypes.CDLL(None, use_errno=True)
+        self.folder, self.handle = folder, system.inotify_init1(os.O_NONBLOCK)
+        self.places = {
+            system.inotify_add_watch(self.handle, os.fsencode(place), self.OPEN): place
+            for place in [folder, *filter(Path.is_dir, folder.rglob("*"))]
+        }
+
+    def names(self) -> set[str]:
+        found, data = set(), b""
+        with suppress(BlockingIOError):
+            while True:
+                data += os.read(self.handle, 1 << 16)
+        os.close(self.handle)
+        while data:
+            place, mask, _, length = struct.unpack_from("iIII", data)
+            name = data[16 : 16 + length].rstrip(b"\0").decode()
+            if name and not mask & self.FOLDER:
+                found.add((self.places[place] / name).relative_to(self.folder).as_posix())
+            data = data[16 + length :]
+        return found
+
+
+def reading_runs(scene: Path) -> dict[str, tuple[str, object]]:
+    """`stage_runs`, and ways to read what those do not."""
+    from sc3d.settings import labels, outputs, reconstruction
+    from sc3d.stages.export import MODULES
+
+    own = {"source": "cloud", "project": scene / "seeds.ply", "cloud": (scene / "seeds.ply",)}
+    return stage_runs() | {
+        "georeference gps": ("georeference", reconstruction.GeoreferenceOptions(from_gps=True)),
+        "georeference again": ("georeference", reconstruction.GeoreferenceOptions(epsg=32632)),
+        "extract depth": ("extract", reconstruction.Extract(method="depth")),
+        "segment masks": ("segment", labels.Segment(masks=scene / "truth")),
+        "segment in place": ("segment", labels.Segment()),
+        "label cloud": ("label", labels.Label(cloud=scene / "seeds.ply")),
+        "label density": ("label", labels.Label(mechanisms=labels.PaperMechanisms(density=True))),
+        "import cloud": ("import_project", reconstruction.Import(**own)),
+        "export": ("export", outputs.Export(format=tuple(set(MODULES) - {"objects"}))),
+    }
+
+
+READS = [
+    *STAGES[1:], "georeference gps", "georeference again", "extract depth", "segment masks", "segment in place", "label cloud", "label density",
+    "import cloud",
+]  # fmt: skip
+
+
+@linux
+@pytest.mark.parametrize("name", READS)
+def test_every_file_that_a_stage_reads_is_an_input(packed, here, tmp_path, monkeypatch, name):
+    """Else a change of it gives yesterday's result without a word."""
+    from sc3d.io import images
+    from sc3d.io.provenance import PhotoFrames
+    from sc3d.scene.scene import Scene
+
+    attack = Attack(packed, tmp_path)
+    stage, settings = reading_runs(attack.scene)[name]
+    attack.unpack(stage)
+    scene, module = Scene(attack.scene), importlib.import_module(f"sc3d.stages.{stage}")
+    (scene.path / "georeference.json").write_text('{"epsg": 32615, "offset": [0, 0, 0]}')
+    if name == "extract depth":
+        from sc3d.runner import execute
+
+        execute(*stage_runs()["depth"][:1], scene, stage_runs()["depth"][1])
+    inputs, outputs = module.inputs(scene, settings), module.outputs(scene, settings)
+    decoded: set[Path] = set()
+    read_stored = images.read_stored
+    monkeypatch.setattr(images, "read_stored", lambda path: (decoded.add(path), read_stored(path))[1])
+    opened = Opened(scene.path)
+    with suppress(Sc3dError):  # photos without GPS, or without depth: what was read until then counts
+        module.run(scene, settings)
+    whole = [path for path in inputs if isinstance(path, Path)]
+    frames = [item.folder for item in inputs if isinstance(item, PhotoFrames)]
+
+    def covered(file: Path, by: list[Path]) -> bool:
+        return any(file == path or path in file.parents for path in by)
+
+    warned_of = [scene.sparse] if name == "segment masks" else []  # photos without a camera, not more
+    made = [*outputs, *warned_of, *(module.besides(scene, settings) if hasattr(module, "besides") else [])]
+    names = {name for name in opened.names() if ".tmp" not in name and ".parts/" not in name}
+    read = {name for name in names if not (scene.path / name).name.startswith(".seeds.ply.cloud")}
+    assert not [name for name in read if not covered(scene.path / name, [*whole, *frames, *made])]
+    assert not [file for file in decoded if not covered(file, whole)]
+
+
+def wrong_kinds(scene: Path, names: set[str]) -> Iterator[tuple[Path, Callable[[Path], object]]]:
+    """Places where a stage writes, each with what makes something there that cannot be replaced."""
+    for name in sorted(name for name in names if not name.startswith(".")):
+        place = scene / name
+        if not name.endswith("/"):
+            yield place, Path.mkdir
+            continue
+        yield place, Path.touch
+        yield place, os.mkfifo
+        yield place, lambda path: path.symlink_to(path.parent / "nowhere")
+        yield place, lambda path: path.symlink_to(path)
+
+
+@linux
+@pytest.mark.parametrize("name", [name for name in STAGES if "tiled" not in name and name != "synthesize"])
+def test_what_cannot_be_replaced_is_refused_before_the_work(packed, here, tmp_path, monkeypatch, name):
+    """A folder where a file is to be written, and the other way round, also under the names of sidecars."""
+    from sc3d.runner import execute, sidecar
+    from sc3d.scene.scene import Scene
+
+    attack = Attack(packed, tmp_path)
+    stage, settings = reading_runs(attack.scene)[name]
+    module = importlib.import_module(f"sc3d.stages.{stage}")
+    scene, place_of_scene = Scene(attack.scene), '{"epsg": 32615, "offset": [0, 0, 0]}'
+
+    def unpack() -> None:
+        attack.unpack(stage)
+        (scene.path / "georeference.json").write_text(place_of_scene)
+
+    unpack()
+    with WATCH.on(attack.scene) as names:
+        attack.run(stage, settings)
+    outputs = module.outputs(scene, settings)
+    made = [*outputs, *(module.besides(scene, settings) if hasattr(module, "besides") else [])]
+    kept = {path.relative_to(attack.scene).as_posix() for path in made}
+    work = {name for name in names if ".parts/" in name or ".blocks/" in name or ".checkpoint" in name}
+    work |= {name for name in names if ".before" in name}  # set aside in the work itself
+    inside = {name for name in names if any(name.startswith(f"{folder}/") for folder in kept)}
+    top = {name for name in names - work - inside if name.rstrip("/") != "segment.unfinished.json"}
+    top |= {f"{name}/" for name in kept if not Path(name).suffix}
+    outputs = module.outputs(scene, settings)
+    top |= {sidecar(path).relative_to(attack.scene).as_posix() for path in outputs}
+    worked = []
+    monkeypatch.setattr(module, "run", lambda *_: worked.append(1) or {})
+    for place, make in wrong_kinds(attack.scene, top):
+        unpack()
+        place.parent.mkdir(parents=True, exist_ok=True)
+        remove(place)
+        make(place)
+        with suppress(InputError):
+            execute(stage, Scene(attack.scene), settings, overwrite=True)
+        assert not worked, place
+
+
 def test_work_that_is_a_link_is_done_anew(packed, here, tmp_path, caplog):
     stage, settings = stage_runs()["label tiled"]
     attack = Attack(packed, tmp_path)
@@ -460,6 +624,34 @@ def test_a_page_writes_no_strokes_through_a_link(packed, tmp_path):
     attack.plant(["strokes/"])
     with pytest.raises(InputError, match="remove the link"):
         Session(Scene(attack.scene))
+
+
+def test_strokes_that_become_a_link_are_not_written(packed, tmp_path):
+    """While the page is open."""
+    from sc3d.annotate.session import Session
+    from sc3d.scene.scene import Scene
+
+    attack = Attack(packed, tmp_path)
+    attack.unpack("annotate")
+    session = Session(Scene(attack.scene))
+    attack.plant(["strokes/"])
+    drawn = {"label": "road", "shape_type": "point", "points": [[1, 1]]}
+    for shapes in ([drawn], []):
+        with pytest.raises(InputError, match="remove the link"):
+            session.save("photo_0", {"shapes": shapes})
+    with pytest.raises(InputError, match="remove the link"):
+        session.try_out("photo_0")
+    assert all(text == "my thesis" for text in attack._content().values())
+
+
+def test_a_length_of_absurd_length_is_too_large():
+    """Python refuses to read such a number."""
+    from sc3d.annotate.server import Handler, Refusal
+
+    asked = SimpleNamespace(headers={"Content-Type": "application/json", "Content-Length": "9" * 5000})
+    with pytest.raises(Refusal) as refusal:
+        Handler._body(asked)
+    assert refusal.value.status == 413
 
 
 def test_links_that_a_user_makes_are_followed(packed, here, tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path, discard
+from sc3d.io.folders import resolved
 from sc3d.io.images import read_orientation, write_image
 from sc3d.io.mask_images import index_image_size, is_indexed, turned_onto
 from sc3d.scene.class_table import ClassTable
@@ -77,7 +78,7 @@ def import_masks(
     if confidence is not None and scene_confidence is None:
         raise InputError("confidence maps are given, but not where in the scene they belong")
     source = source if isinstance(source, MaskFiles) else MaskFiles(source)
-    in_place = source.path.resolve() == scene_masks.resolve()
+    in_place = resolved(source.path) == resolved(scene_masks)
     if in_place and (
         source.mapping is not None
         or source.name_pattern is not None
@@ -100,7 +101,7 @@ def import_masks(
     if scene_confidence is not None:
         _check_target(confidence, scene_confidence)
     with ExitStack() as folders:  # all is written before anything replaces what is there
-        if maps and confidence and scene_confidence and confidence.resolve() != scene_confidence.resolve():
+        if maps and confidence and scene_confidence and resolved(confidence) != resolved(scene_confidence):
             _copy(maps, folders.enter_context(atomic_path(scene_confidence)), PhotoNames(photo_sizes), photos)
         if not in_place:  # in place, they are already there and checked
             _draw(masks, folders.enter_context(atomic_path(scene_masks)), PhotoNames(photo_sizes), photos)
@@ -158,7 +159,7 @@ def _check_target(source: Path | None, target: Path) -> None:
         raise InputError(
             f"{target} is a link: remove the link, so that the folder it leads to is not overwritten"
         )
-    if source is not None and target.resolve() in source.resolve().parents:
+    if source is not None and resolved(target) in resolved(source).parents:
         raise InputError(f"{source} lies inside {target}, which would be replaced: move it elsewhere")
 
 

@@ -35,6 +35,7 @@ BACKGROUND = "_background_"  # LabelMe's own name for it
 NOTHING = -1  # a pixel without a stroke; 0 is background
 MIN_POINTS = {"point": 1, "line": 2, "linestrip": 1, "polygon": 3, "rectangle": 2, "circle": 2, "mask": 2}
 POLYGONS = ("oriented_rectangle", "rotation")  # of LabelMe and X-AnyLabeling, with all their corners
+MAX_SHAPES, MAX_POINTS = 10_000, 200_000  # on one photo; nobody draws more
 DEFAULT_WIDTH = 0.005  # of a stroke that states none, share of the photo's longest side
 _MAX_COORDINATE = 1e5  # px; more cannot be meant, and would overflow the fixed-point coordinates of OpenCV
 _SHIFT = 4  # fractional bits of those coordinates
@@ -193,11 +194,22 @@ def parse_shapes(
     shapes = content.get("shapes") if isinstance(content, dict) else None
     if not isinstance(content, dict) or not isinstance(shapes, list):
         raise InputError(f"{origin} is not a LabelMe file: it has no list of shapes")
+    _check_amount(shapes, origin)
     drawn = _drawn_size(content, origin, size)
     return tuple(
         _parse_shape(shape, f"{origin}: shape {index + 1}", class_table, drawn, max(size) / max(drawn))
         for index, shape in enumerate(shapes)
     )
+
+
+def _check_amount(shapes: list, origin: Path | str) -> None:
+    lists = [shape.get("points") for shape in shapes if isinstance(shape, dict)]
+    points = sum(len(found) for found in lists if isinstance(found, list))
+    if len(shapes) > MAX_SHAPES or points > MAX_POINTS:
+        raise InputError(
+            f"{origin} has {len(shapes)} shapes with {points} points: "
+            f"at most {MAX_SHAPES} with {MAX_POINTS} are drawn"
+        )
 
 
 def _drawn_size(content: dict, origin: Path | str, size: tuple[int, int]) -> tuple[int, int]:

@@ -172,7 +172,7 @@ def _server(host: str, port: int) -> Iterator[viser.ViserServer]:
     through the makers' server is off.
     """
     viser = load_viser()
-    logging.getLogger("websockets").setLevel(logging.WARNING)
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # browsers that leave at once are no error
     with contextlib.redirect_stdout(io.StringIO()), guarding(LocalPage.at(host)):  # it announces itself
         server = viser.ViserServer(host=host, port=port, label=_TITLE, verbose=False)
     server.request_share_url = lambda *_, **__: None
