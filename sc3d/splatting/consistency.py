@@ -97,26 +97,6 @@ def consistent(depth: np.ndarray, view: View, others: OtherDepths, tolerance: fl
     return count
 
 
-def blocking(depth: np.ndarray, view: View, others: OtherDepths, margin: float) -> np.ndarray:
-    """(H, W) uint8: how many other views look through a pixel's point: they know a surface there that is
-    farther by `margin` of its depth.
-
-    depth: (H, W) float32, 0 = none; others: depth maps that can be trusted, 0 = unknown, with their views
-    """
-    count, points_cam = np.zeros(depth.shape, np.uint8), _surface_points(depth, view)
-    for other_depth, other in others:
-        rotation, translation = relative_pose(view, other)
-        points_other = points_cam @ rotation.T + translation
-        pixels = _project(points_other, other)
-        inside = (points_other[:, 2] > 1e-6) & (pixels >= 0).all(1)
-        inside &= (pixels[:, 0] < other.width) & (pixels[:, 1] < other.height)
-        columns, rows = torch.where(inside[:, None], pixels, 0).long().unbind(1)
-        known = torch.from_numpy(other_depth)[rows, columns]
-        through = inside & (known > 0) & (points_other[:, 2] < (1 - margin) * known)
-        count[depth > 0] += through.numpy()
-    return count
-
-
 def _surface_points(depth: np.ndarray, view: View) -> Tensor:
     """(N, 3) points of the pixels that have a depth, camera frame."""
     known = torch.from_numpy(depth)

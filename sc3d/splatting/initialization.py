@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -27,27 +26,17 @@ from sc3d.geometry.plane_sweep import (
     sweep_planes,
     thinned,
 )
-from sc3d.scene.depth_map import DepthMap
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.gaussians import Gaussians
+from sc3d.stereo.starting_points import StartingPoints, points_on_maps
 
-MIN_STEP = 3.0  # px between starting points of a photo
-OVERLAP = 10  # photos that see the same place
 SWEEP_SIZE = 250  # px, longest side of the images compared: 7x7 patches must hold some texture
 MAX_COST = 0.5  # mean 1 - NCC of the two best neighbors
 AROUND = 5  # grid points whose costs are averaged
 
 logger = logging.getLogger(__name__)
-
-
-class StartingPoints(NamedTuple):
-    """points: (M, 3) float64, the views' world; colors: (M, 3) uint8; normals: (M, 3) float64 unit or 0 = unknown"""
-
-    points: np.ndarray
-    colors: np.ndarray
-    normals: np.ndarray
 
 
 def initial_gaussians(
@@ -56,13 +45,11 @@ def initial_gaussians(
     """Gaussians at the sparse points and, with `fill`, on the depth maps and where these know nothing; a random choice
     if they are too many.
     """
-    sparse = np.asarray(data.points, np.float64)
-    found = StartingPoints(sparse, np.asarray(data.colors), np.zeros_like(sparse))
+    found = StartingPoints.without_normals(data.points, data.colors)
     if settings.fill:
-        known = stereo_points(data, settings.max_gaussians // 2)
-        rest, colors = plane_sweep_points(without_known(data), neighbors, settings.max_gaussians // 4)
-        parts = found, known, StartingPoints(rest, colors, np.zeros_like(rest))
-        found = StartingPoints(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        known = points_on_maps(data.views, data.image, data.mask, data.depth_map, settings.max_gaussians // 2)
+        rest = plane_sweep_points(without_known(data), neighbors, settings.max_gaussians // 4)
+        found = StartingPoints.joined([found, known, StartingPoints.without_normals(*rest)])
     if len(found.points) > settings.max_gaussians:
         logger.info(
             "%d of %d points to start from are left out, by chance: --max-gaussians is %d",
@@ -72,53 +59,8 @@ def initial_gaussians(
         )
         order = torch.randperm(len(found.points), generator=generator)
         chosen = order[: settings.max_gaussians].sort().values.numpy()
-        found = StartingPoints(*(values[chosen] for values in found))
+        found = found.chosen(chosen)
     return Gaussians.from_points(found.points, found.colors, settings.sh_degree, normals=found.normals)
-
-
-def stereo_points(data: TrainingData, budget: int) -> StartingPoints:
-    """Points on a pixel grid of every photo at the depth of its map, one per cube as large as a grid cell.
-
-    budget: about how many to return
-    """
-    num_pixels = sum(view.width * view.height for view in data.views)
-    step = max(MIN_STEP, float(np.sqrt(num_pixels / max(OVERLAP * budget, 1))))
-    parts, sizes = [], []
-    for index in range(len(data.views)):
-        depth_map = data.depth_map(index)
-        if depth_map is None:
-            continue
-        part, size = _on_grid(data, index, depth_map, step)
-        parts.append(part)
-        sizes.append(size)
-    if not parts:
-        return StartingPoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)))
-    found = StartingPoints(*(np.concatenate(values) for values in zip(*parts, strict=True)))
-    cells = np.floor(found.points / float(np.median(np.concatenate(sizes)))).astype(np.int64)
-    kept = np.sort(np.unique(cells, axis=0, return_index=True)[1])
-    return StartingPoints(*(values[kept] for values in found))
-
-
-def _on_grid(
-    data: TrainingData, index: int, depth_map: DepthMap, step: float
-) -> tuple[StartingPoints, np.ndarray]:
-    """Starting points of a photo, and the size of a grid cell at each, world units."""
-    view, mask = data.views[index], data.mask(index)
-    columns, rows = np.meshgrid(np.arange(step / 2, view.width, step), np.arange(step / 2, view.height, step))
-    columns, rows = columns.astype(int).ravel(), rows.astype(int).ravel()
-    if mask is not None:
-        columns, rows = columns[mask[rows, columns]], rows[mask[rows, columns]]
-    depth = depth_map.depth[rows, columns].astype(np.float64)
-    chosen = depth > 0
-    rows, columns, depth = rows[chosen], columns[chosen], depth[chosen]
-    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1)
-    rotation = view.cam_from_world[:3, :3]
-    points_cam = pixels @ np.linalg.inv(view.matrix).T * depth[:, None]
-    normals = depth_map.normals[rows, columns] * (depth_map.depth[rows, columns] > 0)[:, None] / 127.0
-    points = (points_cam - view.cam_from_world[:3, 3]) @ rotation
-    return StartingPoints(
-        points, data.image(index)[rows, columns], normals @ rotation
-    ), step * depth / view.focal
 
 
 def without_known(data: TrainingData) -> TrainingData:

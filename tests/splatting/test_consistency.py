@@ -3,10 +3,8 @@
 import numpy as np
 import torch
 
-from sc3d.geometry.cameras import rays
 from sc3d.splatting import losses
-from sc3d.splatting.consistency import blocking, consistent, pixel_rays, reprojection_error
-from tests.extraction.builders import views
+from sc3d.splatting.consistency import consistent, pixel_rays, reprojection_error
 from tests.splatting.test_losses import PLANE, camera, plane_depth
 
 
@@ -63,17 +61,3 @@ def test_consistency_counts_views():
     count = consistent(depth.numpy(), view, [(other.numpy(), pose) for other, pose in maps])
     assert (count[:5] == 0).all() and (count[30:40] == 0).all()
     assert (count[15:25, 30:60] == 2).all() and count.max() == 2
-
-
-def test_a_point_before_a_surface_that_others_see_is_blocked():
-    view, *others = views()[:3]
-    flat = []
-    for each in (view, *others):  # depth of the plane z = 0
-        directions, along = rays(each)
-        flat.append(np.float32(-each.center[2] / directions[:, 2] * along).reshape(120, 160))
-    sure = list(zip(flat[1:], others, strict=True))
-    on_plane = blocking(flat[0], view, sure, 0.03)
-    floating = blocking(0.8 * flat[0], view, sure, 0.03)
-    assert on_plane.max() == 0
-    assert (floating[40:80, 60:100] == 2).all()
-    assert blocking(0.8 * flat[0], view, [(np.zeros_like(flat[1]), others[0])], 0.03).max() == 0
