@@ -47,7 +47,7 @@ def initial_gaussians(
     """
     found = StartingPoints.without_normals(data.points, data.colors)
     if settings.fill:
-        known = points_on_maps(data.views, data.image, data.mask, data.depth_map, settings.max_gaussians // 2)
+        known = points_on_maps(data.views, data.image, data.mask, data.depth_map, settings.max_gaussians // 4)
         rest = plane_sweep_points(without_known(data), neighbors, settings.max_gaussians // 4)
         found = StartingPoints.joined([found, known, StartingPoints.without_normals(*rest)])
     if len(found.points) > settings.max_gaussians:

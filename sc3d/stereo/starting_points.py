@@ -57,9 +57,17 @@ def points_on_maps(
             sizes.append(size)
     if not sum(map(len, sizes)):
         return StartingPoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)))
-    found = StartingPoints.joined(parts)
-    cells = np.floor(found.points / float(np.median(np.concatenate(sizes)))).astype(np.int64)
-    return found.chosen(np.sort(np.unique(cells, axis=0, return_index=True)[1]))
+    found, size = StartingPoints.joined(parts), float(np.median(np.concatenate(sizes)))
+    kept = _one_per_cube(found.points, size)
+    if len(kept) > budget:  # of a surface, cubes larger by the root
+        kept = _one_per_cube(found.points, size * float(np.sqrt(len(kept) / budget)))
+    return found.chosen(kept)
+
+
+def _one_per_cube(points: np.ndarray, size: float) -> np.ndarray:
+    """Rows of the first of the (N, 3) points in every cube of `size`, ascending."""
+    cells = np.floor(points / size).astype(np.int64)
+    return np.sort(np.unique(cells, axis=0, return_index=True)[1])
 
 
 def _on_grid(
