@@ -14,7 +14,7 @@ MARGIN = 0.03  # share of the depth by which a surface must lie behind to be ano
 Prepared = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 AROUND = 5  # px: outlines and ground at grazing angles are not surer
 MIN_COSINE = 0.2  # between ray and normal; flatter, MARGIN grows no more
-STEPS = 64  # depths tried along a ray
+STEPS = 128  # depths tried along a ray
 
 
 def count_opposed(

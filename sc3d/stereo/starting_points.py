@@ -57,10 +57,10 @@ def points_on_maps(
             sizes.append(size)
     if not sum(map(len, sizes)):
         return StartingPoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)))
-    found, size = StartingPoints.joined(parts), float(np.median(np.concatenate(sizes)))
-    kept = _one_per_cube(found.points, size)
+    found, cell = StartingPoints.joined(parts), float(np.median(np.concatenate(sizes)))
+    kept = _one_per_cube(found.points, cell)
     if len(kept) > budget:  # of a surface, cubes larger by the root
-        kept = _one_per_cube(found.points, size * float(np.sqrt(len(kept) / budget)))
+        kept = _one_per_cube(found.points, cell * float(np.sqrt(len(kept) / budget)))
     return found.chosen(kept)
 
 
