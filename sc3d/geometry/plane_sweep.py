@@ -110,8 +110,7 @@ def interpolated_depth(
     return np.minimum(depth, FARTHEST * reference.depths.max())
 
 
-def thinned(points: np.ndarray, colors: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """One point per cube of `size`: photos overlap."""
+def one_per_cube(points: np.ndarray, size: float) -> np.ndarray:
+    """Rows of the first of the (N, 3) points in every cube of `size`, ascending: photos overlap."""
     cells = np.floor(points / size).astype(np.int64)
-    kept = np.sort(np.unique(cells, axis=0, return_index=True)[1])
-    return points[kept], colors[kept]
+    return np.sort(np.unique(cells, axis=0, return_index=True)[1])

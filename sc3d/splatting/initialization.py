@@ -21,10 +21,10 @@ from sc3d.geometry.plane_sweep import (
     SweepVolume,
     SweptView,
     interpolated_depth,
+    one_per_cube,
     plane_depth,
     settled,
     sweep_planes,
-    thinned,
 )
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses
@@ -113,7 +113,9 @@ def plane_sweep_points(
         sizes.append(step * depth / view.focal)
     if not found:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    return thinned(np.concatenate(found), np.concatenate(colors), float(np.median(np.concatenate(sizes))))
+    points = np.concatenate(found)
+    kept = one_per_cube(points, float(np.median(np.concatenate(sizes))))
+    return points[kept], np.concatenate(colors)[kept]
 
 
 def _small_gray(data: TrainingData, index: int) -> tuple[torch.Tensor, View]:

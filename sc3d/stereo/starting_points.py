@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sc3d.geometry.cameras import View
+from sc3d.geometry.plane_sweep import one_per_cube
 from sc3d.scene.depth_map import DepthMap
 
 MIN_STEP = 3.0  # px between points of a photo
@@ -58,16 +59,10 @@ def points_on_maps(
     if not sum(map(len, sizes)):
         return StartingPoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)))
     found, cell = StartingPoints.joined(parts), float(np.median(np.concatenate(sizes)))
-    kept = _one_per_cube(found.points, cell)
+    kept = one_per_cube(found.points, cell)
     if len(kept) > budget:  # of a surface, cubes larger by the root
-        kept = _one_per_cube(found.points, cell * float(np.sqrt(len(kept) / budget)))
+        kept = one_per_cube(found.points, cell * float(np.sqrt(len(kept) / budget)))
     return found.chosen(kept)
-
-
-def _one_per_cube(points: np.ndarray, size: float) -> np.ndarray:
-    """Rows of the first of the (N, 3) points in every cube of `size`, ascending."""
-    cells = np.floor(points / size).astype(np.int64)
-    return np.sort(np.unique(cells, axis=0, return_index=True)[1])
 
 
 def _on_grid(
