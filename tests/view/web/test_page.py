@@ -60,9 +60,13 @@ class Visit(NamedTuple):
         return float((self.picture[LEFT] == color).all(axis=-1).mean())
 
     def is_still(self) -> bool:
-        """Whether two pictures after one another are the same."""
+        """Whether pictures over half a second are the same: a loaded machine pauses within a movement."""
         before = self.picture
-        return np.array_equal(before, self.picture)
+        for _ in range(2):
+            self.page.wait_for_timeout(250)
+            if not np.array_equal(before, self.picture):
+                return False
+        return True
 
     def wait_for(self, condition: Callable[[], bool], what: str) -> None:
         """Until a condition on this visit holds; software rendering takes its time."""
@@ -195,7 +199,10 @@ def test_class_is_switched_off_and_on(opened):
     road[:, LEFT[1].stop :] = False  # the panel has a swatch of it
     assert (hidden[road] == ROAD).all() and opened.share(ROAD) > 0.05  # and nothing but grass went
     box.click()
-    opened.wait_for(lambda: np.array_equal(opened.picture[LEFT], before[LEFT]), "the same picture as before")
+    opened.wait_for(
+        lambda: (opened.picture[LEFT] != before[LEFT]).any(axis=-1).mean() < 1e-3,
+        "the same picture as before but for points as far as others, drawn in another order",
+    )
 
 
 def test_clicked_camera_shows_its_photo_and_mask_and_is_looked_through(scene, opened):
