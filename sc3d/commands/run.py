@@ -70,4 +70,4 @@ def check(command: Run, segment: Segment) -> None:
         source = mask_source(segment, masks) if segment.masks else MaskFiles(masks, "index")
         check_masks(source, sizes, class_table, segment.confidence, command.photos)
     if command.truth is not None:
-        match_masks(command.truth, sizes, class_table, photos=command.photos)
+        match_masks(command.truth, sizes, class_table, photos=command.photos, truth=True)

@@ -89,6 +89,10 @@ def headline(data: ReportData) -> str:
                     "" if before is None else f"given masks {pattern.format(before)}",
                 )
             )
+    given, before = given_class(labels), given_class(masks)
+    if given is not None:
+        note = "" if before is None else f"; given masks {before:.1%}"
+        tiles.append(("Other", f"{given:.1%}", f"of the pixels of no class are given one{note}"))
     coverage, counts = number(labels.get("coverage")), data.label_counts
     if coverage is not None:
         tiles.append(("Coverage", f"{coverage:.1%}", "of the pixels carry a label"))
@@ -147,7 +151,40 @@ def quality_section(data: ReportData) -> str:
     )
     if near is not None and elsewhere is not None:
         note += f" Near depth edges {near:.1%} of the pixels are right, elsewhere {elsewhere:.1%}."
-    return f'<p class="note">{note}</p>{paired_bars(rows)}{_confusion(data)}'
+    return f'<p class="note">{note}</p>{paired_bars(rows)}{_all_judged(data)}{_confusion(data)}'
+
+
+def given_class(figures: dict) -> float | None:
+    """Share of the pixels of no class that are given one; None where the truth marks none."""
+    other = figures.get("other")
+    return number(other.get("given_class")) if isinstance(other, dict) else None
+
+
+def _all_judged(data: ReportData) -> str:
+    """Precision and recall over all judged pixels, and what the pixels of no class were taken for."""
+    sources = {"labels": "fused labels", "masks": "given masks"}
+    shares = {
+        source: {name: of_classes(data.figures(source), name) for name in ("precision", "recall")}
+        for source in sources
+        if data.figures(source).get("precision")
+    }
+    given = {source: given_class(data.figures(source)) for source in shares}
+    if given.get("labels") is None:
+        return ""
+    columns = [found[name] for found in shares.values() for name in ("precision", "recall")]
+    taken = [of_classes(data.figures(source).get("other"), "given") for source in shares]
+    rows = [
+        [escape(name), *(formatted(values.get(name), ".1%") for values in [*columns, *taken])]
+        for name in _class_colors(data)
+        if any(name in values for values in [*columns, *taken])
+    ]
+    heads = [f"{name}, {sources[source]}" for source in shares for name in ("Precision", "Recall")]
+    heads += [f"Share of other, {sources[source]}" for source in shares]
+    told = "; ".join(f"{sources[source]}: {formatted(share, '.1%')}" for source, share in given.items())
+    return (
+        f'<h3>All judged pixels</h3><p class="note">With the pixels that the truth marks as other, none of the classes. '
+        f"Of these are given a class: {told}.</p>{_table(['Class', *heads], rows)}"
+    )
 
 
 def photo_section(data: ReportData) -> str:
@@ -291,7 +328,12 @@ def found_section(data: ReportData) -> str:
 
 def iou_of(data: ReportData, source: str) -> dict[str, float | None]:
     """IoU by class name of "labels" or "masks"; empty without metrics."""
-    found = data.figures(source).get("iou")
+    return of_classes(data.figures(source), "iou")
+
+
+def of_classes(figures: object, key: str) -> dict[str, float | None]:
+    """A figure by class name; empty if there is none."""
+    found = figures.get(key) if isinstance(figures, dict) else None
     return {str(name): number(value) for name, value in found.items()} if isinstance(found, dict) else {}
 
 

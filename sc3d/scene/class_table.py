@@ -17,6 +17,8 @@ from sc3d.scene.channels import Channels
 # in names: they would act on terminals, or cannot be written
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 MAX_NAME, MAX_BYTES = 200, 1 << 20
+# in truth masks, unless a class has one of these ids: looked at and none of the classes; not to be judged
+OTHER, UNJUDGED = 254, 255
 
 
 @dataclass(frozen=True)
@@ -50,24 +52,29 @@ class ClassTable:
         return self.classes[-1].id + 1
 
     @property
+    def leaves_other(self) -> bool:
+        """Whether truth masks may hold `OTHER` and `UNJUDGED`: no class has one of these ids."""
+        return self.num_ids <= OTHER
+
+    @property
     def channels(self) -> Channels:
         """Of votes for these classes."""
         return Channels.of_classes([entry.id for entry in self.classes])
 
     @property
     def palette(self) -> np.ndarray:
-        """(256, 3) uint8 RGB per id; unlabelled is dark gray."""
+        """(256, 3) uint8 RGB per id; unlabelled is dark gray, other of truth masks a lighter one."""
         palette = np.zeros((256, 3), np.uint8)
-        palette[0] = 60
+        palette[0], palette[OTHER] = 60, 105
         for entry in self.classes:
             palette[entry.id] = entry.color
         return palette
 
     def name(self, label: int) -> str:
-        """Name of an id; "unlabelled" for 0."""
+        """Name of an id; "unlabelled" for 0, "other" for `OTHER` of truth."""
+        rest = {0: "unlabelled"} | ({OTHER: "other"} if self.leaves_other else {})
         return next(
-            (entry.name for entry in self.classes if entry.id == label),
-            "unlabelled" if label == 0 else f"class {label}",
+            (entry.name for entry in self.classes if entry.id == label), rest.get(label, f"class {label}")
         )
 
     def find(self, name: str) -> int | None:
