@@ -387,8 +387,13 @@ def match_masks(
                 label for label in class_table.unknown(read_labels(file, meanings)) if label not in reserved
             ]
             if unknown:
+                advice = (
+                    f"; truth marks other by {OTHER} and pixels not to judge by {UNJUDGED}, if all classes have ids up to {OTHER - 1}"
+                    if truth and not reserved and unknown[0] >= OTHER
+                    else ""
+                )
                 raise InputError(
-                    f"{file} has class id {unknown[0]}, which is not in the class table (ids {[entry.id for entry in class_table]})"
+                    f"{file} has class id {unknown[0]}, which is not in the class table (ids {[entry.id for entry in class_table]}){advice}"
                 )
     if class_table is not None:
         tell_of_turned(folder, len(turns), *turns[:1])
