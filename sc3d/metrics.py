@@ -1,5 +1,5 @@
 """Overall accuracy, IoU per class and mIoU against truth masks, through the first surface (paper section
-4.2).
+4.2); precision and recall of the classes where the truth also tells what is none of them.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Confusion:
-    """counts: (C, C) int64 pixels, row = truth, column = prediction, indexed by class id; row 0 = other, that is none
-    of the classes, column 0 = no prediction. The closed-set figures are those of the other rows alone.
+    """counts: (C, C) int64 pixels, row = truth, column = prediction, indexed by class id; row 0 = other, none
+    of the classes, column 0 = no prediction. OA, IoU and coverage are those of the other rows alone.
     """
 
     counts: np.ndarray
 
     @classmethod
     def from_labels(cls, truth: np.ndarray, predicted: np.ndarray, num_ids: int) -> Confusion:
-        """Count the pixels whose truth is not 0, which may be `OTHER`. truth, predicted: uint8 arrays of one shape."""
+        """Count the pixels whose truth is not 0; it may be `OTHER`. truth, predicted: uint8, of one shape."""
         judged = truth > 0
         flat = _rows(truth[judged], num_ids) * num_ids + predicted[judged]
         return cls(np.bincount(flat, minlength=num_ids**2).reshape(num_ids, num_ids))
@@ -82,7 +82,7 @@ class Confusion:
 
     @property
     def precision(self) -> np.ndarray:
-        """(C,) share of the pixels predicted as a class, on other too, that are of it; NaN where there are none."""
+        """(C,) share of the pixels predicted as a class, also on other, that are of it; NaN without any."""
         predicted = self.counts.sum(axis=0)
         return np.where(predicted > 0, np.diag(self.counts) / np.maximum(predicted, 1), np.nan)
 
@@ -93,7 +93,7 @@ class Confusion:
         return np.where(true > 0, np.diag(self.counts) / np.maximum(true, 1), np.nan)
 
     def other(self, class_table: ClassTable) -> dict[str, object]:
-        """JSON-ready: pixels of other, the share of them that is given a class (None without any), and by class."""
+        """JSON-ready: pixels of other, share of them that is given a class (None without any), by class."""
         pixels = int(self.counts[0].sum())
         given = {
             class_table.name(int(label)): float(self.counts[0, label] / pixels)
@@ -103,7 +103,7 @@ class Confusion:
         return {"pixels": pixels, "given_class": share, "given": given}
 
     def summary(self, class_table: ClassTable) -> dict[str, object]:
-        """JSON-ready figures; fractions, not per cent. Precision and recall are over all judged pixels, other too."""
+        """JSON-ready figures; fractions, not per cent. Precision and recall count all judged pixels."""
         iou, open_set = self.iou, {"precision": self.precision, "recall": self.recall}
         figures = {
             key: {class_table.name(label): float(found[label]) for label in _ids(found)}
@@ -141,8 +141,8 @@ class EvaluationPixels:
     """The P pixels that have truth, and the cloud point that each of them shows: found once, then every
     labelling of the cloud is judged by a look-up.
 
-    truth: (P,) uint8 ids or `OTHER`, never 0; rows: (P,) int32 row of the cloud, -1 = no point there; band: (P,) bool
-        near a depth edge
+    truth: (P,) uint8 ids or `OTHER`, never 0; rows: (P,) int32 row of the cloud, -1 = no point there;
+    band: (P,) bool near a depth edge
     """
 
     truth: np.ndarray
@@ -179,8 +179,8 @@ class EvaluationPixels:
     def reliability(
         self, label: np.ndarray, confidence: np.ndarray, num_ids: int, other: bool = False
     ) -> Reliability:
-        """Confidence of the label at each pixel that has one, against being right; with `other` also where the truth
-        is other, where no label is right. label: (N,) uint8, confidence: (N,) float32 per point of the cloud.
+        """Confidence of the label at each pixel that has one, against being right; with `other` also where
+        the truth is other and no label right. label: (N,) uint8, confidence: (N,) float32, of the cloud.
         """
         predicted = self.look_up(label)
         labelled = (predicted > 0) & (other | (_rows(self.truth, num_ids) > 0))
@@ -269,8 +269,8 @@ class SeenCloud(Protocol):
 
 @dataclass(frozen=True)
 class EvaluationSummary:
-    """totals: figures by source (SOURCES); calibration_error: expected error of the confidence, on classes and on all
-    judged pixels, None = no photo
+    """totals: figures by source (SOURCES); calibration_error: expected error of the confidence, on pixels of
+    classes and on all judged ones, None = no photo
     """
 
     totals: dict[str, dict]
@@ -300,8 +300,9 @@ class EvaluationSummary:
 
 def _open_figures(found: dict) -> str:
     other = found["other"]
-    given = f"{other['given_class']:.1%} of {other['pixels']} px of other given a class ({_listed(other['given'])})"
-    return f"{given}  precision ({_listed(found['precision'])})  recall ({_listed(found['recall'])})"
+    given = f"{other['given_class']:.1%} of {other['pixels']} px of other given a class"
+    shares = [f"{name} ({_listed(found[name])})" for name in ("precision", "recall")]
+    return "  ".join([f"{given} ({_listed(other['given'])})", *shares])
 
 
 def _listed(shares: dict[str, float]) -> str:
@@ -371,12 +372,13 @@ def truth_masks(scene: Scene, settings: Evaluate) -> dict[str, Path]:
     scene.require(folder, hint="pass --truth FOLDER with manual masks")
     if settings.zero_margin is not None and not table.leaves_other:
         raise InputError(
-            f"{scene.classes} has a class with id {OTHER} or above, so that truth cannot mark other: give it a smaller id"
+            f"{scene.classes} has a class with id {OTHER} or above, so that truth cannot mark other: "
+            "give it a smaller id"
         )
     files = scene.mask_files(folder, table, truth=True)
     if not any(scene.read_truth(file, name, settings.zero_margin).any() for name, file in files.items()):
         raise InputError(
-            f"no pixel of the {len(files)} truth masks in {folder} is judged: they hold nothing but 0 and 255; "
+            f"no pixel of the {len(files)} truth masks in {folder} is judged: they hold only 0 and 255; "
             "if 0 means that none of the classes is there, pass --truth-zero other"
         )
     return files

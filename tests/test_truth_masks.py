@@ -13,7 +13,7 @@ from PIL import Image
 from sc3d.errors import InputError
 from sc3d.io.clouds import write_geometry
 from sc3d.report.data import load_report_data
-from sc3d.report.sections import headline, quality_section
+from sc3d.report.sections import headline, photo_section, quality_section
 from sc3d.runner import execute
 from sc3d.scene.class_table import OTHER, UNJUDGED, ClassTable, parse_classes
 from sc3d.scene.mask_values import judged_labels, meanings_of_truth, read_labels
@@ -184,7 +184,15 @@ def test_report_shows_both(scene):
     data = load_report_data(scene)
     page = headline(data) + quality_section(data)
     assert "All judged pixels" in page and "of the pixels of no class are given one" in page
+    assert "of other given a class" in photo_section(data) and ">other</li>" in photo_section(data)
     assert "Precision, fused labels" in page and "Share of other, given masks" in page
+
+
+def test_report_reads_truth_as_evaluate_did(scene):
+    execute("evaluate", scene, Evaluate(truth_zero="other", margin=4))
+    assert load_report_data(scene).zero_margin == 4
+    execute("evaluate", scene, Evaluate(), overwrite=True)
+    assert load_report_data(scene).zero_margin is None
 
 
 def test_margin_is_not_negative():

@@ -23,6 +23,7 @@ from sc3d.report.charts import (
 )
 from sc3d.report.data import ReportData, class_areas, read_features
 from sc3d.report.images import cloud_pictures, comparison, ground_picture
+from sc3d.scene.class_table import OTHER
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.view.colors import STATES, Coloring, color_points, confidence_colors, legend_entries
 
@@ -182,7 +183,7 @@ def _all_judged(data: ReportData) -> str:
     heads += [f"Share of other, {sources[source]}" for source in shares]
     told = "; ".join(f"{sources[source]}: {formatted(share, '.1%')}" for source, share in given.items())
     return (
-        f'<h3>All judged pixels</h3><p class="note">With the pixels that the truth marks as other, none of the classes. '
+        f'<h3>All judged pixels</h3><p class="note">With pixels that are none of the classes. '
         f"Of these are given a class: {told}.</p>{_table(['Class', *heads], rows)}"
     )
 
@@ -256,7 +257,10 @@ def _photo_figures(data: ReportData, name: str) -> str:
         for key, text in sources.items()
         if isinstance(figures.get(key), dict)
     ]
-    return " ".join(f"<small>{text} {value:.1%} right</small>" for text, value in found if value is not None)
+    told = [f"{text} {value:.1%} right" for text, value in found if value is not None]
+    given = given_class(figures["labels"]) if isinstance(figures.get("labels"), dict) else None
+    told += [] if given is None else [f"{given:.1%} of other given a class"]
+    return " ".join(f"<small>{text}</small>" for text in told)
 
 
 def _legend(data: ReportData, by: Coloring | Literal["mesh"], everything: bool = False) -> str:
@@ -269,6 +273,8 @@ def _legend(data: ReportData, by: Coloring | Literal["mesh"], everything: bool =
     values = data.values(by) if by in ("label", "state") else None
     present = None if values is None or everything else set(np.unique(values).tolist())
     entries = legend_entries(by, data.class_table, present)
+    if everything and given_class(data.figures("labels")) is not None:
+        entries += legend_entries(by, data.class_table, {OTHER})
     items = "".join(
         f'<li><i style="background:{css_color(color)}"></i>{escape(name)}</li>' for name, color in entries
     )

@@ -80,7 +80,7 @@ def meanings_of(table: ClassTable) -> Meanings:
 
 
 def meanings_of_truth(table: ClassTable) -> Meanings:
-    """As `meanings_of`, for truth masks, which may hold `OTHER` and `UNJUDGED` too unless classes have these ids."""
+    """As `meanings_of`, for truth masks: with `OTHER` and `UNJUDGED`, unless classes have these ids."""
     found = meanings_of(table)
     if not table.leaves_other:
         return found
@@ -92,7 +92,7 @@ def judged_labels(labels: np.ndarray, table: ClassTable, zero_margin: float | No
     """What is judged of a truth mask: class ids and `OTHER`; 0 = not judged.
 
     labels: (H, W) uint8 as `read_labels` gives them
-    zero_margin: 0 counts as `OTHER` where it is farther than this from each pixel of a class, px; None = nowhere
+    zero_margin: 0 counts as `OTHER` where it is farther than this from all classes, px; None = nowhere
     """
     if not table.leaves_other:
         return labels
@@ -193,7 +193,7 @@ def _read_channels(path: Path, meanings: Meanings, format: str) -> Values:
 
 
 def _says(labels: np.ndarray) -> bool:
-    """Whether a reading of truth is more than `UNJUDGED` and 0, which black-and-white pictures of a class hold, too."""
+    """Whether a reading of truth is more than 0 and `UNJUDGED`, as of any black-and-white picture."""
     return bool(((labels != 0) & (labels != UNJUDGED)).any())
 
 

@@ -168,8 +168,8 @@ class Scene:
         return self._onto_photo(read_labels(file, self._meanings), file, name)
 
     def read_truth(self, file: Path, name: str, zero_margin: float | None = None) -> np.ndarray:
-        """(H, W) uint8 of a truth mask of a photo, in the photo's frame as stored: ids and `OTHER`; 0 = not judged,
-        as where the photo is transparent. zero_margin: as in `judged_labels`
+        """(H, W) uint8 of a truth mask of a photo, in the photo's frame as stored: ids and `OTHER`; 0 = not
+        judged, as where the photo is transparent. zero_margin: as in `judged_labels`
         """
         table, meanings = self._truth_meanings
         return self._onto_photo(judged_labels(read_labels(file, meanings), table, zero_margin), file, name)
@@ -241,8 +241,8 @@ class Scene:
     def mask_files(
         self, folder: Path, class_table: ClassTable | None = None, truth: bool = False
     ) -> dict[str, Path]:
-        """Masks (or truth masks: `truth`, or confidence maps) of the views, by view name; all checked. Those of
-        photos without a camera are left out; `warn_of_unplaced` says so.
+        """Masks (or truth masks: `truth`, or confidence maps) of the views, by view name; all checked. Those
+        of photos without a camera are left out; `warn_of_unplaced` says so.
 
         Raises InputError for an empty folder, a mask without a photo, one that fits several photos, another
         aspect than the photo, or ids outside the class table.
@@ -387,17 +387,20 @@ def match_masks(
                 label for label in class_table.unknown(read_labels(file, meanings)) if label not in reserved
             ]
             if unknown:
-                advice = (
-                    f"; truth marks other by {OTHER} and pixels not to judge by {UNJUDGED}, if all classes have ids up to {OTHER - 1}"
-                    if truth and not reserved and unknown[0] >= OTHER
-                    else ""
-                )
                 raise InputError(
-                    f"{file} has class id {unknown[0]}, which is not in the class table (ids {[entry.id for entry in class_table]}){advice}"
+                    f"{file} has class id {unknown[0]}, which is not in the class table "
+                    f"(ids {[entry.id for entry in class_table]}){_advice(unknown[0], truth)}"
                 )
     if class_table is not None:
         tell_of_turned(folder, len(turns), *turns[:1])
     return matched
+
+
+def _advice(unknown: int, truth: bool) -> str:
+    if unknown < OTHER:
+        return ""
+    rule = f"{OTHER} is other and {UNJUDGED} not judged in truth masks alone"
+    return f"; {rule}" + (f", if all classes have ids up to {OTHER - 1}" if truth else "")
 
 
 @cache  # tiles look at the same masks again and again

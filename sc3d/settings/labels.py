@@ -175,14 +175,16 @@ class Propagate(Resources):
 
 @dataclass(frozen=True)
 class Evaluate(Resources):
-    """OA, mIoU and IoU per class against truth masks, through the first surface."""
+    """OA, mIoU, IoU, precision and recall per class against truth masks, through the first surface."""
 
     truth: Path | None = None
-    """Folder of truth masks; SCENE/truth otherwise. Their values are ids of classes, 254 = other: looked at, and none of
-    the classes, 255 = not judged.
+    """Folder of truth masks; SCENE/truth otherwise. Their values are ids of classes, 254 = other: looked at,
+    and none of the classes, 255 = not judged.
     """
     truth_zero: Literal["ignore", "other"] = "ignore"
-    """What 0 in truth masks stands for: ignore = not judged; other = somebody looked, and found none of the classes."""
+    """What 0 in truth masks stands for: ignore = not judged; other = somebody looked, and found none of the
+    classes.
+    """
     margin: float = 10.0
     """With --truth-zero other: 0 nearer to a class than this is not judged, as outlines are not sure, px."""
     labelled: Path | None = None

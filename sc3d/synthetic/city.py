@@ -108,7 +108,7 @@ class SiteLabels:
     rects: np.ndarray
 
     def truth(self, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-        """(N,) uint8 of surface points (N, 3), city's frame, on triangles (N,) of the site, as `truth_labels`."""
+        """(N,) uint8 as `truth_labels` of surface points (N, 3), city's frame, on triangles (N,) of the site."""
         local, plan = (
             (points - self.middle).astype(np.float32),
             (self.half, EXTENT / 2, self.rasters, self.rects),

@@ -17,8 +17,8 @@ SAMPLES_PER_BAND = 2_000_000  # rows are rendered in bands: large photos must no
 
 @dataclass(frozen=True)
 class Photo:
-    """color (H, W, 3) uint8; depth (H, W) float32 z of the pixel center's ray, m, 0 = nothing there; truth (H, W)
-    uint8 of the same ray, as `World.truth`.
+    """color (H, W, 3) uint8; depth (H, W) float32 z of the pixel center's ray, m, 0 = nothing there; truth
+    (H, W) uint8 of the same ray, as `World.truth`.
     """
 
     color: np.ndarray

@@ -128,8 +128,8 @@ def shade(
 
 
 def truth_labels(labels: np.ndarray, points: np.ndarray, triangles: np.ndarray, site: float) -> np.ndarray:
-    """(N,) uint8 truth of surface points: as their `surface_labels` (N,), but `scene.class_table.OTHER` for the sky and
-    for what is no class on the site (half side `site`, m); 0, which is not judged, is left outside of the site.
+    """(N,) uint8 truth of surface points: their `surface_labels` (N,), but `scene.class_table.OTHER` for sky
+    and for what is no class on the site (half side `site`, m); 0, not judged, is left outside of the site.
     """
     outside = (triangles >= 0) & (np.abs(points[:, :2]).max(axis=1) > site)
     return np.where((labels == OTHER) & ~outside, class_table.OTHER, labels).astype(np.uint8)

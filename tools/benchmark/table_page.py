@@ -26,9 +26,10 @@ DIFFERENCES = [
     ("default - majority voting with the filter", None, DEFAULT, "majority voting"),
 ]
 NOTE = (
-    "Per cent, over the pixels with truth of every {every}th photo: first surface, nearest cloud point, no label counts as wrong. Edges: within 10 px of a depth "
-    "edge; elsewhere some classes are rare (trees are all edges), so look at OA there. All judged pixels: with what"
-    " the truth marks as other. Points: mIoU over the points of the cloud, where their labels are known. "
+    "Per cent, over the pixels with truth of every {every}th photo: first surface, nearest cloud point, no label "
+    "counts as wrong. Edges: within 10 px of a depth edge; elsewhere some classes are rare (trees are all edges), "
+    "so look at OA there. All judged pixels: with what the truth marks as other. "
+    "Points: mIoU over the points of the cloud, where their labels are known. "
     "ECE: expected calibration error of the confidence, 10 bins. ± is the standard deviation over {seeds}. CPU s: label and propagate, all "
     "threads, without reading cloud and mesh. MB: peak memory of the process, the loaded scene included. Code {code}."
 )
@@ -121,7 +122,7 @@ def _table(rows: list[dict], results: list[dict]) -> str:
 
 
 def _figures(rows: list[dict], results: list[dict]) -> list[tuple[str, list[dict]]]:
-    """Name and figures on every scene: the masks, the rows, and the bound where the truth of the points is known."""
+    """Name and figures on every scene: of masks, rows, and the bound, where the points' truth is known."""
     masks = [result["rows"]["masks"] for result in results]
     bounds = (
         [(BOUND, [figures["bound"] for figures in masks])]
