@@ -35,7 +35,7 @@ from tools.benchmark.__main__ import main
 from tools.benchmark.fusion_page import markdown as fusion_markdown
 from tools.benchmark.settings import BenchmarkTables
 from tools.benchmark.surface_page import page, voxel_size_of
-from tools.benchmark.table_page import DIFFERENCES, markdown, spread
+from tools.benchmark.table_page import BOUND, DIFFERENCES, MASKS, markdown, spread
 from tools.benchmark.table_rows import DEFAULT, OURS, ablation, turned
 from tools.make_manual import helps
 
@@ -263,6 +263,23 @@ def test_page_shows_means_spread_and_differences():
     assert "| synthetic | +0.00 ± 0.00 |" in text
     assert f"| {OURS} | 95.0 ± 7.1 | 85.0 ± 7.1 | 85.0 ± 7.1 |" in text and "every 4th photo" in text
     assert spread([1.0]) == "1.0" and spread([np.nan]) == "–"
+
+
+def test_page_shows_all_judged_pixels(record):
+    text = markdown(record)
+    lines = text.partition("### All judged pixels")[2].partition("\n## ")[0].strip().splitlines()
+    heads, *rows = [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in lines if "---" not in line
+    ]
+    assert heads[1:4] == ["other given a class", "building precision", "building recall"]
+    found = {row[0]: row for row in rows}
+    masks = record["results"][0]["rows"]["masks"]["all"]
+    assert masks["other"]["pixels"] > 100
+    assert found[MASKS][1] == f"{100 * masks['other']['given_class']:.1f}"
+    assert found[MASKS][2] == f"{100 * masks['precision']['building']:.1f}"
+    bound = record["results"][0]["rows"]["masks"]["bound"]["all"]
+    assert bound["other"]["given_class"] < 0.5 < masks["other"]["given_class"]
+    assert DEFAULT in found and found[BOUND][1] == f"{100 * bound['other']['given_class']:.1f}"
 
 
 def test_bad_input(folder, tmp_path, capsys):

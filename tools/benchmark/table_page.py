@@ -59,7 +59,8 @@ def markdown(record: dict) -> str:
         parts.append(f"## {group[0].upper()}{group[1:]}: {', '.join(result['scene'] for result in results)}")
         for title, rows in layout.items():
             parts += [f"### {title}", _table(rows, results)]
-        parts += ["### All judged pixels", _open_table(layout, results)]
+        if any(np.isfinite(_given(result["rows"]["masks"]["all"])) for result in results):
+            parts += ["### All judged pixels", _open_table(layout, results)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -153,7 +154,7 @@ def _open_table(layout: dict[str, list[dict]], results: list[dict]) -> str:
 
 
 def _given(figures: dict) -> float:
-    share = figures["other"]["given_class"]
+    share = figures.get("other", {}).get("given_class")  # records of earlier versions have none
     return np.nan if share is None else share
 
 
