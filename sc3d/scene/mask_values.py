@@ -15,7 +15,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from sc3d.errors import InputError
@@ -97,6 +96,8 @@ def judged_labels(labels: np.ndarray, table: ClassTable, zero_margin: float | No
     if not table.leaves_other:
         return labels
     if zero_margin is not None:
+        import cv2
+
         free = (labels == 0) | (labels >= OTHER)
         away = np.full(labels.shape, np.inf)
         if not free.all():
