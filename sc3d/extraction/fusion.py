@@ -25,7 +25,7 @@ MIN_PART = 100  # triangles; smaller components are floaters
 ROUNDS = 4  # of completion, each with every fourth view
 NUM_OTHERS = 12  # views asked whether they look through a point
 NEAREST = 0.1  # of the nearest usual depth: occluders are nearer
-BEYOND = 20.0  # times the farthest usual depth: ground beyond what is known is no occluder
+BEYOND = 20.0  # times the farthest usual depth: where nobody looks through there, nothing tells how far it is
 UNLIKE = 0.98  # quantile of the color differences on confirmed surface; more is something else
 BESIDE = 0.1  # of the longest side
 OCCLUDER = 2e-3  # of the pixels, smallest region that is taken for one
@@ -181,9 +181,11 @@ def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
     as_known = np.abs(known / np.where(np.isfinite(hit), hit, 1) - 1) < MARGIN
     covered = _unlike_surface(data, store, row, (known > 0) & np.isfinite(hit) & as_known)
     empty = _large(empty | covered) & empty  # a few pixels at a border say nothing
-    far = np.where(covered, (1 - MARGIN) * hit, np.where(empty, BEYOND * data.depth_range[1], 0))
-    far = far.astype(np.float32)
     others, nearest = _others(data, store, row), NEAREST * data.depth_range[0]
+    beyond = np.where(empty & ~covered, np.float32(BEYOND * data.depth_range[1]), np.float32(0))
+    toward = np.broadcast_to(np.float32([0, 0, -1]), (*hit.shape, 3))
+    inside = count_opposed(beyond, toward, view, *others) > 0
+    far = np.where(covered, (1 - MARGIN) * hit, np.where(inside, data.depth_range[1], 0)).astype(np.float32)
     depth = farthest_free(far, nearest, view, *others)
     depth = cv2.medianBlur(depth, 5)
     depth = np.where(empty & (depth == 0), _spread(depth, data.image(row)), depth)
