@@ -295,7 +295,7 @@ def check_view(job: StereoJob, row: int) -> np.ndarray:
     last = len(passes(job.longest)) - 1
     planes, view, sources = np.load(job.file(last, row)), job.view(last, row), job.sources[row]
     inverse = np.ascontiguousarray(planes[..., 0])
-    others = [np.load(job.file(last, source))[..., :3] for source in sources]
+    others = [_planes_in_photo(job, source) for source in sources]
     other_views = [job.view(last, source) for source in sources]
     counts = count_agreements(inverse, view, others, other_views)
     loose = count_agreements(inverse, view, others, other_views, LOOSE)
@@ -316,6 +316,16 @@ def check_view(job: StereoJob, row: int) -> np.ndarray:
     return (points - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
 
 
+def _planes_in_photo(job: StereoJob, row: int) -> np.ndarray:
+    """(H, W, 3) planes that a view ends with, 0 where its photo shows nothing."""
+    last = len(passes(job.longest)) - 1
+    planes = np.load(job.file(last, row))[..., :3]
+    opaque = Scene(job.scene).opaque_pixels(job.photo_views[row], job.view(last, row))
+    if opaque is not None:
+        planes[~opaque] = 0
+    return planes
+
+
 def finish_view(job: StereoJob, ground: Ground | None, row: int) -> tuple[float, float, float, float]:
     """Complete a view and write its depth map; returns the shares of its pixels that one and that two other
     views confirm, that have a depth, and of sky.
@@ -332,11 +342,13 @@ def finish_view(job: StereoJob, ground: Ground | None, row: int) -> tuple[float,
         below = ~not_below(view, planes, loose >= 1, ground)
         counts[below], loose[below] = 0, 0
     sky = find_sky(image, counts >= 1, horizon(view, job.up))
+    if opaque is not None:
+        sky &= opaque
     counts[sky] = 0
     sure = counts >= min(SURE, len(job.sources[row]))
     complete = continued_planes(view, planes, sure, image, ground)
     complete[loose >= 1] = planes[loose >= 1, :3]
-    complete[sky if opaque is None else sky | ~opaque] = 0
+    complete[sky | (False if opaque is None else ~opaque)] = 0
     inverse, file = complete[..., 0], depth_file(job.output, view.name)
     depth = np.where(inverse > 0, 1 / np.maximum(inverse, 1e-30), 0).astype(np.float32)
     write_depth_map(file, DepthMap(depth, plane_normals(view, complete), counts, sky))
