@@ -112,7 +112,7 @@ def test_undistorted_photo_shows_what_the_pinhole_view_projects(model):
     )
     inside = cameras.in_photo(view, pinhole)
     if inside is not None:
-        pixels = pixels[cv2.erode(inside.astype(np.uint8), np.ones((3, 3)))[pixels[:, 1], pixels[:, 0]] > 0]
+        pixels = pixels[cv2.erode(inside.astype(np.uint8), np.ones((7, 7)))[pixels[:, 1], pixels[:, 0]] > 0]
     assert len(pixels) > 150
     directions, _ = cameras.rays(pinhole, pixels + 0.5)
     expected, _ = cameras.project(view, view.center + 10 * directions)
