@@ -288,11 +288,10 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
     }
     nothing = _empty_figures(empty, table)
     metrics = {"photos": [view.name for view in views], "classes": [entry.name for entry in table]} | totals
-    if nothing:
-        metrics["without_surface"] = nothing
+    apart = {"without_surface": nothing} if nothing else {}
     write_json(
         settings.output or scene.metrics,
-        metrics | {"reliability": overall.summary() if overall else {}, "per_photo": photos},
+        metrics | apart | {"reliability": overall.summary() if overall else {}, "per_photo": photos},
     )
     return EvaluationSummary(totals, overall.ece if overall else None, nothing)
 

@@ -126,7 +126,9 @@ def parse_classes(entries: object, origin: Path | str) -> ClassTable:
         if doubled:
             raise InputError(f"{origin}: {key} {doubled[0]!r} is used twice")
     if not any(entry.surface for entry in classes):
-        raise InputError(f"{origin}: no class has a surface, so that no point can get a label: add one that has")
+        raise InputError(
+            f"{origin}: no class has a surface, so that no point can get a label: add one that has"
+        )
     return ClassTable(classes)
 
 
