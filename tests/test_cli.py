@@ -43,6 +43,31 @@ def files(folder: Path) -> set:
     }
 
 
+@pytest.mark.parametrize(
+    ("name", "options", "first"),
+    [
+        ("sky", (), "segment"),
+        ("tree", (), "depth"),
+        ("sky", ("--depth.ignore-masks",), "depth"),
+        ("sky", ("--depth.sky-masks", "sky"), "depth"),
+    ],
+)
+def test_run_makes_masks_first_where_depth_takes_sky_from_them(scene, monkeypatch, name, options, first):
+    """Else a second run would find masks that the first one's depth did not know, and do all again."""
+    from sc3d.commands import run
+
+    stages: list[str] = []
+    table = [{"id": 1, "name": "road", "color": [1, 1, 1]}, {"id": 3, "name": name, "color": [9, 9, 9]}]
+    (scene / "classes.json").write_text(json.dumps(table))
+    for step in ("check", "prepare", "reconstruct"):
+        monkeypatch.setattr(run, step, lambda *arguments: None)
+    monkeypatch.setattr(run, "execute", lambda stage, *arguments: stages.append(stage))
+    main(["run", "photos", str(scene), *options])
+    others = [stage for stage in stages if stage != "segment"]
+    assert others == ["depth", "train", "extract", "label", "propagate", "report"]
+    assert stages[0] == first and stages.index("segment") in (0, 3)
+
+
 @pytest.mark.parametrize("name", [*STAGES, *COMMANDS])
 def test_help_answers_in_under_a_second(name):
     code = "from sc3d.cli import main; main()"

@@ -114,7 +114,11 @@ def test_annotations_of_sky(photos, table):
         (TABLE, gray(1), "which is a class with a surface"),
         (TABLE, classes(sky=0), "which is a class with a surface"),
         (TABLE, classes(sky=7), "class id 7.*--mapping"),
-        (parse_classes([BUILDING, BUILDING | {"id": 2, "name": "b"}, SKY_CLASS], "t"), classes(2), "no mask in"),
+        (
+            parse_classes([BUILDING, BUILDING | {"id": 2, "name": "b"}, SKY_CLASS], "t"),
+            classes(2),
+            "no mask in",
+        ),
         (BARE, classes(), "are not binary"),
         (None, classes(), "are not binary"),
         (None, gray(7), "are not binary"),
