@@ -93,7 +93,7 @@ class Depth(Workers):
     num_sources: int = 6
     """Other photos that each is compared with."""
     sky_masks: Path | None = None
-    """Masks that show the sky, in any format of `sc3d segment --masks`: binary (0, and 1 or 255 for sky), or of
+    """Masks that show the sky, in any format of `sc3d segment --masks`: binary (255 or 1 is sky, 0 is not), or of
     classes, of which those without surface are sky. SCENE/masks otherwise, where there are masks and classes.json
     has such a class.
     """

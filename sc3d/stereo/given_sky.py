@@ -43,7 +43,7 @@ def read_given_sky(
 ) -> GivenSky:
     """What masks made for the sky say.
 
-    path: as `MaskFiles` has it; PNGs may also be binary: 0, and 1 or 255 for sky. Of classes, those without
+    path: as `MaskFiles` has it; PNGs may also be binary: 0, and 1 or 255 for sky, where 0 is no sky. Of classes, those without
         surface are sky; where there is no such class in the table, one that is called sky
     photo_sizes: (width, height) px as stored by photo name; photos: their folder
 
@@ -96,7 +96,7 @@ def _binary(path: Path, photo_sizes: dict[str, tuple[int, int]], photos: Path) -
 
     def read(name: str, file: Path) -> np.ndarray:
         found = turned_onto(read_confidence(file), file, photos / name)
-        return np.where(found > 0, np.uint8(SKY), np.uint8(UNTOLD))
+        return np.where(found > 0, np.uint8(SKY), np.uint8(SURFACE))
 
     files = match_masks(path, photo_sizes, None, photos=photos)
     values = {value for file in files.values() for value in _values(file)}

@@ -21,7 +21,7 @@ from sc3d.settings.reconstruction import Depth, Extract
 from sc3d.settings.synthesize import Synthesize
 from sc3d.stages import depth
 from sc3d.stereo import multi_view
-from sc3d.stereo.given_sky import SKY
+from sc3d.stereo.given_sky import SKY, SURFACE
 
 
 @pytest.fixture(scope="module")
@@ -223,13 +223,14 @@ def test_given_masks_of_sky_are_used(site, tmp_path, monkeypatch):
     told = {}
 
     def estimated(job, tasks):
-        told.update({row: job.told(row, SKY) for row in range(8)})
+        told.update({row: (job.told(row, SKY), job.told(row, SURFACE)) for row in range(8)})
         return [(0.5, 0.4, 0.6, 0.1)] * 8
 
     monkeypatch.setattr(depth, "estimate_depths", estimated)
     assert execute("depth", scene, Depth(max_size=64, sky_masks=folder))["sky_masks"] == "of 1 photos"
-    assert [row for row in told if told[row].any()] == [3]
-    assert told[3][:, :31].all() and not told[3][:, 33:].any()
+    assert [row for row in told if np.any(told[row])] == [3]
+    sky, surface = told[3]
+    assert sky[:, :31].all() and surface[:, 33:].all() and not (sky & surface).any()
 
 
 def small_map() -> DepthMap:
