@@ -78,6 +78,8 @@ def check(command: Run, segment: Segment) -> None:
             )
         source = mask_source(segment, masks) if segment.masks else MaskFiles(masks, "index")
         check_masks(source, sizes, class_table, segment.confidence, command.photos)
+    if command.extract.crop > len(sizes):
+        raise InputError(f"--extract.crop {command.extract.crop}: there are only {len(sizes)} photos")
     if command.depth.sky_masks is not None:
         from sc3d.stereo.given_sky import read_given_sky
 

@@ -98,9 +98,12 @@ def _binary(path: Path, photo_sizes: dict[str, tuple[int, int]], photos: Path) -
         found = turned_onto(read_confidence(file), file, photos / name)
         return np.where(found > 0, np.uint8(SKY), np.uint8(SURFACE))
 
-    files = match_masks(path, photo_sizes, None, photos=photos)
-    values = {value for file in files.values() for value in _values(file)}
-    if values - {0} not in ({1}, {255}):
+    files, values = match_masks(path, photo_sizes, None, photos=photos), set[int]()
+    for file in files.values():
+        values |= _values(file) - {0}
+        if len(values) > 1:
+            return {}
+    if values not in ({1}, {255}):
         return {}
     return {name: partial(read, name, file) for name, file in files.items()}
 
@@ -108,7 +111,7 @@ def _binary(path: Path, photo_sizes: dict[str, tuple[int, int]], photos: Path) -
 def _values(file: Path) -> set[int]:
     """Gray values of a PNG; -1 for one that has colors, or more than 8 bits."""
     try:
-        return set(np.unique(read_confidence(file)).tolist())
+        return set(np.flatnonzero(np.bincount(read_confidence(file).ravel())).tolist())
     except InputError:
         return {-1}
 
