@@ -43,8 +43,8 @@ def read_given_sky(
 ) -> GivenSky:
     """What masks made for the sky say.
 
-    path: as `MaskFiles` has it; PNGs may also be binary: 0, and 1 or 255 for sky, where 0 is no sky. Of classes, those without
-        surface are sky; where there is no such class in the table, one that is called sky
+    path: as `MaskFiles` has it; PNGs may also be binary: 0, and 1 or 255 for sky, where 0 is no sky. Of
+        classes, those without surface are sky; where the table has none, one that is called sky
     photo_sizes: (width, height) px as stored by photo name; photos: their folder
 
     InputError for what does not fit, for masks without any sky, and where it is not clear which values are.
@@ -52,8 +52,14 @@ def read_given_sky(
     if not path.exists():
         raise InputError(f"--sky-masks {path} is missing: pass a folder of masks, or a file of annotations")
     annotated = detect(path, PhotoNames(photo_sizes)) in READERS
-    binary = {} if annotated else _binary(path, photo_sizes, photos)
+    value, binary = (0, GivenSky()) if annotated else _binary(path, photo_sizes, photos)
+    unclear = InputError(
+        f"--sky-masks: {path} holds 0 and one other value, which is a class with a surface: save binary masks in gray of 8 "
+        "bits with 255 for sky, or 1 where 255 is a class; masks of classes need a pixel of one without surface"
+    )
     if table is None or not table.without_surface:
+        if table is not None and value in {entry.id for entry in table}:
+            raise unclear
         if not annotated and not binary:
             raise InputError(
                 f"--sky-masks: the masks in {path} are not binary (0, and 1 or 255 for sky), or show no sky; for masks of "
@@ -69,10 +75,7 @@ def read_given_sky(
     if any((read() == SKY).any() for read in classes.values()):
         return classes
     if binary:
-        raise InputError(
-            f"--sky-masks: {path} holds 0 and one other value, which is a class with a surface: save the sky of binary "
-            "masks as a value that is no class (1 or 255); masks of classes need a pixel of one without surface"
-        )
+        raise unclear
     raise InputError(f"--sky-masks: no mask in {path} has a pixel of a class without surface")
 
 
@@ -91,8 +94,10 @@ def _of_classes(
     return {name: partial(read, name) for name in masks}
 
 
-def _binary(path: Path, photo_sizes: dict[str, tuple[int, int]], photos: Path) -> GivenSky:
-    """Binary PNGs; empty if one of them holds more than 0 and 1, or 0 and 255, or none has sky."""
+def _binary(path: Path, photo_sizes: dict[str, tuple[int, int]], photos: Path) -> tuple[int, GivenSky]:
+    """The value of sky in binary PNGs, and these; 0 and none if they hold more than 0 and 1, or 0 and 255, or show
+    no sky.
+    """
 
     def read(name: str, file: Path) -> np.ndarray:
         found = turned_onto(read_confidence(file), file, photos / name)
@@ -102,10 +107,10 @@ def _binary(path: Path, photo_sizes: dict[str, tuple[int, int]], photos: Path) -
     for file in files.values():
         values |= _values(file) - {0}
         if len(values) > 1:
-            return {}
+            break
     if values not in ({1}, {255}):
-        return {}
-    return {name: partial(read, name, file) for name, file in files.items()}
+        return 0, {}
+    return values.pop(), {name: partial(read, name, file) for name, file in files.items()}
 
 
 def _values(file: Path) -> set[int]:
