@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -223,10 +223,13 @@ class SeenCloud(Protocol):
 
 @dataclass(frozen=True)
 class EvaluationSummary:
-    """totals: figures by source (SOURCES); calibration_error: expected error of the confidence, None = no labels"""
+    """totals: figures by source (SOURCES); calibration_error: expected error of the confidence, None = no labels
+    empty: of the truth's pixels of classes without surface, by class, how many there are and how many hit nothing
+    """
 
     totals: dict[str, dict]
     calibration_error: float | None
+    empty: dict[str, dict[str, int]] = field(default_factory=dict)
 
     def figures(self) -> dict[str, object]:
         """What the stage reports."""
@@ -237,6 +240,12 @@ class EvaluationSummary:
             rows[key] = f"{head}  ({classes})  coverage {found['coverage']:.1%}"
         if self.calibration_error is not None:
             rows["calibration_error"] = round(self.calibration_error, 4)
+        if self.empty:
+            shares = [
+                f"{name} {found['right'] / found['pixels']:.1%} of {found['pixels']} pixels"
+                for name, found in self.empty.items()
+            ]
+            rows["without_surface"] = f"judged apart, nothing is hit: {'  '.join(shares)}"
         return rows
 
 
@@ -254,10 +263,12 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
     mask_files = scene.mask_files(scene.masks, table) if scene.masks.is_dir() else {}
     views = [view for view in scene.model.views if view.name in truth_files]
     _tell_of_left_out(scene, [view.name for view in views], mask_files)
-    per_photo, reliabilities = {}, []
+    per_photo, reliabilities, empty = {}, [], list[np.ndarray]()
     for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
         truth = scene.read_mask(truth_files[view.name], view.name)
         rows, first = surface.rows(view, truth.shape[::-1], truth > 0)
+        empty.append(_count_empty(truth, first.range, table))
+        truth[table.shows_no_surface(truth)] = 0
         pixels = EvaluationPixels.from_photo(truth, rows, depth_edge_band(first.range, settings.band))
         near, elsewhere = pixels.confusions(pixels.look_up(labels.label), table.num_ids)
         found = {"labels": near + elsewhere, "labels_near_edges": near, "labels_elsewhere": elsewhere}
@@ -275,12 +286,36 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
         name: {key: found[key].summary(table) for key in SOURCES if key in found}
         for name, found in per_photo.items()
     }
+    nothing = _empty_figures(empty, table)
     metrics = {"photos": [view.name for view in views], "classes": [entry.name for entry in table]} | totals
+    apart = {"without_surface": nothing} if nothing else {}
     write_json(
         settings.output or scene.metrics,
-        metrics | {"reliability": overall.summary() if overall else {}, "per_photo": photos},
+        metrics | apart | {"reliability": overall.summary() if overall else {}, "per_photo": photos},
     )
-    return EvaluationSummary(totals, overall.ece if overall else None)
+    return EvaluationSummary(totals, overall.ece if overall else None, nothing)
+
+
+def _count_empty(truth: np.ndarray, ranges: np.ndarray, table: ClassTable) -> np.ndarray:
+    """(2, C) int64 pixels of each class without surface in a truth mask, and those where nothing is hit.
+
+    truth: (H, W) uint8 ids; ranges: (H, W) of the first surface, inf = nothing; the order is the table's
+    """
+    shown = [truth == entry.id for entry in table.without_surface]
+    counts = [[pixels.sum(), (pixels & ~np.isfinite(ranges)).sum()] for pixels in shown]
+    return np.array(counts, np.int64).reshape(-1, 2).T
+
+
+def _empty_figures(counts: list[np.ndarray], table: ClassTable) -> dict[str, dict[str, int]]:
+    """Sums of `_count_empty` by class, of those that the truth shows."""
+    if not counts:
+        return {}
+    names = [entry.name for entry in table.without_surface]
+    return {
+        name: {"pixels": int(pixels), "right": int(right)}
+        for name, pixels, right in zip(names, *np.sum(counts, axis=0), strict=True)
+        if pixels
+    }
 
 
 def _tell_of_left_out(scene: Scene, judged: list[str], mask_files: dict[str, Path]) -> None:

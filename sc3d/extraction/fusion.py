@@ -12,6 +12,7 @@ import open3d as o3d
 from tqdm import tqdm
 
 from sc3d.errors import Sc3dError
+from sc3d.extraction.crop import cropped
 from sc3d.extraction.evidence import DepthViews, EvidenceStore
 from sc3d.extraction.free_space import MARGIN, count_opposed, farthest_free
 from sc3d.geometry.cameras import View
@@ -44,6 +45,8 @@ class Surfaces:
     Shares of all pixels. confirmed: depth confirmed by other views; continued: added as it continues
     confirmed surface; occluders: added before it at the farthest depth that no other view looks through; sky;
     coverage: ray hits the mesh
+
+    cropped: share of the mesh's area that too few views see and that is left out
     """
 
     mesh: o3d.t.geometry.TriangleMesh
@@ -54,10 +57,14 @@ class Surfaces:
     occluders: float
     sky: float
     coverage: float
+    cropped: float = 0.0
 
 
-def fuse_views(data: DepthViews, store: EvidenceStore, voxel_size: float, fill: Fill) -> Surfaces:
-    """Fuse what is confirmed, then add what only one view shows, as far as `fill` allows.
+def fuse_views(
+    data: DepthViews, store: EvidenceStore, voxel_size: float, fill: Fill, crop: int = 0
+) -> Surfaces:
+    """Fuse what is confirmed, then add what only one view shows, as far as `fill` allows, then leave out what
+    fewer than `crop` views see.
 
     voxel_size: world units. Raises Sc3dError where nothing is confirmed.
     """
@@ -73,11 +80,12 @@ def fuse_views(data: DepthViews, store: EvidenceStore, voxel_size: float, fill: 
                 part, share = _added(data, store, surface, row, steps[name], voxel_size)
                 parts.append(part)
                 shares[name] += share / len(data.views)
-    mesh, cloud = _joined(parts)
-    sky = float(np.mean([store.read(row, "sky").mean() for row in range(len(data.views))]))
-    return Surfaces(
-        mesh, cloud, voxel_size, confirmed, **shares, sky=sky, coverage=_coverage(mesh, data.views)
-    )
+    (mesh, cloud), left_out = _joined(parts), 0.0
+    if crop:
+        (mesh, cloud), left_out = cropped((mesh, cloud), _surface(mesh), data, store, voxel_size, crop)
+    shares["sky"] = float(np.mean([store.read(row, "sky").mean() for row in range(len(data.views))]))
+    coverage = _coverage(mesh, data.views)
+    return Surfaces(mesh, cloud, voxel_size, confirmed, **shares, coverage=coverage, cropped=left_out)
 
 
 def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[DepthFusion, float]:
@@ -151,7 +159,7 @@ def _added(
     first = first_surface(surface, view)
     hit = np.where(np.isfinite(first.range), first.range * first.ray_z, np.inf).astype(np.float32)
     depth, normals = step(data, store, row, hit)
-    wanted = (depth > 0) & (depth < (1 - MARGIN) * hit)
+    wanted = (depth > 0) & (depth < (1 - MARGIN) * hit) & ~store.read(row, "sky")
     squares, centers = pixel_squares(view, depth, data.image(row), wanted, normals)
     if len(centers.point.positions):
         centers = cloud_in_order(centers.voxel_down_sample(voxel_size))

@@ -32,6 +32,7 @@ from sc3d.stereo.completion import (
     not_below,
     without_speckles,
 )
+from sc3d.stereo.given_sky import SKY, SURFACE, GivenSky
 from sc3d.stereo.patch_match import Stereo, evaluate, sweep
 from sc3d.stereo.pinhole_pairs import GrayView, smaller, stacked, transfers
 from sc3d.tiling.executor import Executor
@@ -114,6 +115,15 @@ class StereoJob:
         """(2, H, W) uint8, how many sources confirm a pixel of the last pass, and how many loosely."""
         return self.work / f"checked-{row}.npy"
 
+    def sky_file(self, row: int) -> Path:
+        """(H, W) uint8, what a mask says of the pixels of a view (`given_sky`), if there is one."""
+        return self.work / f"sky-{row}.npy"
+
+    def told(self, row: int, what: int) -> np.ndarray:
+        """(H, W) bool: pixels of which a mask says so; none without a mask."""
+        file, view = self.sky_file(row), self.views[row]
+        return np.load(file) == what if file.exists() else np.zeros((view.height, view.width), bool)
+
     def gray(self, row: int) -> GrayView:
         return GrayView(self.views[row], np.load(self.gray_file(row)).astype(np.float32) / np.float32(255))
 
@@ -154,6 +164,14 @@ def estimate_depths(job: StereoJob, tasks: Executor) -> list[tuple[float, float,
     points = tasks.run("confirming", partial(check_view, job), rows)
     ground = fit_ground(np.concatenate(points), np.array([view.center for view in job.views]), job.up)
     return tasks.run("completing", partial(finish_view, job, ground), rows)
+
+
+def write_sky(job: StereoJob, masks: GivenSky) -> None:
+    """What masks, by view name, say of the pixels of the views, unless it is already there."""
+    for row, photo_view in enumerate(job.photo_views):
+        if photo_view.name in masks and not job.sky_file(row).exists():
+            told = masks[photo_view.name]()
+            save(job.sky_file(row), resample(told, photo_view, job.views[row], labels=True))
 
 
 def write_gray(job: StereoJob, row: int) -> None:
@@ -302,7 +320,7 @@ def check_view(job: StereoJob, row: int) -> np.ndarray:
     costs = np.empty(inverse.shape, np.float32)
     evaluate(_problem(job, last, row, geometric=False), planes, costs)
     opaque = Scene(job.scene).opaque_pixels(job.photo_views[row], view)
-    unsure = (costs > MAX_COST) | (False if opaque is None else ~opaque)
+    unsure = (costs > MAX_COST) | job.told(row, SKY) | (False if opaque is None else ~opaque)
     counts[unsure], loose[unsure] = 0, 0
     counts[~without_speckles(inverse, counts >= 1)] = 0
     counts[(counts > 1) & ~without_speckles(inverse, counts > 1)] = 1
@@ -317,9 +335,9 @@ def check_view(job: StereoJob, row: int) -> np.ndarray:
 
 
 def _planes_in_photo(job: StereoJob, row: int) -> np.ndarray:
-    """(H, W, 3) planes that a view ends with, 0 where its photo shows nothing."""
+    """(H, W, 3) planes that a view ends with, 0 where its photo shows nothing, or sky that it was told of."""
     last = len(passes(job.longest)) - 1
-    planes = np.load(job.file(last, row))[..., :3]
+    planes = np.load(job.file(last, row))[..., :3] * ~job.told(row, SKY)[..., None]
     opaque = Scene(job.scene).opaque_pixels(job.photo_views[row], job.view(last, row))
     if opaque is not None:
         planes[~opaque] = 0
@@ -341,7 +359,7 @@ def finish_view(job: StereoJob, ground: Ground | None, row: int) -> tuple[float,
     if ground is not None:
         below = ~not_below(view, planes, loose >= 1, ground)
         counts[below], loose[below] = 0, 0
-    sky = find_sky(image, counts >= 1, horizon(view, job.up))
+    sky = find_sky(image, counts >= 1, horizon(view, job.up)) & ~job.told(row, SURFACE) | job.told(row, SKY)
     if opaque is not None:
         sky &= opaque
     counts[sky] = 0
