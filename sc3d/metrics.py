@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -271,10 +271,12 @@ class SeenCloud(Protocol):
 class EvaluationSummary:
     """totals: figures by source (SOURCES); calibration_error: expected error of the confidence, on pixels of
     classes and on all judged ones, None = no photo
+    empty: of the truth's pixels of classes without surface, by class, how many there are and how many hit nothing
     """
 
     totals: dict[str, dict]
     calibration_error: tuple[float, float] | None
+    empty: dict[str, dict[str, int]] = field(default_factory=dict)
 
     @property
     def has_other(self) -> bool:
@@ -295,6 +297,12 @@ class EvaluationSummary:
             rows["calibration_error"] = round(on_classes, 4)
             if self.has_other:
                 rows["calibration_error_with_other"] = round(everywhere, 4)
+        if self.empty:
+            shares = [
+                f"{name} {found['right'] / found['pixels']:.1%} of {found['pixels']} pixels"
+                for name, found in self.empty.items()
+            ]
+            rows["without_surface"] = f"judged apart, nothing is hit: {'  '.join(shares)}"
         return rows
 
 
@@ -323,10 +331,12 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
     mask_files = scene.mask_files(scene.masks, table) if scene.masks.is_dir() else {}
     views = [view for view in scene.model.views if view.name in truth_files]
     _tell_of_left_out(scene, [view.name for view in views], mask_files)
-    per_photo, reliabilities, with_other = {}, [], []
+    per_photo, reliabilities, with_other, empty = {}, [], [], list[np.ndarray]()
     for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
         truth = scene.read_truth(truth_files[view.name], view.name, settings.zero_margin)
         rows, first = surface.rows(view, truth.shape[::-1], truth > 0)
+        empty.append(_count_empty(truth, first.range, table))
+        truth[table.shows_no_surface(truth)] = 0
         pixels = EvaluationPixels.from_photo(truth, rows, depth_edge_band(first.range, settings.band))
         near, elsewhere = pixels.confusions(pixels.look_up(labels.label), table.num_ids)
         found = {"labels": near + elsewhere, "labels_near_edges": near, "labels_elsewhere": elsewhere}
@@ -345,13 +355,39 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
         name: {key: found[key].summary(table) for key in SOURCES if key in found}
         for name, found in per_photo.items()
     }
-    metrics = {"photos": [view.name for view in views], "classes": [entry.name for entry in table]} | totals
+    nothing = _empty_figures(empty, table)
+    metrics: dict[str, object] = {"photos": [view.name for view in views]}
+    metrics["classes"] = [entry.name for entry in table]
+    metrics |= totals | ({"without_surface": nothing} if nothing else {})
     metrics |= {
         name: found.summary()
         for name, found in zip(("reliability", "reliability_with_other"), overall, strict=False)
     }
     write_json(settings.output or scene.metrics, {"reliability": {}} | metrics | {"per_photo": photos})
-    return EvaluationSummary(totals, (overall[0].ece, overall[1].ece) if overall else None)
+    errors = (overall[0].ece, overall[1].ece) if overall else None
+    return EvaluationSummary(totals, errors, nothing)
+
+
+def _count_empty(truth: np.ndarray, ranges: np.ndarray, table: ClassTable) -> np.ndarray:
+    """(2, C) int64 pixels of each class without surface in a truth mask, and those where nothing is hit.
+
+    truth: (H, W) uint8 ids; ranges: (H, W) of the first surface, inf = nothing; the order is the table's
+    """
+    shown = [truth == entry.id for entry in table.without_surface]
+    counts = [[pixels.sum(), (pixels & ~np.isfinite(ranges)).sum()] for pixels in shown]
+    return np.array(counts, np.int64).reshape(-1, 2).T
+
+
+def _empty_figures(counts: list[np.ndarray], table: ClassTable) -> dict[str, dict[str, int]]:
+    """Sums of `_count_empty` by class, of those that the truth shows."""
+    if not counts:
+        return {}
+    names = [entry.name for entry in table.without_surface]
+    return {
+        name: {"pixels": int(pixels), "right": int(right)}
+        for name, pixels, right in zip(names, *np.sum(counts, axis=0), strict=True)
+        if pixels
+    }
 
 
 def _tell_of_left_out(scene: Scene, judged: list[str], mask_files: dict[str, Path]) -> None:

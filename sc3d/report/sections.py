@@ -152,6 +152,7 @@ def quality_section(data: ReportData) -> str:
     )
     if near is not None and elsewhere is not None:
         note += f" Near depth edges {near:.1%} of the pixels are right, elsewhere {elsewhere:.1%}."
+    note += _told_of_empty(data)
     return f'<p class="note">{note}</p>{paired_bars(rows)}{_all_judged(data)}{_confusion(data)}'
 
 
@@ -186,6 +187,18 @@ def _all_judged(data: ReportData) -> str:
         f'<h3>All judged pixels</h3><p class="note">With pixels that are none of the classes. '
         f"Of these are given a class: {told}.</p>{_table(['Class', *heads], rows)}"
     )
+
+
+def _told_of_empty(data: ReportData) -> str:
+    """A sentence on the truth of classes without surface; empty if there is none."""
+    found, parts = data.metrics.get("without_surface"), []
+    for name, counts in found.items() if isinstance(found, dict) else ():
+        pixels, right = (
+            number(counts.get(key)) if isinstance(counts, dict) else None for key in ("pixels", "right")
+        )
+        if pixels and right is not None:
+            parts.append(f"{escape(str(name))} {right / pixels:.1%} of {pixels:,.0f} pixels")
+    return f" Judged apart, nothing is hit: {', '.join(parts)}." if parts else ""
 
 
 def photo_section(data: ReportData) -> str:

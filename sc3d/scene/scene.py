@@ -202,12 +202,15 @@ class Scene:
 
     def opaque_pixels(self, view: View, target: View) -> np.ndarray | None:
         """(H, W) bool pixels of `target`, a view of the same pose, that lie in the photo of `view` and are
-        opaque there; None if the photo has no transparent pixels.
+        opaque there; None if all are.
         """
-        from sc3d.geometry.cameras import resample
+        from sc3d.geometry.cameras import in_photo, resample
 
-        opaque = self._opaque(view.name)
-        return None if opaque is None else resample(opaque.astype(np.uint8), view, target, labels=True) > 0
+        opaque, inside = self._opaque(view.name), in_photo(view, target)
+        if opaque is None:
+            return inside
+        shown = resample(opaque.astype(np.uint8), view, target, labels=True) > 0
+        return shown if inside is None else shown & inside
 
     def _opaque(self, name: str) -> np.ndarray | None:
         photo = self.photo(name)
