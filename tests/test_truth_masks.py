@@ -198,3 +198,18 @@ def test_report_reads_truth_as_evaluate_did(scene):
 def test_margin_is_not_negative():
     with pytest.raises(InputError, match="margin"):
         Evaluate(margin=-1)
+
+
+def test_classes_without_surface_are_neither_judged_nor_other(scene):
+    classes = json.loads(scene.classes.read_text())
+    scene.classes.write_text(json.dumps([*classes, {"id": 7, "name": "sky", "color": [1, 2, 3]}]))
+    classes_before, other = counts(scene)
+    file = next(scene.truth.iterdir())
+    truth = np.array(Image.open(file))
+    truth[:10, :10] = 7
+    Image.fromarray(truth).save(file)
+    execute("evaluate", scene, Evaluate())
+    metrics = json.loads(scene.metrics.read_text())
+    assert metrics["without_surface"]["sky"]["pixels"] == 100
+    assert (metrics["labels"]["pixels"], metrics["labels"]["other"]["pixels"]) == counts(scene)
+    assert counts(scene)[0] <= classes_before and counts(scene)[1] == other
