@@ -191,7 +191,7 @@ def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
     empty = _large(empty | covered) & empty  # a few pixels at a border say nothing
     others, nearest = _others(data, store, row), NEAREST * data.depth_range[0]
     beyond = np.where(empty & ~covered, np.float32(BEYOND * data.depth_range[1]), np.float32(0))
-    toward = np.broadcast_to(np.float32([0, 0, -1]), (*hit.shape, 3))
+    toward = np.broadcast_to(np.array([0, 0, -1], np.float32), (*hit.shape, 3))
     inside = count_opposed(beyond, toward, view, *others) > 0
     far = np.where(covered, (1 - MARGIN) * hit, np.where(inside, data.depth_range[1], 0)).astype(np.float32)
     depth = farthest_free(far, nearest, view, *others)
