@@ -77,7 +77,10 @@ get_python() { # through apt, or say how and stop
     found=$(version_of python3) || found="not there"
     say "Python $oldest to $newest is needed; python3 is $found"
     version=$(apt_python) || version=
-    [ -n "$version" ] && apt_install "python$version-venv" && return
+    if [ -n "$version" ]; then
+        say "installing python$version-venv"
+        apt_install "python$version-venv" && return
+    fi
     say "one of these brings a Python that fits; then start again (or set SC3D_PYTHON to one):"
     how_to_get "${version:-$newest}"
     exit 1

@@ -5,7 +5,7 @@
 set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 venv=${SC3D_VENV:-$root/.venv}
-libraries=(libgl1 libegl1 libusb-1.0-0 libvulkan1 mesa-vulkan-drivers)
+libraries=(libgl1 libegl1 libgomp1 libusb-1.0-0 libvulkan1 mesa-vulkan-drivers)
 cpu_index=https://download.pytorch.org/whl/cpu
 cuda_size="2.7 GB to download, 4.5 GB on the disk" # of PyTorch with CUDA, at the version of constraints.txt
 source "$root/tools/pythons.sh"

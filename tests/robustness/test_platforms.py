@@ -99,3 +99,31 @@ def test_peak_memory_is_in_bytes_on_macos(monkeypatch):
     for platform, peak in (("linux", 300 << 10), ("darwin", 300)):
         monkeypatch.setattr(sys, "platform", platform)
         assert process_peak_mb() == peak
+
+
+@pytest.mark.parametrize(
+    ("variables", "found"),
+    [({}, True), ({"NUMBA_THREADING_LAYER": "omp"}, True), ({"NUMBA_THREADING_LAYER": "workqueue"}, False),
+     ({"NUMBA_THREADING_LAYER_PRIORITY": "workqueue omp tbb"}, False)],
+)  # fmt: skip
+def test_layers_of_numba_that_bear_several_threads_are_known(variables, found):
+    code = "import sc3d; from sc3d.labelling.threads import kernels_may_overlap; print(kernels_may_overlap())"
+    words = [sys.executable, "-c", code]
+    said = subprocess.check_output(words, text=True, env=os.environ | variables, cwd=ROOT)
+    assert said.strip() == str(found)
+
+
+def test_labels_are_the_same_where_kernels_may_not_overlap(tmp_path):
+    """Numba's own pool ended the process while the next view was prepared."""
+    code = "from sc3d.cli import main\nmain(['label', '.'])"
+    results = []
+    for layer in ("omp", "workqueue"):
+        scene = write_bare_scene(tmp_path / layer)
+        environment = os.environ | {
+            "NUMBA_THREADING_LAYER": layer,
+            "NUMBA_NUM_THREADS": "2",
+            "PYTHONPATH": str(ROOT),
+        }
+        subprocess.run([sys.executable, "-c", code], check=True, cwd=scene, env=environment)
+        results.append((scene / "seeds.ply").read_bytes())
+    assert results[0] == results[1]
