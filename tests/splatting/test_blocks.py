@@ -15,7 +15,7 @@ import torch
 
 from sc3d.cli import main
 from sc3d.errors import InputError
-from sc3d.geometry.blocks import split_blocks
+from sc3d.geometry.blocks import split_blocks, views_of
 from sc3d.geometry.cameras import rays
 from sc3d.io.json_files import read_json
 from sc3d.io.splats import read_splat_ply
@@ -23,7 +23,7 @@ from sc3d.runner import sidecar
 from sc3d.scene.scene import Scene
 from sc3d.settings.train import Train
 from sc3d.splatting import blocks
-from sc3d.splatting.blocks import restrict, share_settings, views_of
+from sc3d.splatting.blocks import restrict, share_settings
 from sc3d.splatting.dataset import scene_data
 from sc3d.splatting.trainer import Trainer
 
@@ -67,7 +67,7 @@ def test_masks_show_core_and_border_as_the_exact_depth_does(site):
     data, origin = scene_data(scene, Train())
     agreed, shown = [], []
     for block in split_blocks(data.points, 3):
-        views = views_of(data, block)
+        views = views_of(block, data.points, data.sightings)
         part = restrict(data, block, views)
         assert len(part.points) == block.holds(data.points, border=True).sum() and len(views) >= 2
         for row, (view, track) in enumerate(zip(part.views, part.tracks, strict=True)):
@@ -92,7 +92,7 @@ def test_pixels_outside_the_mask_leave_no_trace(site):
     """The loss of a block must not depend on what the photos show elsewhere."""
     data, _ = scene_data(Scene(site), Train())
     block = split_blocks(data.points, 2)[0]
-    views = views_of(data, block)
+    views = views_of(block, data.points, data.sightings)
     part = restrict(data, block, views)
     settings = share_settings(
         Train(iterations=40, max_gaussians=1500, surface_from=1.0, coarse_until=0.0, fill=False).training,
@@ -195,7 +195,10 @@ def test_an_interrupted_run_goes_on_where_it_was(site, blocked, tmp_path, monkey
     monkeypatch.setattr(
         blocks,
         "restrict",
-        lambda data, block, views, known=restrict: (seen.append(block), known(data, block, views))[1],
+        lambda data, block, views, seen_by, known=restrict: (
+            seen.append(block),
+            known(data, block, views, seen_by),
+        )[1],
     )
     folder = trained(site, tmp_path / "scene", "--blocks", "2")
     assert len(seen) == 2 and seen[1] == ("1.checkpoint", 20)  # block 0 was not trained again
