@@ -95,7 +95,7 @@ def _tell_of_held_out(data: TrainingData, settings: Train) -> None:
     used, total = len(data.subset(split.trained, settings.seen_by).points), len(data.points)
     if used < MIN_POINTS:
         raise InputError(
-            f"{used} of {total} sparse points are seen by two photos that are not held out, too few to start from: lower --test-sector"
+            f"{used} of {total} sparse points are seen by two photos that are not held out, too few to start from: lower --test-sector, or take a model whose points have tracks"
         )
     logger.info(
         "%d of %d sparse points are not used: fewer than 2 photos of the rest see them", total - used, total
