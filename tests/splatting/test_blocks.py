@@ -23,6 +23,7 @@ from sc3d.geometry.cameras import rays
 from sc3d.io.json_files import read_json
 from sc3d.io.splats import read_splat_ply
 from sc3d.runner import sidecar
+from sc3d.scene.depth_map import DepthMap, depth_file, write_depth_map
 from sc3d.scene.scene import Scene
 from sc3d.settings.train import Train
 from sc3d.splatting import blocks
@@ -236,6 +237,16 @@ def test_a_sector_is_held_out_of_all_blocks_and_listed(site, tmp_path, caplog):
     assert "sparse points are not used: fewer than 2 photos" in caplog.text
     assert not any(name.startswith("held_out") for name in hold_out(folder))
     assert not (folder / "held_out.csv").exists()
+
+
+def test_depth_maps_that_were_made_with_the_sector_are_told(site, tmp_path, caplog):
+    folder = scene_of(site, tmp_path)
+    for photo in (folder / "images").iterdir():
+        write_depth_map(depth_file(folder / "depth", photo.name), DepthMap.nothing((107, 160)))
+    for options, told in (["--fill"], True), (["--no-fill"], False):
+        caplog.clear()
+        hold_out(folder, "--test-sector", "0.25", *options)
+        assert ("--no-fill trains without them" in caplog.text) == told
 
 
 def test_a_sector_of_a_model_without_tracks_is_refused_before_work(site, tmp_path, capsys):

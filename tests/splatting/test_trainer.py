@@ -11,6 +11,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.geometry.held_out import times_seen
 from sc3d.geometry.shown import Witnesses
+from sc3d.scene.depth_map import DepthMap
 from sc3d.scene.held_out import mean_scores, write_held_out
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
@@ -261,6 +262,23 @@ def test_scores_are_of_the_pixels_that_the_training_can_know(scene):
     assert spoiled.psnr < whole.psnr - 0.5
     assert spoiled.seen_psnr == pytest.approx(whole.seen_psnr) and spoiled.seen_depth == whole.seen_depth
     assert spoiled.seen_ssim == pytest.approx(whole.seen_ssim, abs=0.05)
+
+
+def test_depth_is_judged_by_confirmed_depth_of_stereo_and_its_sky_is_not_seen(scene):
+    depths = scene[1].astype(np.float32)
+    sky, confirmed = np.zeros(depths.shape[1:], bool), np.ones(depths.shape[1:], np.uint8)
+    sky[:20], confirmed[:, :30] = True, 0
+
+    def stereo(index):
+        return replace(DepthMap.nothing(sky.shape), depth=depths[index], num_views=confirmed, sky=sky)
+
+    data, settings = replace(with_tracks(scene[0]), depth_maps=stereo), replace(SHORT, test_sector=0.2)
+    good = train(scene[0], SHORT, progress=False).gaussians
+    for row, index in zip(held_out_scores(good, data, settings), data.held_out(settings).sector, strict=True):
+        found, seen = depth_map(good, data.views[index])[0], known_pixels(data, settings, index) & ~sky
+        right = np.abs(found - depths[index]) < 0.01 * depths[index]
+        assert row.seen == pytest.approx(seen.mean())
+        assert row.seen_depth == pytest.approx(right[seen & (confirmed > 0)].mean(), abs=1e-3)
 
 
 def known_pixels(data, settings, index):
