@@ -49,8 +49,8 @@ def split_blocks(points: np.ndarray, count: int) -> list[Block]:
 
 
 def views_of(block: Block, points: np.ndarray, tracks: list[np.ndarray]) -> list[int]:
-    """Indices of the views that see enough of a block's core. points: (N, 3) sparse points; tracks: per view the rows
-    of those that it sees
+    """Indices of the views that see enough of a block's core. points: (N, 3) sparse points; tracks: per view
+    the rows of those that it sees
     """
     inside, chosen = block.holds(points), []
     for index, rows in enumerate(tracks):

@@ -1,5 +1,5 @@
-"""Which photos training leaves out to be judged by: every Nth, which asks for views between others, and a sector, a
-contiguous part of the capture, which asks for views beyond them.
+"""Which photos training leaves out to be judged by: every Nth, which asks for views between others, and a
+sector, a contiguous part of the capture, which asks for views beyond them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _ROWS = 1000  # of the matrix of distances at a time
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Indices of views, ascending, in no two lists. every_nth: of those outside the sector; trained: the rest"""
+    """Indices of views, ascending. every_nth: of those outside the sector; trained: those in neither."""
 
     every_nth: list[int]
     sector: list[int]
@@ -34,9 +34,8 @@ class HeldOut:
 def held_out_views(
     views: list[View], tracks: list[np.ndarray], points: np.ndarray, every: int, share: float
 ) -> HeldOut:
-    """Split the views. every: N of every Nth, by order, 0 = none; share: of the views that the sector takes, 0 =
-    none; the others as in `sector_views`.
-    Raises InputError if fewer than two are left.
+    """Split the views. every: N of every Nth, by order, 0 = none; share: of the views that the sector takes,
+    0 = none; the others as in `sector_views`. Raises InputError if fewer than two are left.
     """
     sector = sector_views(views, tracks, points, share) if share else []
     rest = [index for index in range(len(views)) if index not in set(sector)]
@@ -53,10 +52,11 @@ def sector_views(views: list[View], tracks: list[np.ndarray], points: np.ndarray
     """A contiguous part of a capture: the cameras nearest to an outermost one, in place and viewing direction
     together. It depends on the cameras and points, not on names or order.
 
-    views: any frame; tracks: per view the rows of the sparse points that it sees; points: (N, 3) sparse points
+    views: any frame; tracks: per view the rows of the sparse points that it sees; points: (N, 3) of these
     share: of the views, above 0 and below 1; at least one is taken
-    returns: indices, ascending. Outermost is a camera that is farthest from some other. Of several, the one is taken
-        of whose sector the others see most: of the sightings in it, those whose point ENOUGH others see.
+    returns: indices, ascending. Outermost is a camera that is farthest from some other. Of several, the one
+        is taken of whose sector the others see most: of the sightings in it, those whose point ENOUGH others
+        see.
     """
     places = _places(views, points)
     order = np.lexsort(places.T)  # ties must not depend on the order of the views
@@ -76,8 +76,8 @@ def times_seen(tracks: list[np.ndarray], num_points: int) -> np.ndarray:
 
 
 def _places(views: list[View], points: np.ndarray) -> np.ndarray:
-    """(V, 6) where each camera stands and looks: its center, in units in which the capture is about as wide as
-    directions are far apart, and its unit direction.
+    """(V, 6) where each camera stands and looks: its center, in units in which the capture is about as wide
+    as directions are far apart, and its unit direction.
     """
     centers = np.stack([view.center for view in views])
     middle = np.median(centers, axis=0)

@@ -1,5 +1,5 @@
-"""What the pixels of a photo show, told by the nearest sparse points that the photo sees: without a surface, and a
-roof before the ground counts as what it is.
+"""What the pixels of a photo show, told by the nearest sparse points that the photo sees: without a surface,
+and a roof before the ground counts as what it is.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ CELL = 4  # px, side of the cells of which that is asked
 
 
 def shown_cells(view: View, points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """(H / CELL, W / CELL) uint8: 1 in cells of a photo that show chosen points, by majority of the nearest ones.
+    """(H / CELL, W / CELL) uint8: 1 in cells that show chosen points, by majority of the nearest ones.
 
     points: (T, 3) sparse points that the view sees; chosen: (T,) bool
     """
@@ -38,9 +38,9 @@ class Witnesses:
         self.known = times_seen(tracks, len(points)) >= ENOUGH
 
     def pixels(self, view: View, rows: np.ndarray) -> np.ndarray:
-        """(H, W) bool: pixels of another view that show what at least ENOUGH of these views see: by the nearest
-        sparse points, and what lies at the depth of the nearest is in ENOUGH of their images too, or the outside of
-        the capture, which has no points, would count as its border does.
+        """(H, W) bool: pixels of another view that show what at least ENOUGH of these views see: by the
+        nearest sparse points, and what lies at the depth of the nearest is in ENOUGH of their images too, or
+        the outside of the capture, which has no points, would count as its border does.
 
         rows: (T,) of the sparse points that the other view sees
         """
@@ -59,8 +59,8 @@ class Witnesses:
         return enlarged(cells * (count >= ENOUGH).reshape(cells.shape).astype(np.uint8), view)
 
     def depth(self, view: View, rows: np.ndarray) -> np.ndarray:
-        """(H, W) float32 depth z of another view at the pixels of those of its sparse points that ENOUGH of these
-        views see, the nearest one's; 0 elsewhere.
+        """(H, W) float32 depth z of another view at the pixels of those of its sparse points that ENOUGH of
+        these views see, the nearest one's; 0 elsewhere.
         """
         pixels, depths = project(view, self.points[rows[self.known[rows]]])
         usable = in_image(view, pixels) & (depths > 0)

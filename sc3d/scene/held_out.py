@@ -20,10 +20,10 @@ class HeldOutPhoto:
     """The Gaussians against a photo that they were not trained on. None: nothing there to judge by.
 
     held_out: "every <N>" or SECTOR; psnr (dB) and ssim: of all its pixels, with the exposure that fits best
-    seen: share of the pixels that show what at least two photos of the training see; seen_psnr, seen_ssim: of those
-        alone, so that the rest, which the training cannot know, does not count
-    seen_depth: of those whose depth is known by stereo or, without `depth/`, at the sparse points, the share that is
-        rendered within SAME_DEPTH of it
+    seen: share of the pixels that show what at least two photos of the training see; seen_psnr, seen_ssim: of
+        those alone, so that the rest, which the training cannot know, does not count
+    seen_depth: of those whose depth is known by stereo or, without `depth/`, at the sparse points, the share
+        that is rendered within SAME_DEPTH of it
     """
 
     photo: str
@@ -40,8 +40,8 @@ SCORES = [field.name for field in fields(HeldOutPhoto)][2:]
 
 
 def mean_scores(photos: Sequence[HeldOutPhoto]) -> dict[str, float]:
-    """Number of "photos" and means of their SCORES: of every Nth by these names, of the sector as "sector_photos",
-    "sector_psnr", ... What is None in all photos is left out, and so are kinds without any.
+    """Number of "photos" and means of their SCORES: of every Nth by these names, of the sector as
+    "sector_photos", "sector_psnr", ... What is None in all photos is left out, and so are kinds without any.
     """
     means: dict[str, float] = {}
     for prefix, is_sector in (("", False), ("sector_", True)):

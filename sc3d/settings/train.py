@@ -36,12 +36,12 @@ class TrainSettings:
     exposure: bool = True
     """fit a brightness gain and offset per photo"""
     test_every: int = 0
-    """hold out every Nth photo and report PSNR, SSIM and depth agreement on them; 0 = none. Tells how views between
-    others look
+    """hold out every Nth photo and report PSNR, SSIM and depth agreement on them; 0 = none. Tells how views
+    between others look
     """
     test_sector: float = 0.0
-    """share of the photos to hold out as one contiguous part of the capture, and to report on like test_every, which
-    then takes every Nth of the others; 0 = none. Tells how views beyond the others look
+    """share of the photos to hold out as one contiguous part of the capture, and to report on like
+    test_every, which then takes every Nth of the others; 0 = none. Tells how views beyond the others look
     """
     checkpoint_every: int = 500
     """save a checkpoint every N iterations, to continue an interrupted run; 0 = never"""
@@ -115,8 +115,8 @@ class TrainSettings:
 
     @property
     def seen_by(self) -> int:
-        """Photos that must see a sparse point to start on it: with a sector held out, those that only the sector's
-        photos have found are not known.
+        """Photos that must see a sparse point to start on it: with a sector held out, those that only the
+        sector's photos have found are not known.
         """
         return 2 if self.test_sector else 0
 

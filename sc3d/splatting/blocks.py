@@ -130,8 +130,8 @@ def one_thread() -> Iterator[None]:
 
 
 def restrict(data: TrainingData, block: Block, views: list[int], seen_by: int = 0) -> TrainingData:
-    """What a block is trained on: its views, the sparse points in core and border (that at least `seen_by` of the
-    views see), masks of the pixels that show those.
+    """What a block is trained on: its views, the sparse points in core and border (that at least `seen_by` of
+    the views see), masks of the pixels that show those.
     """
     part = data.subset(views, seen_by)
     near = block.holds(part.points, border=True)

@@ -114,7 +114,7 @@ def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSet
 def _likeness(
     image: torch.Tensor, target: torch.Tensor, used: torch.Tensor, exposure: bool
 ) -> tuple[float | None, float | None]:
-    """PSNR (dB) and SSIM of the used pixels, (H, W) bool, with the exposure that fits these best; None of none."""
+    """PSNR (dB) and SSIM of the used pixels, (H, W) bool, with the exposure that fits these; None of none."""
     if not used.any():
         return None, None
     if exposure:

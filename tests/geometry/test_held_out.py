@@ -1,5 +1,5 @@
-"""Which photos are held out: flights, orbits and streets of known layout, in any order of the photos; and which pixels
-the others can know, against exact visibility.
+"""Which photos are held out: flights, orbits and streets of known layout, in any order of the photos; and
+which pixels the others can know, against exact visibility.
 """
 
 import numpy as np
