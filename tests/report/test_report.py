@@ -335,6 +335,22 @@ def test_labels_without_truth_give_no_accuracy(toy, tmp_path):
     assert "seed" in certainty_section(data)
 
 
+@pytest.mark.parametrize(
+    ("counts", "told"),
+    [
+        ({"pixels": 2000, "right": 1950}, "nothing is hit: &lt;sky&gt; 97.5% of 2,000 pixels."),
+        ({"pixels": 0, "right": 0}, ""),
+        ({"pixels": "many"}, ""),
+        ([1], ""),
+    ],
+)
+def test_truth_without_surface_is_told_of(tmp_path, counts, told):
+    metrics = {"labels": {"iou": {"grass": 0.5}}, "without_surface": {"<sky>": counts}}
+    write_json(tmp_path / "metrics.json", metrics)
+    section = quality_section(load_report_data(Scene(tmp_path)))
+    assert "nothing is hit" in section and told in section if told else "nothing is hit" not in section
+
+
 def test_page_is_made_again_when_objects_were_exported_since(toy, tmp_path):
     scene = Scene(tmp_path)
     for path in (toy.labelled, toy.classes):
