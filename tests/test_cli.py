@@ -122,6 +122,7 @@ def test_usage_and_unknown_command(capsys):
 def test_scripts_in_tools_are_the_commands():
     tools = Path(__file__).parent.parent / "tools"
     assert {file.stem for file in tools.glob("*.py")} - {
+        "demo",
         "fuzz_readers",
         "make_manual",
         "docstring_pages",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+from typing import Any
 
 import numba
 
@@ -13,10 +14,9 @@ def kernels_may_overlap() -> bool:
     """Whether two threads may run parallel kernels at the same time. Numba ends the process otherwise where all it has
     is its own pool, "workqueue": on Linux without libgomp, on macOS without OpenMP, or where it is told so.
     """
-    chosen = numba.config.THREADING_LAYER
-    if chosen not in ("default", "omp") or (
-        chosen == "default" and numba.config.THREADING_LAYER_PRIORITY[0] != "omp"
-    ):
+    settings: Any = numba.config  # filled when it loads
+    layers = {"default": settings.THREADING_LAYER_PRIORITY[0]}
+    if layers.get(settings.THREADING_LAYER, settings.THREADING_LAYER) != "omp":
         return False
     try:
         importlib.import_module("numba.np.ufunc.omppool")
