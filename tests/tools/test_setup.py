@@ -11,7 +11,7 @@ import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[2]
-TOOLS = ("bash", "sed", "uname", "id", "cat", "dirname", "cksum", "grep", "env")
+TOOLS = ("bash", "sed", "uname", "id", "cat", "dirname", "cksum", "grep", "env", "awk")
 CPU_INDEX = "--index-url https://download.pytorch.org/whl/cpu"
 linux = pytest.mark.skipif(sys.platform != "linux", reason="runs set-up as on Linux")
 pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="runs bash scripts")
@@ -145,6 +145,30 @@ def test_pytorch_comes_without_cuda_where_there_is_no_gpu(place, gpu, reached, v
     (place / "log").unlink()
     assert not bash(place, str(ROOT / "tools" / "setup.sh"), SC3D_VENV=str(place / "venv")).stderr
     assert not (place / "log").exists()  # finished set-up is not repeated
+
+
+@linux
+@pytest.mark.parametrize("failing", ["", "3.12"])
+def test_tests_run_on_the_oldest_the_default_and_the_newest(place, failing):
+    root = place / "root"
+    for file in (*(ROOT / "tools").glob("*.sh"), ROOT / "tools" / "constraints.txt", ROOT / "setup.cfg"):
+        (root / file.relative_to(ROOT)).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(file, root / file.relative_to(ROOT))
+    script(place / "bin" / "dpkg", "exit 0")
+    for version, folder in {"3.10": ".venv-3.10", "3.12": ".venv"}.items():
+        interpreter(place / "bin" / f"python{version}", version)
+        interpreter(root / "real" / version, version)
+        ending = f'case "$*" in "-m pytest "*) echo "$0" >>{place}/log; exit {int(version == failing)};; "-m pip "* | *open3d*) exit 0;; esac'
+        script(root / folder / "bin" / "python", f'{ending}\nexec {root}/real/{version} "$@"')
+    done = bash(place, str(root / "tools" / "test_pythons.sh"), SC3D_TORCH_INDEX="")
+    assert "Error" not in done.stderr
+    ran = (place / "log").read_text().split()
+    assert ran == [str(root / folder / "bin" / "python") for folder in (".venv-3.10", ".venv")]
+    first, second, third = done.stdout.splitlines()
+    assert first.endswith("passed") and second.endswith("FAILED" if failing else "passed")
+    assert (
+        third == "Python 3.14: NOT RUN" and "uv python install 3.14" in done.stderr and done.returncode == 1
+    )
 
 
 @linux
