@@ -12,6 +12,11 @@ source "$root/tools/pythons.sh"
 
 has_nvidia() { [ -e /proc/driver/nvidia/version ] || { command -v nvidia-smi >/dev/null && nvidia-smi -L 2>/dev/null | grep -q '^GPU'; }; }
 
+torch=$(grep -m1 '^torch==' "$root/tools/constraints.txt")
+has_torch() { # at this version, with or without CUDA
+    "$venv/bin/python" -c 'import importlib.metadata, sys; sys.exit(importlib.metadata.version("torch").split("+")[0] != sys.argv[1])' "${torch#*==}" 2>/dev/null
+}
+
 torch_index() { # the index that PyTorch comes from; nothing for pip's own
     if [ -n "${SC3D_TORCH_INDEX+set}" ]; then
         printf '%s' "$SC3D_TORCH_INDEX"
@@ -47,8 +52,10 @@ if [ "$(cat "$venv/.sc3d-stamp" 2>/dev/null)" != "$stamp" ]; then
     say "installing Python packages into $venv with Python $(version_of "$python") (some minutes on the first run)"
     [ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
     pip=("$venv/bin/python" -m pip install --quiet --disable-pip-version-check)
-    index=$(torch_index)
-    "${pip[@]}" ${index:+--index-url "$index"} "$(grep -m1 '^torch==' "$root/tools/constraints.txt")"
+    if ! has_torch; then
+        index=$(torch_index)
+        "${pip[@]}" ${index:+--index-url "$index"} "$torch"
+    fi
     "${pip[@]}" -c "$root/tools/constraints.txt" -e "$root[all]"
     "$venv/bin/python" -c 'import open3d' || { say "Open3D does not load; on Debian and Ubuntu: sudo apt-get install --no-install-recommends ${libraries[*]}"; exit 1; }
     printf '%s' "$stamp" >"$venv/.sc3d-stamp"
