@@ -65,15 +65,21 @@ class Prism:
 
     def contain(self, points: np.ndarray) -> np.ndarray:
         """As `Balls.contain`."""
-        x, y, z = points.T
-        inside = np.zeros(len(points), bool)
-        for (x0, y0), (x1, y1) in zip(self.polygon, np.roll(self.polygon, -1, axis=0), strict=True):
-            if y0 != y1:
-                inside ^= ((y0 > y) != (y1 > y)) & (x < (x1 - x0) * (y - y0) / (y1 - y0) + x0)
-        return inside & (z >= self.low) & (z <= self.high)
+        z = points[:, 2]
+        return in_polygon(self.polygon, points[:, :2]) & (z >= self.low) & (z <= self.high)
 
     def as_json(self) -> dict[str, object]:
         return {"polygon": self.polygon.tolist(), "z": [self.low, self.high]}
+
+
+def in_polygon(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N,) bool of points (N, 2): in a polygon (K, 2), by the even-odd rule."""
+    x, y = points.T
+    inside = np.zeros(len(points), bool)
+    for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        if y0 != y1:
+            inside ^= ((y0 > y) != (y1 > y)) & (x < (x1 - x0) * (y - y0) / (y1 - y0) + x0)
+    return inside
 
 
 @dataclass(frozen=True)
