@@ -27,30 +27,30 @@ from sc3d.scene.scene import Scene
 
 VERSION = 1
 MAX_BYTES = 256 << 20
-MAX_CENTERS = 50_000  # of the balls of one correction
-KINDS = ("centers", "polygon", "undo", "redo")  # by the one of these keys that it has, an entry is what it is
+MAX_SIZES, MAX_CENTERS = 64, 100_000  # of the balls of one correction: different radii, and balls of each
+KINDS = ("balls", "polygon", "undo", "redo")  # by the one of these keys that it has, an entry is what it is
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Balls:
-    """All that lies within `radius` of one of the centers (B, 3), world."""
+    """All that lies in one of many balls. groups: per size, the centers (B, 3), world, and the radius of balls."""
 
-    centers: np.ndarray
-    radius: float
+    groups: tuple[tuple[np.ndarray, float], ...]
 
     def contain(self, points: np.ndarray) -> np.ndarray:
-        """(N,) bool of points (N, 3) float64 world; each is judged by itself."""
-        low, high = self.centers.min(axis=0) - self.radius, self.centers.max(axis=0) + self.radius
-        inside = ((points >= low) & (points <= high)).all(axis=1)
-        near = np.flatnonzero(inside)
-        distances, _ = cKDTree(self.centers).query(points[near])
-        inside[near] = distances <= self.radius
+        """(N,) bool of points (N, 3) float64 world; each is judged by itself. On the surface is inside."""
+        inside = np.zeros(len(points), bool)
+        for centers, radius in self.groups:
+            low, high = centers.min(axis=0) - radius, centers.max(axis=0) + radius
+            near = np.flatnonzero(~inside & ((points >= low) & (points <= high)).all(axis=1))
+            distances, _ = cKDTree(centers).query(points[near])
+            inside[near[distances <= radius]] = True
         return inside
 
     def as_json(self) -> dict[str, object]:
-        return {"centers": self.centers.tolist(), "radius": self.radius}
+        return {"balls": [{"radius": radius, "centers": centers.tolist()} for centers, radius in self.groups]}
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ def standing(log: Sequence[dict]) -> tuple[Correction, ...]:
 
 def _is_made(entry: dict) -> bool:
     """Whether an entry is a correction."""
-    return "centers" in entry or "polygon" in entry
+    return "balls" in entry or "polygon" in entry
 
 
 def _append(path: Path, make: Callable[[list[dict]], dict[str, object] | None]) -> None:
@@ -277,10 +277,17 @@ def _fault(entry: Any, made: set[str], undone: set[str], keys: set[str]) -> str 
         return "needs a class: a name, or null for none"
     if "polygon" in entry:
         return _prism_fault(entry)
-    if not _is_table(entry["centers"], 3, 1, MAX_CENTERS):
-        return f"needs centers: 1 to {MAX_CENTERS} positions of three numbers"
-    if not _is_table([[entry.get("radius")]], 1) or entry["radius"] <= 0:
-        return "needs a radius above 0"
+    return _balls_fault(entry["balls"])
+
+
+def _balls_fault(groups: object) -> str | None:
+    if not isinstance(groups, list) or not 1 <= len(groups) <= MAX_SIZES:
+        return f"needs balls: 1 to {MAX_SIZES} objects with a radius and centers"
+    for group in groups:
+        if not isinstance(group, dict) or not _is_table(group.get("centers"), 3, 1, MAX_CENTERS):
+            return f"needs centers: 1 to {MAX_CENTERS} positions of three numbers"
+        if not _is_table([[group.get("radius")]], 1) or group["radius"] <= 0:
+            return "needs a radius above 0"
     return None
 
 
@@ -322,5 +329,6 @@ def _correction(entry: dict[str, Any]) -> Correction:
     if "polygon" in entry:
         shape: Balls | Prism = Prism(np.array(entry["polygon"], np.float64), *map(float, entry["z"]))
     else:
-        shape = Balls(np.array(entry["centers"], np.float64), float(entry["radius"]))
+        groups = entry["balls"]
+        shape = Balls(tuple((np.array(one["centers"], np.float64), float(one["radius"])) for one in groups))
     return Correction(entry["id"], entry["time"], entry["class"], shape)

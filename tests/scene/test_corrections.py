@@ -25,8 +25,12 @@ from sc3d.stages import propagate as stage
 from sc3d.tiling import propagate as tiled_propagate
 from tests.builders import ORIGIN, ground, labelled_scene
 
-HERE = Balls(ORIGIN + [[-2.0, -2.0, 0.0], [-1.5, -2.0, 0.0]], 0.45)
+HERE = Balls(((ORIGIN + [[-2.0, -2.0, 0.0], [-1.5, -2.0, 0.0]], 0.45),))
 EAST = Prism(ORIGIN[:2] + [[1, -1], [3, -1], [3, 1], [1, 1]], ORIGIN[2] - 1, ORIGIN[2] + 1)
+
+
+def ball(center: list[float], radius: float) -> Balls:
+    return Balls(((ORIGIN[None] + center, radius),))
 
 
 @pytest.fixture
@@ -56,10 +60,17 @@ def labels_of(scene: Scene, settings: Propagate = Propagate()) -> dict[str, np.n
 
 def test_balls_are_all_points_within_the_radius_of_a_center():
     points = np.random.default_rng(0).uniform(-3, 3, (4000, 3)) + ORIGIN
-    expected = (np.linalg.norm(points[:, None] - HERE.centers, axis=2) <= HERE.radius).any(axis=1)
-    assert 5 < expected.sum() and (HERE.contain(points) == expected).all()
+    groups = (*HERE.groups, (ORIGIN[None] + [1, 1, 1], 1.5))
+    expected = np.any(
+        [
+            (np.linalg.norm(points[:, None] - centers, axis=2) <= radius).any(axis=1)
+            for centers, radius in groups
+        ],
+        axis=0,
+    )
+    assert 50 < expected.sum() and (Balls(groups).contain(points) == expected).all()
     edge = ORIGIN + [[-2.0 - 0.25, -2.0, 0.0], [-2.5, -2.0, 0.0]]
-    assert Balls(HERE.centers[:1], 0.25).contain(edge).tolist() == [True, False]
+    assert ball([-2, -2, 0], 0.25).contain(edge).tolist() == [True, False]
 
 
 def test_a_prism_is_its_polygon_in_the_plane_and_its_range_in_z():
@@ -74,9 +85,7 @@ def test_later_corrections_win_and_points_outside_keep_what_they_have():
     found = Corrections(
         tuple(
             corrections.Correction(str(row), "2026-01-01", name, shape)
-            for row, (name, shape) in enumerate(
-                [("road", EAST), (None, Balls(ORIGIN[None] + [1, 0, 0], 0.5))]
-            )
+            for row, (name, shape) in enumerate([("road", EAST), (None, ball([1, 0, 0], 0.5))])
         ),
         (1, 0),
     )
@@ -91,8 +100,10 @@ def test_the_log_gives_back_what_was_added_undone_and_redone(scene):
     add_correction(scene, "grass", HERE)
     add_correction(scene, None, EAST)
     first, second = Corrections.of_scene(scene).corrections
-    assert first.name == "grass" and first.shape.radius == HERE.radius
-    assert (first.shape.centers == HERE.centers).all() and (second.shape.polygon == EAST.polygon).all()
+    assert first.name == "grass" and first.shape.groups[0][1] == HERE.groups[0][1]
+    assert (first.shape.groups[0][0] == HERE.groups[0][0]).all() and (
+        second.shape.polygon == EAST.polygon
+    ).all()
     assert undo(scene).key == second.key and undo(scene).key == first.key and undo(scene) is None
     assert Corrections.of_scene(scene).corrections == ()
     assert redo(scene).key == first.key
@@ -106,7 +117,7 @@ def test_writers_at_the_same_time_lose_nothing(scene):
     code = (
         "import sys, numpy as np; from pathlib import Path; from sc3d.scene.scene import Scene;"
         "from sc3d.scene.corrections import Balls, add_correction\n"
-        "for _ in range(10): add_correction(Scene(Path(sys.argv[1])), None, Balls(np.zeros((1, 3)), 1.0))"
+        "for _ in range(10): add_correction(Scene(Path(sys.argv[1])), None, Balls(((np.zeros((1, 3)), 1.0),)))"
     )
     others = [subprocess.Popen([sys.executable, "-c", code, str(scene.path)]) for _ in range(2)]
     with ThreadPoolExecutor(4) as pool:
@@ -117,7 +128,12 @@ def test_writers_at_the_same_time_lose_nothing(scene):
     assert [entry["time"] for entry in log] == sorted(entry["time"] for entry in log)
 
 
-GOOD = {"id": "a", "time": "2026-05-01T12:00:00Z", "class": "road", "centers": [[0, 0, 0]], "radius": 1}
+GOOD = {
+    "id": "a",
+    "time": "2026-05-01T12:00:00Z",
+    "class": "road",
+    "balls": [{"radius": 1, "centers": [[0, 0, 0]]}],
+}
 
 
 @pytest.mark.parametrize(
@@ -133,12 +149,12 @@ GOOD = {"id": "a", "time": "2026-05-01T12:00:00Z", "class": "road", "centers": [
                 ({"class": 1}, "entry 1 needs a class"),
                 ({"class": "house"}, "'house', which is no class"),
                 ({"time": "yesterday"}, "entry 1 needs a time"),
-                ({"centers": []}, "needs centers"),
-                ({"centers": [[0, 0]]}, "needs centers"),
-                ({"centers": [[0, 0, float("nan")]]}, "needs centers"),
-                ({"centers": [[0, 0, "1"]]}, "needs centers"),
-                ({"radius": 0}, "needs a radius"),
-                ({"radius": True}, "needs a radius"),
+                ({"balls": []}, "needs balls"),
+                ({"balls": [{"radius": 1, "centers": [[0, 0]]}]}, "needs centers"),
+                ({"balls": [{"radius": 1, "centers": [[0, 0, float("nan")]]}]}, "needs centers"),
+                ({"balls": [{"radius": 1, "centers": [[0, 0, "1"]]}]}, "needs centers"),
+                ({"balls": [{"radius": 0, "centers": [[0, 0, 0]]}]}, "needs a radius"),
+                ({"balls": [{"radius": True, "centers": [[0, 0, 0]]}]}, "needs a radius"),
                 ({"undo": "b"}, "needs one of"),
             )
         ),
@@ -169,8 +185,8 @@ def test_a_malformed_file_is_refused_in_one_line(scene, content, message):
 def test_what_is_no_correction_is_not_written(scene):
     for name, shape in (
         ("house", HERE),
-        ("road", Balls(np.zeros((0, 3)), 1.0)),
-        (None, Balls(HERE.centers, 0.0)),
+        ("road", Balls(((np.zeros((0, 3)), 1.0),))),
+        (None, ball([0, 0, 0], 0.0)),
     ):
         with pytest.raises(InputError):
             add_correction(scene, name, shape)
@@ -189,7 +205,7 @@ def test_corrected_points_are_never_voted_away(scene, method):
     assert (after["label"][grass] == 3).all() and (after["confidence"][grass] == 1).all()
     assert (after["label"][none] == 0).all() and (after["confidence"][none] == 0).all()
     assert (after["state"] == CORRECTED).tolist() == (grass | none).tolist()
-    far = ~Balls(HERE.centers, 1.5).contain(points) & ~none
+    far = ~Balls(((HERE.groups[0][0], 1.5),)).contain(points) & ~none
     assert (after["label"][far] == before["label"][far]).all()
     undo(scene), undo(scene)
     again = labels_of(scene, settings)
@@ -207,7 +223,7 @@ def test_labels_spread_from_a_correction_where_nothing_else_is_known(scene):
     assert (labels_of(scene)["label"] == 3).all()  # road has no seed
     add_correction(scene, "road", HERE)
     after = labels_of(scene)
-    near = Balls(HERE.centers, 0.7).contain(points)
+    near = Balls(((HERE.groups[0][0], 0.7),)).contain(points)
     assert (after["label"][near] == 1).all() and (after["label"][points[:, 0] > ORIGIN[0]] == 3).all()
 
 
@@ -274,7 +290,7 @@ def test_corrections_are_an_input_where_there_are_some(scene):
 def test_corrections_that_touch_no_point_are_told(scene, caplog, monkeypatch, memory):
     monkeypatch.setattr(tiled_propagate, "fits", lambda _, resources: resources.max_memory != "2G")
     add_correction(scene, "grass", HERE)
-    add_correction(scene, "road", Balls(np.zeros((1, 3)), 1.0))
+    add_correction(scene, "road", ball(-ORIGIN, 1.0))
     stage.run(scene, Propagate(max_memory=memory))
     lines = [record.getMessage() for record in caplog.records if "touch no point" in record.getMessage()]
     assert len(lines) == 1 and lines[0].startswith("1 of 2 corrections in") and "road of 20" in lines[0]

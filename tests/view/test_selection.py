@@ -55,13 +55,23 @@ def test_a_lasso_wider_than_a_picture_is_refused():
         seen_in_lasso(sheet(0), FAR, corners, 0.1)
 
 
-@pytest.mark.parametrize("most", [50_000, 60])
-def test_balls_hold_the_points_and_little_else(monkeypatch, most):
-    monkeypatch.setattr(selection, "MAX_CENTERS", most)
-    points = sheet(0, half=1.0) + np.random.default_rng(0).normal(0, 0.01, (400, 3))
-    found = balls_around(points, 0.1)
-    assert len(found.centers) <= most and found.contain(points).all()
-    probes = np.concatenate([points, FAR + np.random.default_rng(1).uniform(-2, 2, (4000, 3))])
-    distances = np.linalg.norm(probes[:, None] - points, axis=2).min(axis=1)
-    assert not found.contain(probes)[distances > 2 * found.radius].any()
-    assert found.radius == 0.1 or most == 60
+def test_balls_hold_what_is_chosen_and_others_only_within_a_spacing():
+    ground = sheet(0) + np.random.default_rng(0).normal(0, 0.01, (6400, 3))
+    points = np.concatenate([ground, sheet(-0.35)])  # a floor below, hidden
+    local = points - FAR
+    chosen = (np.linalg.norm(local[:, :2], axis=1) < 3) & (local[:, 2] > -0.2)
+    found = balls_around(points, np.flatnonzero(chosen), 0.1)
+    inside = found.contain(points)
+    assert inside[chosen].all() and not inside[local[:, 2] < -0.2].any()
+    assert np.linalg.norm(local[inside & ~chosen, :2], axis=1).max() < 3.25
+    assert sum(len(centers) for centers, _ in found.groups) < chosen.sum() / 2 and len(found.groups) > 1
+    dense = sheet(0, half=2.0, step=0.03)  # of another cloud
+    assert found.contain(dense).all()
+
+
+def test_what_is_too_ragged_for_balls_is_refused(monkeypatch):
+    monkeypatch.setattr(selection, "MAX_CENTERS", 60)
+    points = sheet(0)
+    with pytest.raises(InputError, match="too ragged"):
+        balls_around(points, np.arange(0, len(points), 2), 0.1)
+    assert balls_around(points, np.arange(len(points)), 0.1).contain(points).all()

@@ -100,7 +100,7 @@ class CorrectionPanel:
         if found is None:
             raise InputError("there is no point: click on one")
         if self._tool.value == BRUSH:
-            self._add(Balls(self._world[shown[found]][None], float(self._radius.value)))
+            self._add(Balls(((self._world[shown[found]][None], float(self._radius.value)),)))
         else:
             self._add_region(int(shown[found]))
 
@@ -108,7 +108,7 @@ class CorrectionPanel:
         display = self._page.display
         colors = display.colors("photo") if "photo" in display.colorings else None
         rows = region_around(self._world, display.label, colors, row, display.spacing)
-        self._add(balls_around(self._world[rows], display.spacing))
+        self._add(balls_around(self._world, rows, display.spacing))
 
     def _close_lasso(self) -> None:
         if len(self._corners) < 3:
@@ -119,7 +119,7 @@ class CorrectionPanel:
         self._draw([])
         if not len(rows):
             raise InputError("there is no point in the lasso")
-        self._add(balls_around(self._world[rows], display.spacing))
+        self._add(balls_around(self._world, rows, display.spacing))
 
     def _shown(self) -> np.ndarray:
         """Rows of the display whose class is shown."""
