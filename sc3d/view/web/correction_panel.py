@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 NONE = "(none of the classes)"
-REGION, BRUSH, LASSO = "region", "brush", "lasso"
+OFF, REGION, BRUSH, LASSO = "off", "region", "brush", "lasso"
 HINTS = {
+    OFF: "choose a tool",
     REGION: "Shift + click: what hangs together with the point and looks like it",
     BRUSH: "Shift + click: a ball around the point",
     LASSO: "Shift + click: a corner; Close lasso: what is seen in it",
@@ -54,7 +55,7 @@ class CorrectionPanel:
         table, gui, spacing = page.display.class_table, page.server.gui, page.display.spacing
         names = [] if table is None else [entry.name for entry in table if entry.surface]
         with gui.add_folder("Correct"):
-            self._tool = gui.add_dropdown("Tool", (REGION, BRUSH, LASSO), initial_value=REGION)
+            self._tool = gui.add_dropdown("Tool", tuple(HINTS), initial_value=OFF)
             self._class = gui.add_dropdown("Class", (*names, NONE), initial_value=names[0])
             self._radius = gui.add_number("Brush radius", float(f"{4 * spacing:.2g}"), min=0.0)
             self._close = gui.add_button("Close lasso", visible=False)
@@ -82,11 +83,13 @@ class CorrectionPanel:
         self._text.content = f"<small style='padding:0 .75em'>{escape(text)}</small>"
 
     def _choose(self) -> None:
-        self._close.visible = self._tool.value == LASSO
+        self._close.visible, self._radius.visible = self._tool.value == LASSO, self._tool.value == BRUSH
         self._draw([])
         self._say(HINTS[self._tool.value])
 
     def _point(self, event: viser.SceneClickEvent) -> None:
+        if self._tool.value == OFF:
+            return
         eye, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         if self._tool.value == LASSO:
             same = np.linalg.norm(eye - self._eye) < self._page.display.spacing
@@ -135,8 +138,10 @@ class CorrectionPanel:
         far = float(np.linalg.norm(self._page.display.middle - self._eye)) / 2
         ends = self._eye + far * np.array(corners)
         lines = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1).astype(np.float32)
-        self._lasso = scene.add_line_segments("/lasso", lines, _LASSO_COLOR, thickness=_LASSO_WIDTH)
-        self._say(f"{len(corners)} corners")
+        self._lasso = scene.add_line_segments(
+            "/lasso", lines, _LASSO_COLOR, thickness=_LASSO_WIDTH, thickness_units="screen"
+        )
+        self._say(f"corners: {len(corners)}")
 
     def _add(self, shape: Balls) -> None:
         name = self._class.value
@@ -170,7 +175,7 @@ class CorrectionPanel:
         else:
             _remove(self._marked)
             self._marked = None
-        count = f"{len(found.ids)} corrections; {len(rows)} points wait for Apply"
+        count = f"corrections: {len(found.ids)}; points that wait for Apply: {len(rows)}"
         self._say(f"{done}: {count}" if done else count if found.ids else HINTS[self._tool.value])
 
     def _rows_in(self, correction: Correction) -> np.ndarray:

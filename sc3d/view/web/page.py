@@ -102,7 +102,7 @@ def serving(view: WebView, host: str = LOCAL, port: int = 0) -> Iterator[str]:
         home = _start(server, view, display, views)
         show = ShowPanel(page, view.by, hidden, view.splats_first)
         PointPanel(page, show)
-        if display.class_table is not None:
+        if display.class_table is not None and host in LOOPBACK:
             CorrectionPanel(page, show)
         if views:
             photos = PhotoPanel(page, home)

@@ -113,7 +113,10 @@ def test_corrections_are_drawn_saved_undone_and_applied(scene, browser, address)
         found.wait_for(lambda: len(standing(scene)) == 2, "the brush")
         press(found, "Apply")
         found.wait_for(
-            lambda: found.page.get_by_text("applied: 2 corrections; 0 points").count() > 0, "labels"
+            lambda: (
+                found.page.get_by_text("applied: corrections: 2; points that wait for Apply: 0").count() > 0
+            ),
+            "labels",
         )
         assert found.errors == []
     cloud = read_cloud(scene.labelled)
@@ -127,6 +130,9 @@ def test_a_region_is_corrected_whole_and_two_tabs_keep_each_others(scene, browse
     with visit(browser, address) as first, visit(browser, address) as second:
         for tab in (first, second):
             ready(tab)
+        click(first, scene, (-2, -1))  # no tool is chosen
+        choose(first, "Tool", "region")  # in both tabs: the panel is one
+        assert not scene.corrections.exists()
         choose(first, "Class", "grass")
         click(first, scene, (-2, -1))
         first.wait_for(lambda: len(standing(scene)) == 1, "the region")
@@ -139,5 +145,5 @@ def test_a_region_is_corrected_whole_and_two_tabs_keep_each_others(scene, browse
         assert west[road].all() and east[~road].all()
         assert west[~road].mean() < 0.05 and east[road].mean() < 0.05  # the border, one spacing wide
     with visit(browser, address) as again:
-        again.page.get_by_text("2 corrections").wait_for()
+        again.page.get_by_text("corrections: 2").wait_for()
     assert len(read_log(scene.corrections)) == 2
