@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import uuid
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,14 @@ from sc3d.io.file_lock import locked
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.limits import FARTHEST
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.frame_reference import Move, Reference, move_into, reference_of
 from sc3d.scene.labels import CORRECTED, Labels
 from sc3d.scene.scene import Scene
 
 VERSION = 1
 MAX_BYTES = 256 << 20
 MAX_SIZES, MAX_CENTERS = 64, 100_000  # of the balls of one correction: different radii, and balls of each
+MAX_ERROR = 0.01  # of a frame, as `Move.error`
 KINDS = ("balls", "polygon", "undo", "redo")  # by the one of these keys that it has, an entry is what it is
 
 logger = logging.getLogger(__name__)
@@ -84,22 +86,27 @@ def in_polygon(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Correction:
-    """The points in a shape are of a class. name: of the class, None = of none; time: ISO 8601, when it was made"""
+    """The points in a shape are of a class. name: of the class, None = of none; time: ISO 8601, when it was made;
+    reference: in whose frame the shape is, empty = in that of the scene
+    """
 
     key: str
     time: str
     name: str | None
     shape: Balls | Prism
+    reference: Reference = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Corrections:
     """The corrections of a scene that stand, in the order in which they were made; where two overlap, the later one
-    counts. ids: (C,) int of their classes, 0 = none of them; origin: their file
+    counts. ids: (C,) int of their classes, 0 = none of them; moves: (C,) ways into the frames of their shapes; origin:
+    their file
     """
 
     corrections: tuple[Correction, ...] = ()
     ids: tuple[int, ...] = ()
+    moves: tuple[Move | None, ...] = ()
     origin: Path | None = None
 
     @classmethod
@@ -110,7 +117,13 @@ class Corrections:
             return cls()
         found = standing(read_log(path))
         table = scene.class_table() if any(one.name is not None for one in found) else None
-        return cls(found, tuple(_class_id(one.name, table, path) for one in found), path)
+        ids = tuple(_class_id(one.name, table, path) for one in found)
+        return cls(found, ids, _moves(found, scene), path)
+
+    def contain(self, row: int, points: np.ndarray) -> np.ndarray:
+        """(N,) bool which of the points (N, 3) float64 world lie in a correction; row: which one"""
+        move = self.moves[row]
+        return self.corrections[row].shape.contain(points if move is None else move(points))
 
     @property
     def files(self) -> list[Path]:
@@ -123,8 +136,8 @@ class Corrections:
         """
         label, counts = labels.label.copy(), np.zeros(len(self.ids), np.int64)
         touched = np.zeros(len(points), bool)
-        for row, (correction, given) in enumerate(zip(self.corrections, self.ids, strict=True)):
-            inside = correction.shape.contain(points)
+        for row, given in enumerate(self.ids):
+            inside = self.contain(row, points)
             label[inside], counts[row] = given, np.count_nonzero(inside)
             touched |= inside
         confidence = np.where(touched, label > 0, labels.confidence).astype(labels.confidence.dtype)
@@ -149,6 +162,32 @@ class Corrections:
             )
 
 
+def _moves(found: tuple[Correction, ...], scene: Scene) -> tuple[Move | None, ...]:
+    """How points come into the frames of the corrections; a warning for those that cannot be followed."""
+    views = scene.model.views if scene.sparse.is_dir() else []
+    moves, lost, worst = list[Move | None](), 0, 0.0
+    for one in found:
+        move = None
+        try:
+            move = move_into(one.reference, views)
+        except KeyError:
+            lost += 1
+        worst = max(worst, 0.0 if move is None else move.error)
+        moves.append(move)
+    if lost:
+        logger.warning(
+            "%d of %d corrections were made with cameras that the scene does not have now: they are taken to be in its present frame",
+            lost,
+            len(found),
+        )
+    if worst > MAX_ERROR:
+        logger.warning(
+            "corrections were made with cameras that lie otherwise to one another now, by %.1f%% of their distance: they may have slipped",
+            100 * worst,
+        )
+    return tuple(moves)
+
+
 def _class_id(name: str | None, table: ClassTable | None, origin: Path) -> int:
     if name is None or table is None:
         return 0
@@ -160,7 +199,7 @@ def _class_id(name: str | None, table: ClassTable | None, origin: Path) -> int:
     return found
 
 
-def add_correction(scene: Scene, name: str | None, shape: Balls | Prism) -> Correction:
+def add_correction(scene: Scene, name: str | None, shape: Balls | Prism) -> None:
     """Write down that the points in a shape are of a class (None: of none), at once and after whatever others wrote.
 
     Raises InputError for a class that no point can be of, a shape that is none, or a broken file.
@@ -168,8 +207,9 @@ def add_correction(scene: Scene, name: str | None, shape: Balls | Prism) -> Corr
     if name is not None:
         _class_id(name, scene.class_table(), scene.corrections)
     entry = {"class": name} | shape.as_json()
+    if scene.sparse.is_dir():
+        entry["cameras"] = {name: pose.tolist() for name, pose in reference_of(scene.model.views).items()}
     _append(scene.corrections, lambda _: entry)
-    return _correction(entry)
 
 
 def undo(scene: Scene) -> Correction | None:
@@ -275,6 +315,8 @@ def _fault(entry: Any, made: set[str], undone: set[str], keys: set[str]) -> str 
     name = entry.get("class", 0)
     if name is not None and not isinstance(name, str):
         return "needs a class: a name, or null for none"
+    if not _is_reference(entry.get("cameras", {})):
+        return "needs cameras: a pose of three rows of four numbers by the name of a photo"
     if "polygon" in entry:
         return _prism_fault(entry)
     return _balls_fault(entry["balls"])
@@ -297,6 +339,17 @@ def _prism_fault(entry: dict) -> str | None:
     if not _is_table([entry.get("z")], 2) or entry["z"][0] > entry["z"][1]:
         return "needs z: its lower and upper end"
     return None
+
+
+def _is_reference(cameras: object) -> bool:
+    return isinstance(cameras, dict) and all(
+        _is_table(pose, 4, 3, 3) and np.allclose(_rotation(pose) @ _rotation(pose).T, np.eye(3), atol=1e-6)
+        for pose in cameras.values()
+    )
+
+
+def _rotation(pose: list[list[float]]) -> np.ndarray:
+    return np.array(pose, np.float64)[:, :3]
 
 
 def _is_time(value: object) -> bool:
@@ -331,4 +384,5 @@ def _correction(entry: dict[str, Any]) -> Correction:
     else:
         groups = entry["balls"]
         shape = Balls(tuple((np.array(one["centers"], np.float64), float(one["radius"])) for one in groups))
-    return Correction(entry["id"], entry["time"], entry["class"], shape)
+    cameras = {name: np.array(pose, np.float64) for name, pose in entry.get("cameras", {}).items()}
+    return Correction(entry["id"], entry["time"], entry["class"], shape, cameras)

@@ -1,17 +1,21 @@
 """Corrections in 3D: shapes by their definition, the log and its writers, and what propagation makes of them."""
 
 import json
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import open3d as o3d
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sc3d.errors import InputError
+from sc3d.geometry.cameras import View
 from sc3d.io.clouds import read_cloud
 from sc3d.propagation.labelled_points import LabelledPoints
 from sc3d.propagation.potts import sure_examples
@@ -23,7 +27,7 @@ from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
 from sc3d.stages import propagate as stage
 from sc3d.tiling import propagate as tiled_propagate
-from tests.builders import ORIGIN, ground, labelled_scene
+from tests.builders import ORIGIN, ground, labelled_scene, views, write_model
 
 HERE = Balls(((ORIGIN + [[-2.0, -2.0, 0.0], [-1.5, -2.0, 0.0]], 0.45),))
 EAST = Prism(ORIGIN[:2] + [[1, -1], [3, -1], [3, 1], [1, 1]], ORIGIN[2] - 1, ORIGIN[2] + 1)
@@ -88,6 +92,7 @@ def test_later_corrections_win_and_points_outside_keep_what_they_have():
             for row, (name, shape) in enumerate([("road", EAST), (None, ball([1, 0, 0], 0.5))])
         ),
         (1, 0),
+        (None, None),
     )
     points = ORIGIN + [[2.0, 0, 0], [1.2, 0, 0], [-3, 0, 0]]
     labels, counts = found.apply(unlabelled(points), points)
@@ -156,6 +161,8 @@ GOOD = {
                 ({"balls": [{"radius": 0, "centers": [[0, 0, 0]]}]}, "needs a radius"),
                 ({"balls": [{"radius": True, "centers": [[0, 0, 0]]}]}, "needs a radius"),
                 ({"undo": "b"}, "needs one of"),
+                ({"cameras": {"a.jpg": [[1, 0, 0]]}}, "needs cameras"),
+                ({"cameras": {"a.jpg": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}}, "needs cameras"),
             )
         ),
         ({"version": 1, "log": [{"id": "a", "time": "2026-05-01", "undo": "b"}]}, "nothing to undo"),
@@ -235,6 +242,7 @@ def test_the_look_of_classes_is_learned_from_corrections_however_few_views_there
             corrections.Correction("b", "2026-01-01", None, EAST),
         ),
         (1, 0),
+        (None, None),
     ).apply(unlabelled(points), points)
     known = LabelledPoints(points, seeds, np.zeros((len(points), 4), np.float32), None)
     inside = HERE.contain(points)
@@ -284,6 +292,38 @@ def test_corrections_are_an_input_where_there_are_some(scene):
     assert scene.corrections in stage.inputs(scene, Propagate())
     summary = execute("propagate", scene, Propagate())
     assert scene.labelled.stat().st_mtime_ns > before and summary["corrected"] == HERE.contain(ground()).sum()
+
+
+def test_they_move_turn_and_grow_with_the_scene(scene, caplog):
+    add_correction(scene, "grass", HERE)
+    add_correction(scene, None, EAST)
+    points = ground() + [0.031, 0.017, 0]  # not on a border
+    before, _ = Corrections.of_scene(scene).apply(unlabelled(points), points)
+    turn = Rotation.from_euler("xyz", [0.3, -0.8, 2.0]).as_matrix()
+    moved = [
+        replace(view, cam_from_world=moved_pose(view, turn, 2.5, np.array([7.0, -3, 20]))) for view in views()
+    ]
+    shutil.rmtree(scene.sparse)
+    write_model(scene.sparse, moved)
+    points = 2.5 * points @ turn.T + [7.0, -3, 20]
+    after, _ = Corrections.of_scene(Scene(scene.path)).apply(unlabelled(points), points)
+    assert (before.label == 3).sum() > 50 and (after.label == before.label).mean() > 0.999
+    assert (after.state == before.state).mean() > 0.999 and not caplog.records
+    add_correction(Scene(scene.path), "road", Balls(((points[:1], 1.0),)))  # in the new frame
+    again, _ = Corrections.of_scene(Scene(scene.path)).apply(unlabelled(points), points)
+    assert again.label[0] == 1
+    write_model(scene.path / "other", [replace(view, name=f"other_{view.name}") for view in views()])
+    shutil.rmtree(scene.sparse)
+    (scene.path / "other").rename(scene.sparse)
+    Corrections.of_scene(Scene(scene.path))
+    assert caplog.records[-1].getMessage().startswith("3 of 3 corrections were made with cameras that")
+
+
+def moved_pose(view: View, turn: np.ndarray, scale: float, shift: np.ndarray) -> np.ndarray:
+    """(4, 4) cam_from_world after x -> scale * turn @ x + shift."""
+    result, rotation = np.eye(4), view.cam_from_world[:3, :3] @ turn.T
+    result[:3, :3], result[:3, 3] = rotation, -rotation @ (scale * turn @ view.center + shift)
+    return result
 
 
 @pytest.mark.parametrize("memory", ["", "2G"])

@@ -16,7 +16,7 @@ from sc3d.errors import InputError, Sc3dError
 from sc3d.io.json_files import read_json
 from sc3d.io.python_process import run_python
 from sc3d.runner import sidecar
-from sc3d.scene.corrections import Balls, Correction, Corrections, add_correction, redo, undo
+from sc3d.scene.corrections import Balls, Corrections, add_correction, redo, undo
 from sc3d.scene.labelled_cloud import read_labelled
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
@@ -158,8 +158,8 @@ class CorrectionPanel:
         """Show what is corrected and not yet in the labels."""
         found, display = Corrections.of_scene(self._page.scene), self._page.display
         label = display.label.astype(np.int16)
-        for correction, given in zip(found.corrections, found.ids, strict=True):
-            label[self._rows_in(correction)] = given
+        for row, given in enumerate(found.ids):
+            label[self._rows_in(found, row)] = given
         rows = np.flatnonzero(label != display.label)
         if len(rows) and display.class_table is not None:
             size = _COVER * display.spacing_at(self._page.cloud.count)
@@ -178,10 +178,11 @@ class CorrectionPanel:
         count = f"corrections: {len(found.ids)}; points that wait for Apply: {len(rows)}"
         self._say(f"{done}: {count}" if done else count if found.ids else HINTS[self._tool.value])
 
-    def _rows_in(self, correction: Correction) -> np.ndarray:
-        if correction.key not in self._inside:
-            self._inside[correction.key] = np.flatnonzero(correction.shape.contain(self._world))
-        return self._inside[correction.key]
+    def _rows_in(self, found: Corrections, row: int) -> np.ndarray:
+        key = found.corrections[row].key
+        if key not in self._inside:
+            self._inside[key] = np.flatnonzero(found.contain(row, self._world))
+        return self._inside[key]
 
     def _apply(self) -> None:
         self._say("labels are made ...")
