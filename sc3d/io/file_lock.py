@@ -18,7 +18,8 @@ else:
 def locked(path: Path) -> Iterator[None]:
     """Wait until nobody else is in such a block for `path`; who dies in it lets go.
 
-    The lock is held on a hidden file beside `path`, which stays, as `path` itself is replaced by who writes it.
+    The lock is held on a hidden file beside `path`, which stays, as `path` itself is replaced by who
+    writes it.
     """
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
     descriptor = os.open(path.with_name(f".{path.name}.lock"), flags, 0o666)

@@ -70,8 +70,8 @@ def appearance_marginals(
 
 
 def hold_corrected(likelihood: np.ndarray, known: LabelledPoints) -> None:
-    """Make the log-likelihood (N, C), in place, certain of what people have corrected; what is none of the classes is
-    no evidence of any.
+    """Make the log-likelihood (N, C), in place, certain of what people have corrected; what is none of
+    the classes is no evidence of any.
     """
     label = known.seeds.label.astype(np.int64)
     likelihood[known.corrected & (label == 0)] = 0

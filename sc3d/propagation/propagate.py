@@ -80,8 +80,8 @@ def fill_from_nearest(
 def with_states(
     given: Labels, seeds: np.ndarray, found: tuple[np.ndarray, np.ndarray], settings: Propagate
 ) -> Labels:
-    """The labels found, (N,) each with its confidence, and what they mean: kept seeds, propagated, or doubted seeds;
-    what people have corrected is theirs.
+    """The labels found, (N,) each with its confidence, and what they mean: kept seeds, propagated, or
+    doubted seeds; what people have corrected is theirs.
     """
     corrected = given.state == CORRECTED
     label, confidence = np.where(corrected, given.label, found[0]), np.where(corrected, 1, found[1])
@@ -95,8 +95,8 @@ def with_states(
 
 @dataclass(frozen=True)
 class PropagateSummary:
-    """Of a finished cloud: points, those with a label, those that got it here, the sum of the labelled points'
-    confidences, and those that people corrected.
+    """Of a finished cloud: points, those with a label, those that got it here, the sum of the labelled
+    points' confidences, and those that people corrected.
     """
 
     num_points: int

@@ -1,7 +1,7 @@
 """What people have corrected in 3D: shapes in the frame of the scene whose points are of a class, or of none.
 
-`corrections.json` is a log to which entries are added: corrections, and what was undone or redone of them. Shapes
-hold no rows of a cloud, so they are as good for any other cloud of the scene.
+`corrections.json` is a log to which entries are added: corrections, and what was undone or redone of them.
+Shapes hold no rows of a cloud, so they are as good for any other cloud of the scene.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Balls:
-    """All that lies in one of many balls. groups: per size, the centers (B, 3), world, and the radius of balls."""
+    """All that lies in one of many balls. groups: per size, the centers (B, 3), world, and the radius
+    of balls.
+    """
 
     groups: tuple[tuple[np.ndarray, float], ...]
 
@@ -57,8 +59,8 @@ class Balls:
 
 @dataclass(frozen=True)
 class Prism:
-    """All that lies over or under a polygon (K, 2) of the ground plane, x and y, and from `low` to `high` in z, world.
-    Where the polygon crosses itself, the even-odd rule counts.
+    """All that lies over or under a polygon (K, 2) of the ground plane, x and y, and from `low` to
+    `high` in z, world. Where the polygon crosses itself, the even-odd rule counts.
     """
 
     polygon: np.ndarray
@@ -86,8 +88,8 @@ def in_polygon(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Correction:
-    """The points in a shape are of a class. name: of the class, None = of none; time: ISO 8601, when it was made;
-    reference: in whose frame the shape is, empty = in that of the scene
+    """The points in a shape are of a class. name: of the class, None = of none; time: ISO 8601, when it
+    was made; reference: in whose frame the shape is, empty = in that of the scene
     """
 
     key: str
@@ -99,9 +101,9 @@ class Correction:
 
 @dataclass(frozen=True)
 class Corrections:
-    """The corrections of a scene that stand, in the order in which they were made; where two overlap, the later one
-    counts. ids: (C,) int of their classes, 0 = none of them; moves: (C,) ways into the frames of their shapes; origin:
-    their file
+    """The corrections of a scene that stand, in the order in which they were made; where two overlap,
+    the later one counts. ids: (C,) int of their classes, 0 = none of them; moves: (C,) ways into the
+    frames of their shapes; origin: their file
     """
 
     corrections: tuple[Correction, ...] = ()
@@ -131,8 +133,8 @@ class Corrections:
         return [] if self.origin is None else [self.origin, self.origin.with_name("classes.json")]
 
     def apply(self, labels: Labels, points: np.ndarray) -> tuple[Labels, np.ndarray]:
-        """Labels (N,), ids, of points (N, 3) float64 world with what was corrected, state `CORRECTED`; and (C,) int64
-        how many points lie in each correction.
+        """Labels (N,), ids, of points (N, 3) float64 world with what was corrected, state
+        `CORRECTED`; and (C,) int64 how many points lie in each correction.
         """
         label, counts = labels.label.copy(), np.zeros(len(self.ids), np.int64)
         touched = np.zeros(len(points), bool)
@@ -176,13 +178,15 @@ def _moves(found: tuple[Correction, ...], scene: Scene) -> tuple[Move | None, ..
         moves.append(move)
     if lost:
         logger.warning(
-            "%d of %d corrections were made with cameras that the scene does not have now: they are taken to be in its present frame",
+            "%d of %d corrections were made with cameras that the scene does not have now:"
+            " they are taken to be in its present frame",
             lost,
             len(found),
         )
     if worst > MAX_ERROR:
         logger.warning(
-            "corrections were made with cameras that lie otherwise to one another now, by %.1f%% of their distance: they may have slipped",
+            "corrections were made with cameras that lie otherwise to one another now,"
+            " by %.1f%% of their distance: they may have slipped",
             100 * worst,
         )
     return tuple(moves)
@@ -200,7 +204,8 @@ def _class_id(name: str | None, table: ClassTable | None, origin: Path) -> int:
 
 
 def add_correction(scene: Scene, name: str | None, shape: Balls | Prism) -> None:
-    """Write down that the points in a shape are of a class (None: of none), at once and after whatever others wrote.
+    """Write down that the points in a shape are of a class (None: of none), at once and after whatever
+    others wrote.
 
     Raises InputError for a class that no point can be of, a shape that is none, or a broken file.
     """
@@ -279,7 +284,8 @@ def read_log(path: Path) -> list[dict]:
     version = content.get("version") if isinstance(content, dict) else None
     if not isinstance(content, dict) or version != VERSION or not isinstance(content.get("log"), list):
         raise InputError(
-            f'{path} is no log of corrections of version {VERSION}: {{"version": {VERSION}, "log": [...]}} is expected'
+            f"{path} is no log of corrections of version {VERSION}:"
+            f' {{"version": {VERSION}, "log": [...]}} is expected'
         )
     return _checked(content["log"], path)
 

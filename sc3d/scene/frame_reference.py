@@ -1,5 +1,5 @@
-"""In which frame positions were written down: by the poses of two cameras, from which the way into the present frame
-follows after the scene was moved, turned or scaled.
+"""In which frame positions were written down: by the poses of two cameras, from which the way into the
+present frame follows after the scene was moved, turned or scaled.
 """
 
 from __future__ import annotations

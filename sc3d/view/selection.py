@@ -42,8 +42,8 @@ def region_around(
 
 
 def _connected(keys: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """(M,) number of the group of each of the cells that touch at a side, edge or corner; keys: (M,) int64 rising, of
-    an array of that shape, whose outermost cells are free.
+    """(M,) number of the group of each of the cells that touch at a side, edge or corner; keys: (M,)
+    int64 rising, of an array of that shape, whose outermost cells are free.
     """
     strides, pairs = np.array([shape[1] * shape[2], shape[2], 1]), []
     for step in np.ndindex(3, 3, 3):
@@ -87,8 +87,8 @@ def seen_in_lasso(points: np.ndarray, eye: np.ndarray, corners: np.ndarray, spac
 
 
 def balls_around(points: np.ndarray, chosen: np.ndarray, spacing: float) -> Balls:
-    """Balls that hold the chosen points and hardly more: large ones where no other point is near, and at the border
-    such of the size of the spacing.
+    """Balls that hold the chosen points and hardly more: large ones where no other point is near, and
+    at the border such of the size of the spacing.
 
     points: (N, 3) float64 world; chosen: (R,) rows of them, R >= 1; spacing: between points
     Raises InputError for what would need too many.

@@ -200,7 +200,8 @@ def _remove(node: viser.SceneNodeHandle | None) -> None:
 
 
 def propagate_again(scene: Scene) -> None:
-    """`sc3d propagate` with the settings that `labelled.ply` was made with, in a process of its own: the page goes on.
+    """`sc3d propagate` with the settings that `labelled.ply` was made with, in a process of its own:
+    the page goes on.
 
     Raises InputError with the reason if it fails.
     """
@@ -214,7 +215,8 @@ def propagate_again(scene: Scene) -> None:
         "from pathlib import Path\nfrom sc3d.cli import reporting_errors, start_logging\n"
         "from sc3d.runner import execute\nfrom sc3d.scene.scene import Scene\n"
         "from sc3d.settings.labels import Propagate\nstart_logging()\n"
-        f"with reporting_errors():\n execute('propagate', Scene(Path({str(scene.path.absolute())!r})), Propagate(**{settings!r}))"
+        f"scene = Scene(Path({str(scene.path.absolute())!r}))\n"
+        f"with reporting_errors():\n execute('propagate', scene, Propagate(**{settings!r}))"
     )
     ended = run_python(code, _DAY)
     if ended.returncode:
