@@ -5,8 +5,9 @@ both.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import open3d as o3d
@@ -42,9 +43,11 @@ class Masks:
     without: tuple[str, ...] = ()
 
     @classmethod
-    def load(cls, scene: Scene, confidence: Path | None) -> Masks:
+    def load(
+        cls, scene: Scene, confidence: Path | None, unlabelled: Literal["evidence", "ignore"] = "ignore"
+    ) -> Masks:
         """Masks of a scene, and confidence maps in a folder if it exists, all checked; InputError for what
-        does not fit.
+        does not fit. unlabelled: as `Label.unlabelled`
         """
         scene.require(
             scene.classes,
@@ -60,7 +63,8 @@ class Masks:
         views = scene.model.views
         masked = [view for view in views if view.name in files]
         without = tuple(view.name for view in views if view.name not in files)
-        return cls(files, confidences, masked, scene, table.channels, without)
+        channels = replace(table.channels, none=unlabelled == "evidence")
+        return cls(files, confidences, masked, scene, channels, without)
 
     def tell_of_left_out(self, low: np.ndarray, high: np.ndarray) -> None:
         """One line for each reason why photos do not vote, or not as others do. low, high: (3,) box of the
@@ -82,7 +86,8 @@ class Masks:
         confidence = self.confidences.get(view.name)
         sure = None if confidence is None else self.scene.read_confidence(confidence, view.name)
         file = self.files[view.name]
-        return self.channels.from_ids(self.scene.read_mask(file, view.name), file), sure
+        mask = self.channels.from_ids(self.scene.read_mask(file, view.name), file)
+        return self.channels.with_none(mask, np.ones(mask.shape, bool)), sure
 
     def size(self, view: View) -> tuple[int, int]:
         """(width, height) px of the mask of a view."""

@@ -48,7 +48,7 @@ def vote_marginals(
     """Log-evidence and marginals (N, C) from the votes alone; offered: (C,) bool, a class without a single seed
     is not.
     """
-    likelihood = vote_likelihood(known.known_votes)
+    likelihood = evidence_of(known)
     likelihood[:, ~offered] = -np.inf
     # else the votes would take one edge per step to reach points without any
     grown, _ = grow_regions(graph, known.seed_labels)
@@ -62,7 +62,7 @@ def appearance_marginals(
     graph: Graph, known: LabelledPoints, offered: np.ndarray, rating: np.ndarray, settings: Propagate
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same from votes and appearance; rating: (N, C) of the appearance, overwritten."""
-    rating += np.float32(TRUST) * vote_likelihood(known.known_votes)
+    rating += np.float32(TRUST) * evidence_of(known)
     rating[:, ~offered] = -np.inf
     return rating, mean_field(graph, rating, settings.smoothness)  # afresh: sure marginals would not move
 
@@ -78,6 +78,16 @@ def decided(graph: Graph, evidence: np.ndarray, marginals: np.ndarray) -> tuple[
     evidence *= np.float32(CAUTION)
     cautious = mean_field(graph, evidence, SUPPORT, marginals, steps=1)
     return label.astype(np.uint8), cautious[np.arange(len(label)), label - 1]
+
+
+def evidence_of(known: LabelledPoints) -> np.ndarray:
+    """(N, C) float32 log-likelihood of all labels from the votes: of the classes among themselves, and of none of them
+    against the best.
+    """
+    if known.rates is None:
+        return vote_likelihood(known.known_votes)
+    none = known.rates.log_odds(known.known_votes)
+    return np.concatenate([vote_likelihood(known.known_votes[:, :-1]), none[:, None]], axis=1)
 
 
 def vote_likelihood(votes: np.ndarray) -> np.ndarray:

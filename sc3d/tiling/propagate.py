@@ -10,7 +10,7 @@ otherwise than in one piece.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -34,6 +34,7 @@ from sc3d.propagation.appearance import (
     uses_appearance,
 )
 from sc3d.propagation.labelled_points import MIN_EXAMPLES, views_to_agree
+from sc3d.propagation.none_evidence import NoneRates, count_votes
 from sc3d.propagation.potts import STEPS, appearance_marginals, decided, sure_examples, vote_marginals
 from sc3d.propagation.propagate import PropagateSummary, fill_from_nearest, no_seeds, spread, with_states
 from sc3d.propagation.quantile_sketch import QuantileSketch
@@ -107,8 +108,10 @@ def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
         sum(summary.seeds for summary in summaries) > 0,
         views_to_agree(sum(summary.agreement for summary in summaries)),
     )
-    if not offered.any():
+    if not offered[: len(job.channels.ids) - 1].any():
         raise no_seeds(path)
+    if job.channels.none:
+        job = replace(job, rates=NoneRates.from_counts(sum(summary.found for summary in summaries)))
     statistics = (
         _learn(job, executor, NormalStatistics.merge([summary.lean for summary in summaries]), least)
         if uses_appearance(job.settings)
@@ -132,12 +135,13 @@ def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
 @dataclass(frozen=True)
 class TileSummary:
     """First look at a tile. seeds: (C,) int64 of each class; agreement: as `LabelledPoints.agreement`; lean: of its
-    surfaces
+    surfaces; found: as `none_evidence.count_votes`
     """
 
     seeds: np.ndarray
     agreement: np.ndarray
     lean: NormalStatistics
+    found: np.ndarray
 
 
 def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
@@ -147,6 +151,7 @@ def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
         np.bincount(start[core], minlength=job.channels.count)[1:],
         part.known.agreement(core),
         NormalStatistics.from_normals(part.graph.normals[core], part.graph.spacings[core]),
+        count_votes(part.known.known_votes[core]) if job.channels.none else np.zeros((0, 2), np.int64),
     )
 
 
@@ -358,7 +363,7 @@ def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
             for name, _ in kept:
                 result[name] = values[name] if name in values else records[name]
             labelled = values["label"] > 0
-            counts[:] += len(records), labelled.sum(), (values["state"] == PROPAGATED).sum()
+            counts[:] += len(records), labelled.sum(), (labelled & (values["state"] == PROPAGATED)).sum()
             confidence[0] += float(values["confidence"][labelled].sum(dtype=np.float64))
             yield result
 
