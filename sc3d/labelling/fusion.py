@@ -98,7 +98,8 @@ def fuse(
 
 
 def most_voted(votes: np.ndarray, none: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Winner of each cell among the classes. votes: (K, num_channels), column 0 is ignored; none: as in `VoteWeighting`.
+    """Winner of each cell among the classes. votes: (K, num_channels), column 0 is ignored; none: as in
+    `VoteWeighting`.
 
     returns: (K,) uint8 label with most votes (0 = no votes; ties: smallest id), (K,) float32 its share of the votes
     """
@@ -110,7 +111,9 @@ def most_voted(votes: np.ndarray, none: int = 0) -> tuple[np.ndarray, np.ndarray
 
 
 def none_share(votes: np.ndarray) -> np.ndarray:
-    """(K,) float32 share of the last channel in votes (K, num_channels), of which column 0 is ignored; 0 without votes."""
+    """(K,) float32 share of the last channel in votes (K, num_channels), of which column 0 is ignored; 0
+    without votes.
+    """
     total = votes[:, 1:].sum(axis=1, dtype=np.float64)
     return (votes[:, -1] / np.maximum(total, 1e-9)).astype(np.float32)
 

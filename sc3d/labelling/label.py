@@ -82,7 +82,9 @@ def summarize(
 def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     """Fuse the masks of a scene on its cloud (or `settings.cloud`) and write seeds and votes."""
     settings = settings.resolved
-    masks = Masks.load(scene, best_confidence(scene) if settings.use_confidence else None, settings.unlabelled)
+    masks = Masks.load(
+        scene, best_confidence(scene) if settings.use_confidence else None, settings.unlabelled
+    )
     given = read_given_cloud(scene, settings.cloud)
     path, positions = given_cloud_path(scene, settings.cloud), given.point.positions.numpy()
     box = positions.min(axis=0), positions.max(axis=0)

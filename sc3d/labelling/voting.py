@@ -96,8 +96,8 @@ class CameraParameters(NamedTuple):
 
 class VoteWeighting(NamedTuple):
     """How a sighting is weighed: which factors count (the others are 1), and the depth at which the range factor is 1;
-    `equal` = all weigh 1; `second` = strict sightings are also voted on apart; `none` = channel of the votes for none of
-    the classes, 0 = there is none.
+    `equal` = all weigh 1; `second` = strict sightings are also voted on apart; `none` = channel of the
+    votes for none of the classes, 0 = there is none.
     """
 
     voxel_size: float
@@ -107,7 +107,7 @@ class VoteWeighting(NamedTuple):
     range: bool
     equal: bool
     second: bool
-    none: int
+    none: int = 0
 
     @classmethod
     def from_settings(
@@ -178,8 +178,8 @@ class VoteAccumulator:
         return self.grid.votes[self.cloud.rows]
 
     def verify(self, winner: np.ndarray, reweigh: bool, none: int = 0) -> np.ndarray:
-        """(K,) bool, which cells pass the two-way verification; see `verification.verify`. winner: (K,) uint8;
-        none: as in `VoteWeighting`; these votes keep their share.
+        """(K,) bool, which cells pass the two-way verification; see `verification.verify`. winner: (K,)
+        uint8; none: as in `VoteWeighting`; these votes keep their share.
         """
         if not none:
             return verify(self.log, winner, self.grid, self.cloud.rows, SCALE, reweigh)

@@ -21,8 +21,8 @@ class LabelledPoints:
     points: (N, 3) world; seeds: labels of fusion, which are channels (`sc3d.scene.channels`); votes: (N, C + 1)
         float32 or None, column 0 is ignored; colors: (N, 3) uint8 or None
     up: (3,) of the cameras, None = not known
-    none: the last of the C labels, and the last column of the votes, stand for none of the classes; rates: what is
-        known of the votes for it
+    none: the last of the C labels, and the last column of the votes, stand for none of the classes; rates:
+    what is known of the votes for it
     """
 
     points: np.ndarray

@@ -1,12 +1,12 @@
-"""Evidence that a point belongs to none of the classes: how often the views that look at it find nothing there, against
-how often they miss what is there.
+"""Evidence that a point belongs to none of the classes: how often the views that look at it find nothing
+there, against how often they miss what is there.
 
-Masks have holes, and they have more of them on some classes than on others. How many is learned from the votes
-themselves: on points whose votes for classes name class c, the share h_c of all votes that name none; on points where
-most votes name none, that share g. A point of N votes, a share s of which names none, then speaks for "none" against
-its own best class by N (s log(g / h) + (1 - s) log((1 - g) / (1 - h))), which changes sign at some s, and never below
-one half. Whatever the class, it is held against its own rate: otherwise the class with the most holes would attract all
-that has no label.
+Masks have holes, and they have more of them on some classes than on others. How many is learned from the
+votes themselves: on points whose votes for classes name class c, the share h_c of all votes that name none;
+on points where most votes name none, that share g. A point of N votes, a share s of which names none, then
+speaks for "none" against its own best class by N (s log(g / h) + (1 - s) log((1 - g) / (1 - h))), which
+changes sign at some s, and never below one half. Whatever the class, it is held against its own rate:
+otherwise the class with the most holes would attract all that has no label.
 """
 
 from __future__ import annotations
@@ -24,12 +24,14 @@ EVEN = 0.5  # share of votes for none below which they never win
 
 @dataclass(frozen=True)
 class NoneRates:
-    """How often views find nothing. missed: (C + 1,) on points of each class, entry 0 = on those without a vote for one;
-    silent: on what is none of the classes.
+    """How often views find nothing. missed: (C + 1,) on points of each class, entry 0 = on those without a
+    vote for one; silent: on what is none of the classes; prior: share of all votes that fall on what is
+    none of the classes.
     """
 
     missed: np.ndarray
     silent: float
+    prior: float
 
     @classmethod
     def from_counts(cls, counts: np.ndarray) -> NoneRates:
@@ -40,11 +42,17 @@ class NoneRates:
         silent = max(float(rates[0]), EVEN + 0.01)
         missed = np.clip(rates, 0.01, silent - 0.01)
         missed[0] = missed[1:].max()
-        return cls(missed, silent)
+        share = (seen[0].sum() + 1) / (seen[1:].sum() + seen[0, 0] + 2)
+        return cls(missed, silent, float(np.clip(share, 0.001, 0.5)))
+
+    @property
+    def prior_odds(self) -> float:
+        """Natural logarithm."""
+        return float(np.log(self.prior / (1 - self.prior)))
 
     def log_odds(self, votes: np.ndarray) -> np.ndarray:
-        """(N,) float32 log-odds of none against the best class, by votes (N, C + 2) as in `LabelledPoints`; 0 without
-        votes.
+        """(N,) float32 log-odds of none against the best class, by votes (N, C + 2) as in `LabelledPoints`;
+        0 without votes.
         """
         total, share = votes[:, 1:].sum(axis=1), none_share(votes)
         missed, silent = self.missed[best_class(votes)], self.silent
@@ -54,7 +62,9 @@ class NoneRates:
 
 
 def none_share(votes: np.ndarray) -> np.ndarray:
-    """(N,) float32 share of the votes (N, C + 2) that name none of the classes, the last column; 0 without votes."""
+    """(N,) float32 share of the votes (N, C + 2) that name none of the classes, the last column; 0 without
+    votes.
+    """
     return (votes[:, -1] / np.maximum(votes[:, 1:].sum(axis=1), np.float32(1e-9))).astype(np.float32)
 
 
@@ -64,8 +74,9 @@ def best_class(votes: np.ndarray) -> np.ndarray:
 
 
 def count_votes(votes: np.ndarray) -> np.ndarray:
-    """(C + 1, 2) int64 votes for none and for classes, in UNITs: row c on points whose best class is c, row 0 on points
-    where most votes name none. votes: (N, C + 2) as in `LabelledPoints`; parts of a cloud add up.
+    """(C + 1, 2) int64 votes for none and for classes, in UNITs: row c on points whose best class is c, row
+    0 on points where most votes name none. votes: (N, C + 2) as in `LabelledPoints`; parts of a cloud add
+    up.
     """
     num_classes = votes.shape[1] - 2
     pair = np.rint(np.stack([votes[:, -1], votes[:, 1:-1].sum(axis=1)], axis=1) * UNIT).astype(np.int64)

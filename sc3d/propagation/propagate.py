@@ -141,7 +141,9 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
 
 
 def seeds_in_channels(seeds: Labels, channels: Channels, origin: Path | str) -> Labels:
-    """Labels of fusion, which are ids, as channels; seeds without a class are of none of them. origin: for errors."""
+    """Labels of fusion, which are ids, as channels; seeds without a class are of none of them. origin: for
+    errors.
+    """
     label = channels.from_ids(seeds.label, origin)
     return replace(seeds, label=channels.with_none(label, np.isin(seeds.state, (SEED, UNLOCKED))))
 

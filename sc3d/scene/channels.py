@@ -15,7 +15,8 @@ class Channels:
     """Which class each channel stands for. ids: (C + 1,) uint8 rising, of which the first, 0, is no class.
 
     With the ids 1, 2, ..., C, as most tables have them, channels are ids.
-    none: one more channel, the last, for what views looked at and found none of the classes on; its id is 0, too
+    none: one more channel, the last, for what views looked at and found none of the classes on; its id is
+    0, too
     """
 
     ids: np.ndarray

@@ -158,8 +158,8 @@ def _in_range(path: Path, name: str, values: np.ndarray, largest: int, dtype: ty
 
 @dataclass(frozen=True)
 class Votes:
-    """values: (N, channels) float32, in views of full weight, of which column 0 counts views; channels: the class of
-    each column.
+    """values: (N, channels) float32, in views of full weight, of which column 0 counts views; channels: the
+    class of each column.
     """
 
     values: np.ndarray

@@ -243,7 +243,7 @@ def _turn_task(
             raise ValueError("a round needs examples of two classes")
         evidence, marginals = appearance_marginals(part.graph, known, offered, rating, job.settings)
         examples = sure_examples(marginals, known)
-        label, confidence = decided(part.graph, evidence, marginals)
+        label, confidence = decided(part.graph, known, evidence, marginals)
         names = (f"round{turn}_label", f"round{turn}_confidence", f"round{turn}_examples")
         job.results.write(
             tile,
@@ -264,9 +264,8 @@ def _once_task(
     """map without appearance, geometry or knn, within the margin."""
     part = TileGraph.load(job, tile)
     if job.settings.method == "map":
-        label, confidence = decided(
-            part.graph, *vote_marginals(part.graph, part.known, offered, job.settings)
-        )
+        found = vote_marginals(part.graph, part.known, offered, job.settings)
+        label, confidence = decided(part.graph, part.known, *found)
     else:
         start = _start(job, part, statistics)
         label, confidence = spread(part.graph, part.known.points, start, job.settings)

@@ -37,8 +37,9 @@ KNOWN = ("points", "votes", *(field.name for field in fields(Labels)), "colors")
 
 @dataclass(frozen=True)
 class PropagateJob:
-    """What the task of a tile needs to know. margin: world units; channels: of the votes; shared:
-    folder for what all tiles read; up: (3,) of the cameras, None = not known; rates: of votes for none, once counted
+    """What the task of a tile needs to know. margin: world units; channels: of the votes; shared: folder
+    for what all tiles read; up: (3,) of the cameras, None = not known; rates: of votes for none, once
+    counted
     """
 
     settings: Propagate
