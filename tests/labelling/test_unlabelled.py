@@ -1,0 +1,139 @@
+"""What masks leave unlabelled: holes are voted away, a surface of none of the classes stays unlabelled."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sc3d.errors import InputError
+from sc3d.geometry.cameras import look_at, pinhole_view
+from sc3d.geometry.raycast import Surface
+from sc3d.labelling.cloud import Cloud
+from sc3d.labelling.fusion import fuse
+from sc3d.propagation.labelled_points import LabelledPoints
+from sc3d.propagation.none_evidence import NoneRates, count_votes, none_share
+from sc3d.propagation.propagate import propagate
+from sc3d.scene.channels import Channels
+from sc3d.scene.labelled_cloud import vote_channels
+from sc3d.scene.labels import SEED
+from sc3d.settings.labels import Label, Propagate
+
+SIZE, NONE = 160, 3  # classes 1 and 2; channel 3 = looked at, none of them
+VIEWS = [
+    pinhole_view(
+        f"view_{row}.jpg",
+        (SIZE, SIZE),
+        (SIZE, SIZE, SIZE / 2, SIZE / 2),
+        look_at(np.array([x, y, 12.0]), np.array([x, y, 0.0])),
+    )
+    for row, (x, y) in enumerate(
+        [(-0.6, -0.4), (0.5, -0.5), (0.4, 0.6), (-0.5, 0.5), (0.0, 0.1), (0.2, -0.1)]
+    )
+]
+
+
+def plane(step: float = 0.1, half: float = 4.0) -> np.ndarray:
+    x, y = np.meshgrid(np.arange(-half, half, step), np.arange(-half, half, step))
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+
+
+def mask(view, holes: float, seed: int) -> np.ndarray:
+    """Class 1 where x < -1, 2 where x < 1.5, none beyond; patches of 8 px are holes at random."""
+    columns = (np.arange(SIZE) + 0.5 - SIZE / 2) * 12 / SIZE + view.center[0]
+    found = np.where(columns < -1, 1, np.where(columns < 1.5, 2, NONE))
+    result = np.repeat(found[None], SIZE, axis=0)
+    patches = np.random.default_rng(seed).random((SIZE // 8, SIZE // 8)) < holes
+    return np.where(np.kron(patches, np.ones((8, 8), bool)), NONE, result).astype(np.uint8)
+
+
+def labels_of(holes: float, none: bool, settings: Propagate = Propagate(appearance=False)) -> np.ndarray:
+    """(N,) channels of the plane's points; without `none`, unlabelled pixels say nothing."""
+    points = plane()
+    cloud = Cloud(points, np.tile(np.float32([0, 0, 1]), (len(points), 1)))
+    masks = {view.name: mask(view, holes, row) for row, view in enumerate(VIEWS)}
+    if not none:
+        masks = {name: np.where(values == NONE, 0, values).astype(np.uint8) for name, values in masks.items()}
+    surface = Surface.from_cloud(points, cloud.normals, np.zeros(3))
+    settings_of = Label(voxel_size=0.2)
+    fusion = fuse(
+        cloud, VIEWS, lambda view: (masks[view.name], None), surface, NONE + none, settings_of, none
+    )
+    known = LabelledPoints(points, fusion.labels, fusion.votes, None, none=none)
+    return propagate(known, cloud.normals, settings).label
+
+
+def inner(points: np.ndarray, low: float, high: float) -> np.ndarray:
+    return (points[:, 0] > low + 0.4) & (points[:, 0] < high - 0.4)
+
+
+@pytest.mark.parametrize("holes", [0.0, 0.15, 0.3])
+@pytest.mark.parametrize("method", ["map", "geometry", "knn"])
+def test_holes_are_voted_away_and_the_rest_stays_unlabelled(holes, method):
+    found, points = labels_of(holes, True, Propagate(method=method, appearance=False)), plane()
+    assert (found[inner(points, -4, -1)] == 1).mean() > 0.97
+    assert (found[inner(points, -1, 1.5)] == 2).mean() > 0.97
+    assert (found[inner(points, 1.5, 4)] == NONE).mean() > 0.99
+
+
+def test_without_evidence_the_rest_gets_a_class_as_before():
+    found, points = labels_of(0.15, False), plane()
+    assert (found[inner(points, 1.5, 4)] == 2).all()
+
+
+def test_votes_for_classes_are_those_without_evidence():
+    points = plane()
+    cloud = Cloud(points, np.tile(np.float32([0, 0, 1]), (len(points), 1)))
+    surface = Surface.from_cloud(points, cloud.normals, np.zeros(3))
+    both = []
+    for none in (False, True):
+
+        def read(view, none=none):
+            values = mask(view, 0.2, 1)
+            return (values if none else np.where(values == NONE, 0, values).astype(np.uint8)), None
+
+        both.append(fuse(cloud, VIEWS, read, surface, NONE + none, Label(voxel_size=0.2), none))
+    # a class vote in a hole's neighborhood weighs what it weighed: classes are decided as before
+    np.testing.assert_array_equal(both[0].votes, both[1].votes[:, :NONE])
+    kept = both[1].labels.state == SEED
+    named = kept & (both[1].labels.label != NONE)
+    np.testing.assert_array_equal(both[0].labels.label[named], both[1].labels.label[named])
+
+
+def test_rates_are_those_of_the_votes():
+    rng = np.random.default_rng(0)
+    count, views = 20_000, 6
+    truth = rng.integers(0, 3, count)  # 0 = none of the classes
+    silent = rng.random((count, views)) < np.array([0.95, 0.3, 0.05])[truth][:, None]
+    votes = np.zeros((count, 4), np.float32)
+    votes[:, 3] = silent.sum(axis=1)
+    named = np.where(truth == 0, rng.integers(1, 3, count), truth)
+    votes[np.arange(count), named] = views - votes[:, 3]
+    rates = NoneRates.from_counts(count_votes(votes[truth > 0]))
+    assert rates.missed[1:] == pytest.approx([0.3, 0.05], abs=0.01)
+    whole = sum(count_votes(part) for part in np.array_split(votes, 7))
+    np.testing.assert_array_equal(whole, count_votes(votes))
+    odds = NoneRates.from_counts(whole).log_odds(votes)
+    assert ((odds > 0) == (truth == 0)).mean() > 0.97
+    assert (odds[none_share(votes) <= 0.5] <= 0).all()
+    assert (NoneRates.from_counts(whole).log_odds(np.zeros((3, 4), np.float32)) == 0).all()
+
+
+def test_channels_of_none():
+    channels = replace(Channels.of_classes([1, 7]), none=True)
+    assert channels.names == ["0", "1", "7", "none"]
+    ids = np.array([0, 1, 7, 0], np.uint8)
+    found = channels.with_none(channels.from_ids(ids), np.array([True, True, True, False]))
+    np.testing.assert_array_equal(found, [3, 1, 2, 0])
+    np.testing.assert_array_equal(channels.to_ids(found), ids)
+    assert vote_channels(["votes_0", "votes_1", "votes_7", "votes_none"]) is not None
+    assert (
+        not vote_channels(["votes_0", "votes_1"]).none
+        and vote_channels(["votes_0", "votes_1", "votes_none"]).none
+    )
+    with pytest.raises(InputError, match="votes_5"):
+        channels.from_ids(np.array([5], np.uint8))
+
+
+@pytest.mark.parametrize("method", ["direct", "majority", "paper"])
+def test_baselines_ignore_what_is_unlabelled(method):
+    assert Label(method=method).resolved.unlabelled == "ignore"
