@@ -56,7 +56,7 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
         "inputs": {_named(item, scene): digest(item) for item in stage.inputs(scene, settings)},
     }
     outputs = stage.outputs(scene, settings)
-    previous = _finished(record, outputs, scene, _path_fields(settings))
+    previous = _finished(record, outputs, scene, settings)
     if previous is not None and not overwrite:
         logger.info("%s: up to date (--overwrite runs it again)", name)
         return previous["summary"]
@@ -178,7 +178,16 @@ def sidecar(output: Path) -> Path:
     return output.with_name(output.name + ".json")
 
 
-def _finished(record: dict, outputs: list[Path], scene: Scene, paths: set[str]) -> dict | None:
+def _off(settings: Any) -> set[str]:
+    """Settings that are off, as they are by default."""
+    return {
+        field.name
+        for field in fields(settings)
+        if not getattr(settings, field.name) and getattr(settings, field.name) == field.default
+    }
+
+
+def _finished(record: dict, outputs: list[Path], scene: Scene, settings: object) -> dict | None:
     found: dict | None = None
     for output in outputs:
         try:
@@ -188,22 +197,25 @@ def _finished(record: dict, outputs: list[Path], scene: Scene, paths: set[str]) 
         if not isinstance(read, dict) or not isinstance(read.get("summary"), dict):
             return None
         found = read
-        if not output.exists() or not _is_same_work(found, record, scene, paths):
+        if not output.exists() or not _is_same_work(found, record, scene, settings):
             return None
     return found
 
 
-def _is_same_work(found: dict, record: dict, scene: Scene, paths: set[str]) -> bool:
-    """Whether a sidecar tells of what `record` asks for. Inputs count by their content, and settings that are
-    `paths` by the inputs that they name: sidecars of earlier versions hold them as they were typed.
+def _is_same_work(found: dict, record: dict, scene: Scene, asked: object) -> bool:
+    """Whether a sidecar tells of what `record` asks for, with the settings `asked`. Inputs count by their
+    content, and settings that are paths by the inputs that they name: sidecars of earlier versions hold them as
+    they were typed, and do not know later ones, which count as off.
     """
-    inputs, settings = found.get("inputs"), found.get("settings")
+    inputs, settings, paths = found.get("inputs"), found.get("settings"), _path_fields(asked)
     if (
         found.get("stage") != record["stage"]
         or not isinstance(inputs, dict)
         or not isinstance(settings, dict)
     ):
         return False
+    later = record["settings"].keys() - settings.keys()
+    settings = settings | {name: record["settings"][name] for name in later & _off(asked)}
     if (
         list(inputs.values()) != list(record["inputs"].values())
         or settings.keys() != record["settings"].keys()

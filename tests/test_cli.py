@@ -43,6 +43,52 @@ def files(folder: Path) -> set:
     }
 
 
+@pytest.mark.parametrize(
+    ("name", "options", "first"),
+    [
+        ("sky", (), "segment"),
+        ("tree", (), "depth"),
+        ("sky", ("--depth.ignore-masks",), "depth"),
+        ("sky", ("--depth.sky-masks", "sky"), "depth"),
+    ],
+)
+def test_run_makes_masks_first_where_depth_takes_sky_from_them(scene, monkeypatch, name, options, first):
+    """Else a second run would find masks that the first one's depth did not know, and do all again."""
+    from sc3d.commands import run
+
+    stages: list[str] = []
+    table = [{"id": 1, "name": "road", "color": [1, 1, 1]}, {"id": 3, "name": name, "color": [9, 9, 9]}]
+    (scene / "classes.json").write_text(json.dumps(table))
+    for step in ("check", "prepare", "reconstruct"):
+        monkeypatch.setattr(run, step, lambda *arguments: None)
+    monkeypatch.setattr(run, "execute", lambda stage, *arguments: stages.append(stage))
+    main(["run", "photos", str(scene), *options])
+    others = [stage for stage in stages if stage != "segment"]
+    assert others == ["depth", "train", "extract", "label", "propagate", "report"]
+    assert stages[0] == first and stages.index("segment") in (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--extract.crop", "3"), "only 2 photos"),
+        (("--depth.sky-masks", "none"), "--sky-masks none is missing"),
+        (("--depth.sky-masks", "photos"), "no masks in photos"),
+    ],
+)
+def test_run_refuses_before_the_first_stage(tmp_path, monkeypatch, capsys, options, told):
+    monkeypatch.chdir(tmp_path)
+    write_bare_scene(tmp_path / "given")
+    Path("photos").mkdir()
+    for name in ("photo_0", "photo_1"):
+        Image.fromarray(np.zeros((120, 160, 3), np.uint8)).save(f"photos/{name}.jpg")
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        (tmp_path / "given" / "masks" / f"{name}.png").rename(tmp_path / "masks" / f"{name}.png")
+    classes = ("--classes", "given/classes.json", "--masks", "masks")
+    assert told in fails(capsys, "run", "photos", "scene", *classes, *options)
+    assert not Path("scene").exists()
+
+
 @pytest.mark.parametrize("name", [*STAGES, *COMMANDS])
 def test_help_answers_in_under_a_second(name):
     code = "from sc3d.cli import main; main()"

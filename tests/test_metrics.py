@@ -4,6 +4,11 @@ import numpy as np
 import pytest
 
 from sc3d.metrics import Confusion, EvaluationPixels, depth_edge_band, total
+from sc3d.scene.class_table import OTHER, parse_classes
+
+TABLE = parse_classes(
+    [{"id": n, "name": name, "color": [n, 0, 0]} for n, name in ((1, "road"), (2, "tree"), (3, "car"))], "x"
+)
 
 
 def test_hand_made_matrix():
@@ -95,6 +100,60 @@ def test_judged_pixels_equal_the_confusion_of_images():
         and (values[pixels.rows >= 0] >= 0.5).all()
         and values.dtype == np.float32
     )
-    believed = pixels.reliability(label, np.full(50, 0.75, np.float32))
+    believed = pixels.reliability(label, np.full(50, 0.75, np.float32), 4)
     right, labelled = int(np.trace((near + elsewhere).counts)), int((near + elsewhere).counts[:, 1:].sum())
     assert believed.count[7] == labelled and believed.accuracy[7] == pytest.approx(right / labelled)
+
+
+def test_other_counts_in_precision_and_leaves_the_closed_figures():
+    truth = np.uint8([1, 1, 1, 1, 2, 2, OTHER, OTHER, OTHER, OTHER, 0, 0])
+    predicted = np.uint8([1, 1, 2, 0, 2, 1, 1, 1, 2, 0, 1, 0])
+    confusion = Confusion.from_labels(truth, predicted, 4)
+    closed = Confusion.from_labels(np.where(truth == OTHER, 0, truth), predicted, 4)
+    found, before = confusion.summary(TABLE), closed.summary(TABLE)
+    assert {key: found[key] for key in before if key not in ("precision", "other")} == {
+        key: before[key] for key in before if key not in ("precision", "other")
+    }
+    assert found["pixels"] == 6 and found["oa"] == pytest.approx(3 / 6)
+    assert found["precision"] == pytest.approx({"road": 2 / 5, "tree": 1 / 3})
+    assert before["precision"] == pytest.approx({"road": 2 / 3, "tree": 1 / 2})
+    assert found["recall"] == pytest.approx({"road": 2 / 4, "tree": 1 / 2})
+    assert found["other"] == {
+        "pixels": 4,
+        "given_class": pytest.approx(3 / 4),
+        "given": pytest.approx({"road": 2 / 4, "tree": 1 / 4}),
+    }
+    assert before["other"] == {"pixels": 0, "given_class": None, "given": {}}
+
+
+def test_open_set_against_scikit_learn():
+    metrics = pytest.importorskip("sklearn.metrics")
+    rng = np.random.default_rng(0)
+    truth, predicted = (rng.integers(0, 4, 5000).astype(np.uint8) for _ in range(2))
+    confusion = Confusion.from_labels(np.where(truth == 0, OTHER, truth).astype(np.uint8), predicted, 4)
+    for found, score in ((confusion.precision, "precision_score"), (confusion.recall, "recall_score")):
+        expected = getattr(metrics, score)(truth, predicted, average=None, labels=[1, 2, 3])
+        np.testing.assert_allclose(found[1:], expected)
+
+
+def test_other_alone_has_no_closed_figures():
+    confusion = Confusion.from_labels(np.full(4, OTHER, np.uint8), np.uint8([0, 0, 0, 3]), 4)
+    assert np.isnan([confusion.accuracy, confusion.mean_iou, confusion.coverage]).all()
+    assert confusion.other(TABLE) == {"pixels": 4, "given_class": 0.25, "given": {"car": 0.25}}
+    assert confusion.summary(TABLE)["precision"] == {"car": 0.0} and len(confusion.present) == 0
+
+
+def test_a_class_may_have_the_id_of_other():
+    truth = np.uint8([OTHER, OTHER, 1])
+    confusion = Confusion.from_labels(truth, np.uint8([OTHER, 1, 1]), OTHER + 1)
+    assert confusion.counts[OTHER, OTHER] == confusion.counts[OTHER, 1] == 1 and not confusion.counts[0].any()
+
+
+def test_reliability_with_and_without_other():
+    truth, rows = np.uint8([[1, 1, OTHER, OTHER]]), np.int32([[0, 1, 0, -1]])
+    pixels = EvaluationPixels.from_photo(truth, rows, np.zeros((1, 4), bool))
+    label, confidence = np.uint8([1, 2]), np.float32([0.75, 0.75])
+    closed = pixels.reliability(label, confidence, 4)
+    everywhere = pixels.reliability(label, confidence, 4, other=True)
+    assert closed.count.sum() == 2 and closed.ece == pytest.approx(0.25)
+    assert everywhere.count.sum() == 3 and everywhere.ece == pytest.approx(0.75 - 1 / 3)

@@ -32,11 +32,14 @@ def main(command: Run) -> None:
     if command.classes is not None:
         with atomic_path(scene.classes) as temporary:
             shutil.copyfile(command.classes, temporary)
-    stages = [
+    surface: list[tuple[str, object]] = [
         ("depth", command.depth),
         ("train", command.train),
         ("extract", command.extract),
-        ("segment", replace(segment, refine=False)),
+    ]
+    masks: list[tuple[str, object]] = [("segment", replace(segment, refine=False))]
+    stages = [
+        *(masks + surface if _masks_first(scene, command) else surface + masks),
         *([("segment", Segment(refine=True))] if segment.refine else []),
         ("label", command.label),
         ("propagate", command.propagate),
@@ -47,6 +50,12 @@ def main(command: Run) -> None:
     for name, settings in [*stages, ("report", Report())]:
         execute(name, scene, settings, command.overwrite)
     logger.info("run: %.0f s; look at %s", time.perf_counter() - started, scene.report)
+
+
+def _masks_first(scene: Scene, command: Run) -> bool:
+    """Whether depth takes the sky of the masks."""
+    other = command.depth.sky_masks is not None or command.depth.ignore_masks
+    return not other and bool(scene.class_table().without_surface)
 
 
 def check(command: Run, segment: Segment) -> None:
@@ -69,5 +78,11 @@ def check(command: Run, segment: Segment) -> None:
             )
         source = mask_source(segment, masks) if segment.masks else MaskFiles(masks, "index")
         check_masks(source, sizes, class_table, segment.confidence, command.photos)
+    if command.extract.crop > len(sizes):
+        raise InputError(f"--extract.crop {command.extract.crop}: there are only {len(sizes)} photos")
+    if command.depth.sky_masks is not None:
+        from sc3d.stereo.given_sky import read_given_sky
+
+        read_given_sky(command.depth.sky_masks, sizes, class_table, command.photos)
     if command.truth is not None:
-        match_masks(command.truth, sizes, class_table, photos=command.photos)
+        match_masks(command.truth, sizes, class_table, photos=command.photos, truth=True)

@@ -13,7 +13,7 @@ from sc3d.stereo.pinhole_pairs import stacked, transfers
 MARGIN = 0.03  # share of the depth by which a surface must lie behind to be another one
 Prepared = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 AROUND = 5  # px: outlines and ground at grazing angles are not surer
-MIN_COSINE = 0.2  # between ray and normal; flatter, MARGIN grows no more
+MIN_COSINE = 0.08  # between ray and normal; flatter, MARGIN grows no more
 STEPS = 128  # depths tried along a ray
 
 

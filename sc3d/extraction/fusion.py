@@ -12,6 +12,7 @@ import open3d as o3d
 from tqdm import tqdm
 
 from sc3d.errors import Sc3dError
+from sc3d.extraction.crop import cropped
 from sc3d.extraction.evidence import DepthViews, EvidenceStore
 from sc3d.extraction.free_space import MARGIN, count_opposed, farthest_free
 from sc3d.geometry.cameras import View
@@ -25,7 +26,7 @@ MIN_PART = 100  # triangles; smaller components are floaters
 ROUNDS = 4  # of completion, each with every fourth view
 NUM_OTHERS = 12  # views asked whether they look through a point
 NEAREST = 0.1  # of the nearest usual depth: occluders are nearer
-BEYOND = 20.0  # times the farthest usual depth: ground beyond what is known is no occluder
+BEYOND = 20.0  # times the farthest usual depth: where nobody looks through there, nothing tells how far it is
 UNLIKE = 0.98  # quantile of the color differences on confirmed surface; more is something else
 BESIDE = 0.1  # of the longest side
 OCCLUDER = 2e-3  # of the pixels, smallest region that is taken for one
@@ -44,6 +45,8 @@ class Surfaces:
     Shares of all pixels. confirmed: depth confirmed by other views; continued: added as it continues
     confirmed surface; occluders: added before it at the farthest depth that no other view looks through; sky;
     coverage: ray hits the mesh
+
+    cropped: share of the mesh's area that too few views see and that is left out
     """
 
     mesh: o3d.t.geometry.TriangleMesh
@@ -54,10 +57,14 @@ class Surfaces:
     occluders: float
     sky: float
     coverage: float
+    cropped: float = 0.0
 
 
-def fuse_views(data: DepthViews, store: EvidenceStore, voxel_size: float, fill: Fill) -> Surfaces:
-    """Fuse what is confirmed, then add what only one view shows, as far as `fill` allows.
+def fuse_views(
+    data: DepthViews, store: EvidenceStore, voxel_size: float, fill: Fill, crop: int = 0
+) -> Surfaces:
+    """Fuse what is confirmed, then add what only one view shows, as far as `fill` allows, then leave out what
+    fewer than `crop` views see.
 
     voxel_size: world units. Raises Sc3dError where nothing is confirmed.
     """
@@ -73,11 +80,12 @@ def fuse_views(data: DepthViews, store: EvidenceStore, voxel_size: float, fill: 
                 part, share = _added(data, store, surface, row, steps[name], voxel_size)
                 parts.append(part)
                 shares[name] += share / len(data.views)
-    mesh, cloud = _joined(parts)
-    sky = float(np.mean([store.read(row, "sky").mean() for row in range(len(data.views))]))
-    return Surfaces(
-        mesh, cloud, voxel_size, confirmed, **shares, sky=sky, coverage=_coverage(mesh, data.views)
-    )
+    (mesh, cloud), left_out = _joined(parts), 0.0
+    if crop:
+        (mesh, cloud), left_out = cropped((mesh, cloud), _surface(mesh), data, store, voxel_size, crop)
+    shares["sky"] = float(np.mean([store.read(row, "sky").mean() for row in range(len(data.views))]))
+    coverage = _coverage(mesh, data.views)
+    return Surfaces(mesh, cloud, voxel_size, confirmed, **shares, coverage=coverage, cropped=left_out)
 
 
 def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[DepthFusion, float]:
@@ -151,7 +159,7 @@ def _added(
     first = first_surface(surface, view)
     hit = np.where(np.isfinite(first.range), first.range * first.ray_z, np.inf).astype(np.float32)
     depth, normals = step(data, store, row, hit)
-    wanted = (depth > 0) & (depth < (1 - MARGIN) * hit)
+    wanted = (depth > 0) & (depth < (1 - MARGIN) * hit) & ~store.read(row, "sky")
     squares, centers = pixel_squares(view, depth, data.image(row), wanted, normals)
     if len(centers.point.positions):
         centers = cloud_in_order(centers.voxel_down_sample(voxel_size))
@@ -179,11 +187,13 @@ def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
         empty &= opaque
     known = store.read(row, "known")
     as_known = np.abs(known / np.where(np.isfinite(hit), hit, 1) - 1) < MARGIN
-    covered = _unlike_surface(data, store, row, (known > 0) & np.isfinite(hit) & as_known)
+    covered = _unlike_surface(data, store, row, (known > 0) & np.isfinite(hit) & as_known, np.isfinite(hit))
     empty = _large(empty | covered) & empty  # a few pixels at a border say nothing
-    far = np.where(covered, (1 - MARGIN) * hit, np.where(empty, BEYOND * data.depth_range[1], 0))
-    far = far.astype(np.float32)
     others, nearest = _others(data, store, row), NEAREST * data.depth_range[0]
+    beyond = np.where(empty & ~covered, np.float32(BEYOND * data.depth_range[1]), np.float32(0))
+    toward = np.broadcast_to(np.array([0, 0, -1], np.float32), (*hit.shape, 3))
+    inside = count_opposed(beyond, toward, view, *others) > 0
+    far = np.where(covered, (1 - MARGIN) * hit, np.where(inside, data.depth_range[1], 0)).astype(np.float32)
     depth = farthest_free(far, nearest, view, *others)
     depth = cv2.medianBlur(depth, 5)
     depth = np.where(empty & (depth == 0), _spread(depth, data.image(row)), depth)
@@ -200,17 +210,21 @@ def _spread(depth: np.ndarray, image: np.ndarray) -> np.ndarray:
     return np.where((source >= 0) & (gap < BESIDE * max(depth.shape)), depth.ravel()[source], 0)
 
 
-def _unlike_surface(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray) -> np.ndarray:
+def _unlike_surface(
+    data: DepthViews, store: EvidenceStore, row: int, known: np.ndarray, hit: np.ndarray
+) -> np.ndarray:
     """(H, W) bool: regions in which the photo does not look like the surface behind: something is before it.
 
-    The measure is how the two differ where this view confirms the surface.
+    The measure is how the two differ where this view confirms the surface. What continues it has no look of its
+    own and goes with the more alike of what is confirmed and what is not. known, hit: (H, W) bool, the
+    confirmed surface, any surface
     """
-    confirmed = (store.read(row, "confirmed") > 0) & hit
+    confirmed = (store.read(row, "confirmed") > 0) & known
     if not confirmed.any():
         return np.zeros_like(hit)
     photo, shown = data.image(row).astype(np.float32), store.read(row, "colors").astype(np.float32)
     gap = np.abs(cv2.blur(photo, (9, 9)) - cv2.blur(shown, (9, 9))).max(axis=2)
-    unlike = hit & ~confirmed & (gap > np.quantile(gap[confirmed], UNLIKE))
+    unlike = known & ~confirmed & (gap > np.quantile(gap[confirmed], UNLIKE))
     seeds = _large(unlike)
     source, _ = nearest_by_color(data.image(row), seeds | confirmed | ~hit)
     return seeds.ravel()[source] & hit & ~confirmed

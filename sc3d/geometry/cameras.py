@@ -13,6 +13,10 @@ import cv2
 import numpy as np
 import pycolmap
 
+GROWN = 0.1  # of each side of the view without empty borders
+LEAST_COSINE = 0.1  # between the optical axis and the photo's border, where a pinhole view can show that
+SUBPIXEL = 4  # bits
+
 
 @dataclass(frozen=True)
 class View:
@@ -77,13 +81,14 @@ class View:
 
     @cached_property
     def _border_rays(self) -> np.ndarray:
+        """Of the pixels' corners once around the image."""
         columns, rows = np.arange(0, self.width + 1), np.arange(0, self.height + 1)
         border = np.concatenate(
             [
                 np.stack([columns, np.zeros_like(columns)], 1),
-                np.stack([columns, np.full_like(columns, self.height)], 1),
-                np.stack([np.zeros_like(rows), rows], 1),
                 np.stack([np.full_like(rows, self.width), rows], 1),
+                np.stack([columns[::-1], np.full_like(columns, self.height)], 1),
+                np.stack([np.zeros_like(rows), rows[::-1]], 1),
             ]
         )
         return _unit_rays(self.camera, border.astype(np.float64))
@@ -210,20 +215,57 @@ def may_see(view: View, low: np.ndarray, high: np.ndarray) -> bool:
 
 
 def undistorted(view: View, max_size: int | None = None) -> View:
-    """A pinhole view of the same pose, with the largest field of view that has no empty borders, longest side
-    at most `max_size` px.
+    """A pinhole view of the same pose that shows the whole photo, or at least what lies up to GROWN of a side
+    around the largest field of view without empty borders, longest side at most `max_size` px. See `in_photo`.
     """
     if view.camera.is_undistorted():
         pinhole = view
     else:
         options = pycolmap.UndistortCameraOptions()
         options.blank_pixels = 0.0
-        pinhole = replace(view, camera=pycolmap.undistort_camera(options, view.camera))
+        pinhole = _grown(view, replace(view, camera=pycolmap.undistort_camera(options, view.camera)))
     longest = max(pinhole.width, pinhole.height)
     if max_size is None or longest <= max_size:
         return pinhole
     scale = max_size / longest
     return pinhole.resized(max(1, round(pinhole.width * scale)), max(1, round(pinhole.height * scale)))
+
+
+def in_photo(view: View, target: View) -> np.ndarray | None:
+    """(H, W) bool pixels of `target`, a pinhole view of the same pose, that the photo of `view` shows; None if
+    all are.
+    """
+    outline = None if view.camera.is_undistorted() else _outline(view, target)
+    if outline is None:
+        return None
+    inside = np.zeros((target.height, target.width), np.uint8)
+    fixed = np.round((outline - 0.5) * 2**SUBPIXEL).astype(np.int32)  # cv2: pixel center = integer
+    cv2.fillPoly(inside, [fixed], 1, shift=SUBPIXEL)
+    return None if inside.all() else inside > 0
+
+
+def _grown(view: View, pinhole: View) -> View:
+    """A field of view without empty borders, enlarged to that of the photo by at most GROWN of each side."""
+    outline = _outline(view, pinhole)
+    if outline is None:
+        return pinhole
+    size = np.array([pinhole.width, pinhole.height])
+    low = np.floor(np.clip(outline.min(axis=0), -GROWN * size, 0))
+    high = np.ceil(np.clip(outline.max(axis=0), size, (1 + GROWN) * size))
+    (width, height), (focal_x, focal_y) = (high - low).astype(int), np.diag(pinhole.matrix)[:2]
+    calibration = (focal_x, focal_y, *(pinhole.matrix[:2, 2] - low))
+    return pinhole_view(view.name, (int(width), int(height)), calibration, view.cam_from_world)
+
+
+def _outline(view: View, pinhole: View) -> np.ndarray | None:
+    """(N, 2) px where the border of the photo lies in a pinhole view of the same pose; None if it sees more
+    than that can show.
+    """
+    border = view._border_rays
+    if not (np.isfinite(border).all() and (border[:, 2] > LEAST_COSINE).all()):
+        return None
+    pixels = border @ pinhole.matrix.T
+    return pixels[:, :2] / pixels[:, 2:]
 
 
 def resample(image: np.ndarray, view: View, target: View, labels: bool = False) -> np.ndarray:

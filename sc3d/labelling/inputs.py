@@ -12,13 +12,14 @@ from typing import Literal
 import numpy as np
 import open3d as o3d
 
-from sc3d.errors import InputError, left_out
+from sc3d.errors import InputError, examples, left_out
 from sc3d.geometry.cameras import View, may_see
 from sc3d.io.clouds import read_cloud
 from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.labelling.density import GaussianField, gaussian_density, kernel_density
 from sc3d.labelling.observation import Mask
 from sc3d.scene.channels import Channels
+from sc3d.scene.class_table import ClassTable
 from sc3d.scene.frame_check import Box, box_of, check_frame, describe
 from sc3d.scene.labelled_cloud import spacing_of
 from sc3d.scene.scene import Scene
@@ -32,15 +33,22 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class Masks:
     """The masks of a scene: files by view name, confidence maps where there are any, the views that have a mask,
-    and the channels of the classes; without: names of the photos that have a camera and no mask.
+    and the classes; without: names of the photos that have a camera and no mask; none: unlabelled pixels are
+    evidence of none of the classes.
     """
 
     files: dict[str, Path]
     confidences: dict[str, Path]
     views: list[View]
     scene: Scene
-    channels: Channels
+    table: ClassTable
     without: tuple[str, ...] = ()
+    none: bool = False
+
+    @property
+    def channels(self) -> Channels:
+        """Of the classes that points can be of, and of none of them where unlabelled pixels are evidence."""
+        return replace(self.table.channels, none=self.none)
 
     @classmethod
     def load(
@@ -63,8 +71,7 @@ class Masks:
         views = scene.model.views
         masked = [view for view in views if view.name in files]
         without = tuple(view.name for view in views if view.name not in files)
-        channels = replace(table.channels, none=unlabelled == "evidence")
-        return cls(files, confidences, masked, scene, channels, without)
+        return cls(files, confidences, masked, scene, table, without, unlabelled == "evidence")
 
     def tell_of_left_out(self, low: np.ndarray, high: np.ndarray) -> None:
         """One line for each reason why photos do not vote, or not as others do. low, high: (3,) box of the
@@ -74,6 +81,9 @@ class Masks:
         away = [view.name for view in self.views if not may_see(view, low, high)]
         sure = [view.name for view in self.views if view.name not in self.confidences]
         tell_of_transparent({view.name: self.scene.photo(view.name) for view in self.views}, "do not vote")
+        if self.table.without_surface:
+            names = examples([entry.name for entry in self.table.without_surface])
+            logger.info("mask pixels of classes without surface do not vote: %s", names)
         if self.without:
             logger.info(left_out(self.without, count, "photos have no mask and do not vote"))
         if away:
@@ -82,12 +92,17 @@ class Masks:
             logger.warning(left_out(sure, count, "photos have no confidence map; their masks count as sure"))
 
     def read(self, view: View) -> Mask:
-        """As `fuse` wants it: channels, not ids."""
+        """As `fuse` wants it: channels, not ids; what shows no surface says nothing of the one behind its
+        outline.
+        """
         confidence = self.confidences.get(view.name)
         sure = None if confidence is None else self.scene.read_confidence(confidence, view.name)
         file = self.files[view.name]
-        mask = self.channels.from_ids(self.scene.read_mask(file, view.name), file)
-        return self.channels.with_none(mask, np.ones(mask.shape, bool)), sure
+        labels = self.scene.read_mask(file, view.name)
+        nothing = labels == 0
+        if self.table.without_surface:
+            labels = np.where(self.table.shows_no_surface(labels), np.uint8(0), labels)
+        return self.channels.with_none(self.channels.from_ids(labels, file), nothing), sure
 
     def size(self, view: View) -> tuple[int, int]:
         """(width, height) px of the mask of a view."""

@@ -16,6 +16,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.raster import Raster, highest_points, spacing_of_all
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.json_files import read_json
+from sc3d.report.charts import number
 from sc3d.runner import MAX_SIDECAR, sidecar
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene, find_masks
@@ -84,6 +85,12 @@ class ReportData:
         return evaluated_truth(self.scene)
 
     @cached_property
+    def zero_margin(self) -> float | None:
+        """How 0 in truth masks was read, as in `Scene.read_truth`."""
+        used = _evaluate_settings(self.scene)
+        return number(used.get("margin")) if used.get("truth_zero") == "other" else None
+
+    @cached_property
     def truth_files(self) -> dict[str, Path]:
         """Truth masks by photo name."""
         return find_masks(self.truth, self.scene.photo_names, strict=False)
@@ -122,13 +129,17 @@ def load_report_data(scene: Scene) -> ReportData:
 
 def evaluated_truth(scene: Scene) -> Path:
     """The folder of truth masks that metrics.json was made with, else the scene's own."""
+    told = _evaluate_settings(scene).get("truth")
+    return scene.path / told if isinstance(told, str) and (scene.path / told).is_dir() else scene.truth
+
+
+def _evaluate_settings(scene: Scene) -> dict[str, Any]:
+    """What metrics.json was made with; empty if that is not known."""
     with suppress(InputError):
         record: Any = read_json(sidecar(scene.metrics), MAX_SIDECAR)
         used = record.get("settings") if isinstance(record, dict) else None
-        told = used.get("truth") if isinstance(used, dict) else None
-        if isinstance(told, str) and (scene.path / told).is_dir():
-            return scene.path / told
-    return scene.truth
+        return used if isinstance(used, dict) else {}
+    return {}
 
 
 def sidecar_files(folder: Path) -> list[Path]:

@@ -82,7 +82,11 @@ def comparison(data: ReportData, view: View, labelled: LabelledSurface | None) -
         if caption == "fused labels" and labelled is not None:
             labels, _ = labelled.see(view, size)
         elif file is not None:
-            labels = cv2.resize(scene.read_mask(file, view.name), size, interpolation=cv2.INTER_NEAREST)
+            if caption == "truth":
+                labels = scene.read_truth(file, view.name, data.zero_margin)
+            else:
+                labels = scene.read_mask(file, view.name)
+            labels = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
         else:
             continue
         panels.append((caption, data_uri(palette[labels], ".png")))

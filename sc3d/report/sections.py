@@ -23,6 +23,7 @@ from sc3d.report.charts import (
 )
 from sc3d.report.data import ReportData, class_areas, read_features
 from sc3d.report.images import cloud_pictures, comparison, ground_picture
+from sc3d.scene.class_table import OTHER
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.view.colors import STATES, Coloring, color_points, confidence_colors, legend_entries
 
@@ -36,6 +37,16 @@ _COLORING_NAMES: dict[Coloring | Literal["mesh"], str] = {
 }
 # file names of `sc3d export --format objects`, and what they hold
 _LAYERS = {"buildings": "buildings", "trees": "trees"}
+# columns of the table of photos that were held out, their names in the summary of `train`, and formats
+_HELD_OUT = {
+    "Photos": ("photos", ".0f"),
+    "PSNR, dB": ("psnr", ".2f"),
+    "SSIM": ("ssim", ".3f"),
+    "Seen": ("seen", ".1%"),
+    "PSNR where seen": ("seen_psnr", ".2f"),
+    "SSIM where seen": ("seen_ssim", ".3f"),
+    "Depth right where seen": ("seen_depth", ".1%"),
+}
 _BLOCKS = {
     "settings": "Settings",
     "summary": "Results",
@@ -89,6 +100,10 @@ def headline(data: ReportData) -> str:
                     "" if before is None else f"given masks {pattern.format(before)}",
                 )
             )
+    given, before = given_class(labels), given_class(masks)
+    if given is not None:
+        note = "" if before is None else f"; given masks {before:.1%}"
+        tiles.append(("Other", f"{given:.1%}", f"of the pixels of no class are given one{note}"))
     coverage, counts = number(labels.get("coverage")), data.label_counts
     if coverage is not None:
         tiles.append(("Coverage", f"{coverage:.1%}", "of the pixels carry a label"))
@@ -147,7 +162,53 @@ def quality_section(data: ReportData) -> str:
     )
     if near is not None and elsewhere is not None:
         note += f" Near depth edges {near:.1%} of the pixels are right, elsewhere {elsewhere:.1%}."
-    return f'<p class="note">{note}</p>{paired_bars(rows)}{_confusion(data)}'
+    note += _told_of_empty(data)
+    return f'<p class="note">{note}</p>{paired_bars(rows)}{_all_judged(data)}{_confusion(data)}'
+
+
+def given_class(figures: dict) -> float | None:
+    """Share of the pixels of no class that are given one; None where the truth marks none."""
+    other = figures.get("other")
+    return number(other.get("given_class")) if isinstance(other, dict) else None
+
+
+def _all_judged(data: ReportData) -> str:
+    """Precision and recall over all judged pixels, and what the pixels of no class were taken for."""
+    sources = {"labels": "fused labels", "masks": "given masks"}
+    shares = {
+        source: {name: of_classes(data.figures(source), name) for name in ("precision", "recall")}
+        for source in sources
+        if data.figures(source).get("precision")
+    }
+    given = {source: given_class(data.figures(source)) for source in shares}
+    if given.get("labels") is None:
+        return ""
+    columns = [found[name] for found in shares.values() for name in ("precision", "recall")]
+    taken = [of_classes(data.figures(source).get("other"), "given") for source in shares]
+    rows = [
+        [escape(name), *(formatted(values.get(name), ".1%") for values in [*columns, *taken])]
+        for name in _class_colors(data)
+        if any(name in values for values in [*columns, *taken])
+    ]
+    heads = [f"{name}, {sources[source]}" for source in shares for name in ("Precision", "Recall")]
+    heads += [f"Share of other, {sources[source]}" for source in shares]
+    told = "; ".join(f"{sources[source]}: {formatted(share, '.1%')}" for source, share in given.items())
+    return (
+        f'<h3>All judged pixels</h3><p class="note">With pixels that are none of the classes. '
+        f"Of these are given a class: {told}.</p>{_table(['Class', *heads], rows)}"
+    )
+
+
+def _told_of_empty(data: ReportData) -> str:
+    """A sentence on the truth of classes without surface; empty if there is none."""
+    found, parts = data.metrics.get("without_surface"), []
+    for name, counts in found.items() if isinstance(found, dict) else ():
+        pixels, right = (
+            number(counts.get(key)) if isinstance(counts, dict) else None for key in ("pixels", "right")
+        )
+        if pixels and right is not None:
+            parts.append(f"{escape(str(name))} {right / pixels:.1%} of {pixels:,.0f} pixels")
+    return f" Judged apart, nothing is hit: {', '.join(parts)}." if parts else ""
 
 
 def photo_section(data: ReportData) -> str:
@@ -184,14 +245,40 @@ def flight_section(data: ReportData) -> str:
 
 
 def training_section(data: ReportData) -> str:
-    """The contact sheet of the training."""
+    """The contact sheet of the training, and how it did on the photos that it left out."""
     if not data.contact_sheet_file.exists():
-        return ""
+        return _held_out_table(data)
     text = "Photos of the flight, and the Gaussians seen by the same cameras: rendering, depth and normals"
     return (
         f'<p class="note">{text}. Where a rendering is blurred, or its depth stands out from its surroundings, too few photos overlap.</p>'
         f'<figure><img src="{data_uri(read_image(data.contact_sheet_file))}" alt="{text}"></figure>'
+        + _held_out_table(data)
     )
+
+
+def _held_out_table(data: ReportData) -> str:
+    """Means over the photos that were not trained on, by why they were not."""
+    record = next((record for record in data.records if record["stage"] == "train"), {})
+    settings, summary = (
+        found if isinstance(found := record.get(key), dict) else {} for key in ("settings", "summary")
+    )
+    every, share = number(settings.get("test_every")), number(settings.get("test_sector"))
+    rows = []
+    for prefix, name in (
+        ("held_out_", f"Between others: one of every {formatted(every, '.0f')}"),
+        ("held_out_sector_", f"Beyond others: a sector of {formatted(share, '.0%')}"),
+    ):
+        if number(summary.get(f"{prefix}photos")) is not None:
+            figures = [formatted(number(summary.get(prefix + key)), form) for key, form in _HELD_OUT.values()]
+            rows.append([name, *figures])
+    if not rows:
+        return ""
+    note = (
+        "Photos that the training did not use, with the brightness that fits best; means over the photos. Seen: pixels that show what at least two "
+        "photos of the training see, judged by the sparse points around; of the rest, nothing can be known. Depth: share of the seen pixels of known "
+        "depth at which it is rendered within 1 %. Per photo: held_out.csv."
+    )
+    return f'<h3>Held out</h3><p class="note">{note}</p>{_table(["Photos left out", *_HELD_OUT], rows)}'
 
 
 def _choose_views(data: ReportData) -> list:
@@ -219,7 +306,10 @@ def _photo_figures(data: ReportData, name: str) -> str:
         for key, text in sources.items()
         if isinstance(figures.get(key), dict)
     ]
-    return " ".join(f"<small>{text} {value:.1%} right</small>" for text, value in found if value is not None)
+    told = [f"{text} {value:.1%} right" for text, value in found if value is not None]
+    given = given_class(figures["labels"]) if isinstance(figures.get("labels"), dict) else None
+    told += [] if given is None else [f"{given:.1%} of other given a class"]
+    return " ".join(f"<small>{text}</small>" for text in told)
 
 
 def _legend(data: ReportData, by: Coloring | Literal["mesh"], everything: bool = False) -> str:
@@ -232,6 +322,8 @@ def _legend(data: ReportData, by: Coloring | Literal["mesh"], everything: bool =
     values = data.values(by) if by in ("label", "state") else None
     present = None if values is None or everything else set(np.unique(values).tolist())
     entries = legend_entries(by, data.class_table, present)
+    if everything and given_class(data.figures("labels")) is not None:
+        entries += legend_entries(by, data.class_table, {OTHER})
     items = "".join(
         f'<li><i style="background:{css_color(color)}"></i>{escape(name)}</li>' for name, color in entries
     )
@@ -291,7 +383,12 @@ def found_section(data: ReportData) -> str:
 
 def iou_of(data: ReportData, source: str) -> dict[str, float | None]:
     """IoU by class name of "labels" or "masks"; empty without metrics."""
-    found = data.figures(source).get("iou")
+    return of_classes(data.figures(source), "iou")
+
+
+def of_classes(figures: object, key: str) -> dict[str, float | None]:
+    """A figure by class name; empty if there is none."""
+    found = figures.get(key) if isinstance(figures, dict) else None
     return {str(name): number(value) for name, value in found.items()} if isinstance(found, dict) else {}
 
 

@@ -17,12 +17,14 @@ from sc3d.scene.channels import Channels
 # in names: they would act on terminals, or cannot be written
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 MAX_NAME, MAX_BYTES = 200, 1 << 20
+# in truth masks, unless a class has one of these ids: looked at and none of the classes; not to be judged
+OTHER, UNJUDGED = 254, 255
 
 
 @dataclass(frozen=True)
 class SemanticClass:
     """One class. id: 1 to 255 (0 is reserved: unlabelled); color: RGB uint8; prompts: texts for segmenters;
-    asprs: LAS class code.
+    asprs: LAS class code; surface: False for what masks may show and no point can be, such as the sky.
     """
 
     id: int
@@ -30,6 +32,7 @@ class SemanticClass:
     color: tuple[int, int, int]
     prompts: tuple[str, ...] = ()
     asprs: int = 1
+    surface: bool = True
 
 
 @dataclass(frozen=True)
@@ -50,24 +53,38 @@ class ClassTable:
         return self.classes[-1].id + 1
 
     @property
+    def leaves_other(self) -> bool:
+        """Whether truth masks may hold `OTHER` and `UNJUDGED`: no class has one of these ids."""
+        return self.num_ids <= OTHER
+
+    @property
     def channels(self) -> Channels:
-        """Of votes for these classes."""
-        return Channels.of_classes([entry.id for entry in self.classes])
+        """Of votes for these classes, as far as a point can be of them."""
+        return Channels.of_classes([entry.id for entry in self.classes if entry.surface])
+
+    @property
+    def without_surface(self) -> tuple[SemanticClass, ...]:
+        """The classes that no point can be of."""
+        return tuple(entry for entry in self.classes if not entry.surface)
+
+    def shows_no_surface(self, labels: np.ndarray) -> np.ndarray:
+        """Bool, of the shape of `labels` (uint8 ids): of a class without surface."""
+        return np.isin(labels, [entry.id for entry in self.without_surface])
 
     @property
     def palette(self) -> np.ndarray:
-        """(256, 3) uint8 RGB per id; unlabelled is dark gray."""
+        """(256, 3) uint8 RGB per id; unlabelled is dark gray, other of truth masks a lighter one."""
         palette = np.zeros((256, 3), np.uint8)
-        palette[0] = 60
+        palette[0], palette[OTHER] = 60, 105
         for entry in self.classes:
             palette[entry.id] = entry.color
         return palette
 
     def name(self, label: int) -> str:
-        """Name of an id; "unlabelled" for 0."""
+        """Name of an id; "unlabelled" for 0, "other" for `OTHER` of truth."""
+        rest = {0: "unlabelled"} | ({OTHER: "other"} if self.leaves_other else {})
         return next(
-            (entry.name for entry in self.classes if entry.id == label),
-            "unlabelled" if label == 0 else f"class {label}",
+            (entry.name for entry in self.classes if entry.id == label), rest.get(label, f"class {label}")
         )
 
     def find(self, name: str) -> int | None:
@@ -84,8 +101,15 @@ class ClassTable:
         return sorted({int(label) for label in present} - {0} - {entry.id for entry in self.classes})
 
     def as_json(self) -> list[dict]:
-        """The list that `classes.json` holds."""
-        return [asdict(entry) for entry in self.classes]
+        """The list that `classes.json` holds; `surface` where it is not what the name says."""
+        return [
+            {
+                key: value
+                for key, value in asdict(entry).items()
+                if key != "surface" or value != _usual_surface(entry.name)
+            }
+            for entry in self.classes
+        ]
 
 
 def read_classes(path: Path) -> ClassTable:
@@ -108,6 +132,10 @@ def parse_classes(entries: object, origin: Path | str) -> ClassTable:
         doubled = sorted({value for value in values if values.count(value) > 1})
         if doubled:
             raise InputError(f"{origin}: {key} {doubled[0]!r} is used twice")
+    if not any(entry.surface for entry in classes):
+        raise InputError(
+            f"{origin}: no class has a surface, so that no point can get a label: add one that has"
+        )
     return ClassTable(classes)
 
 
@@ -138,7 +166,15 @@ def _parse_class(entry: object, origin: Path | str) -> SemanticClass:
         )
     if not _is_int(asprs, 0, 255):
         raise InputError(f"{origin}: asprs code of class {label} must be a whole number from 0 to 255")
-    return SemanticClass(label, name.strip(), tuple(color), tuple(prompts), asprs)
+    surface = entry.get("surface", _usual_surface(name))
+    if not isinstance(surface, bool):
+        raise InputError(f"{origin}: surface of class {label} must be true or false")
+    return SemanticClass(label, name.strip(), tuple(color), tuple(prompts), asprs, surface)
+
+
+def _usual_surface(name: str) -> bool:
+    """Whether a class has a surface where the table does not say so."""
+    return name.strip().casefold() != "sky"
 
 
 def _whole(value: object) -> object:

@@ -19,7 +19,7 @@ import numpy as np
 
 from sc3d.errors import InputError
 from sc3d.io.mask_images import IndexImage, is_indexed, read_channels, read_samples
-from sc3d.scene.class_table import ClassTable
+from sc3d.scene.class_table import OTHER, UNJUDGED, ClassTable
 
 UNKNOWN = -1
 BLACK = 0
@@ -31,10 +31,12 @@ class Meanings:
 
     by_id: (256 or more,) int16 class id per value, UNKNOWN where there is none
     by_color: class id per color 0xRRGGBB
+    truth: the values `OTHER` and `UNJUDGED` stand for themselves
     """
 
     by_id: np.ndarray
     by_color: Mapping[int, int]
+    truth: bool = False
 
     @cached_property
     def color_table(self) -> np.ndarray:
@@ -74,6 +76,34 @@ def meanings_of(table: ClassTable) -> Meanings:
         return Meanings(by_id, {})
     # the table shows unlabelled pixels in a dark gray, and so do pictures made with it
     return Meanings(by_id, {BLACK: 0, color_code(table.palette[0]): 0} | colors)
+
+
+def meanings_of_truth(table: ClassTable) -> Meanings:
+    """As `meanings_of`, for truth masks: with `OTHER` and `UNJUDGED`, unless classes have these ids."""
+    found = meanings_of(table)
+    if not table.leaves_other:
+        return found
+    found.by_id[[OTHER, UNJUDGED]] = OTHER, UNJUDGED
+    return Meanings(found.by_id, found.by_color, truth=True)
+
+
+def judged_labels(labels: np.ndarray, table: ClassTable, zero_margin: float | None) -> np.ndarray:
+    """What is judged of a truth mask: class ids and `OTHER`; 0 = not judged.
+
+    labels: (H, W) uint8 as `read_labels` gives them
+    zero_margin: 0 counts as `OTHER` where it is farther than this from all classes, px; None = nowhere
+    """
+    if not table.leaves_other:
+        return labels
+    if zero_margin is not None:
+        import cv2
+
+        free = (labels == 0) | (labels >= OTHER)
+        away = np.full(labels.shape, np.inf)
+        if not free.all():
+            away = cv2.distanceTransform(free.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        labels = np.where((labels == 0) & (away > zero_margin), OTHER, labels)
+    return np.where(labels == UNJUDGED, 0, labels).astype(np.uint8)
 
 
 def color_code(color: np.ndarray | tuple[int, ...]) -> int:
@@ -130,6 +160,8 @@ def read_values(path: Path, meanings: Meanings, format: str = "auto") -> Values:
     used = np.flatnonzero(np.bincount(image.samples.ravel(), minlength=256))
     readings = _readings(image, meanings)
     fitting = {name: found for name, found in readings.items() if (found[used] != UNKNOWN).all()}
+    if meanings.truth:
+        fitting = {name: found for name, found in fitting.items() if _says(found[used])} or fitting
     if len({found[used].tobytes() for found in fitting.values()}) > 1:
         if "colors" not in fitting or not _is_table(image, meanings):
             raise _ambiguous(path, "palette" if image.palette is not None else "gray levels")
@@ -154,9 +186,16 @@ def _read_channels(path: Path, meanings: Meanings, format: str) -> Values:
     colors = _colors(path, pixels, meanings)
     by_id, by_color = ids.labels, colors.labels
     strange = [np.count_nonzero(labels == UNKNOWN) for labels in (by_id, by_color)]
+    if meanings.truth and not strange[1] and not _says(by_id):
+        return colors
     if strange == [0, 0] and (by_id != by_color).any():
         raise _ambiguous(path, "colors")
     return ids if strange[0] < strange[1] else colors
+
+
+def _says(labels: np.ndarray) -> bool:
+    """Whether a reading of truth is more than 0 and `UNJUDGED`, as of any black-and-white picture."""
+    return bool(((labels != 0) & (labels != UNJUDGED)).any())
 
 
 def _colors(path: Path, pixels: np.ndarray, meanings: Meanings) -> Values:

@@ -16,8 +16,15 @@ from sc3d.io.limits import FARTHEST, MAX_MASK_PIXELS
 from sc3d.io.mask_images import index_image_size, mask_orientation, turned_onto
 from sc3d.io.orientation import turned_size
 from sc3d.io.photo_folder import broken_link, find_photos, list_photos, require_within
-from sc3d.scene.class_table import CONTROL, ClassTable, read_classes
-from sc3d.scene.mask_values import Meanings, meanings_of, read_confidence, read_labels
+from sc3d.scene.class_table import CONTROL, OTHER, UNJUDGED, ClassTable, read_classes
+from sc3d.scene.mask_values import (
+    Meanings,
+    judged_labels,
+    meanings_of,
+    meanings_of_truth,
+    read_confidence,
+    read_labels,
+)
 from sc3d.scene.photo_names import PhotoNames, files_of_photos, photo_name
 
 if TYPE_CHECKING:
@@ -155,10 +162,17 @@ class Scene:
         return read_image(self.photo(name), self.images)
 
     def read_mask(self, file: Path, name: str) -> np.ndarray:
-        """(H, W) uint8 class ids of a mask or truth mask of a photo, in the photo's frame as stored, 0 where
-        the photo is transparent.
+        """(H, W) uint8 class ids of a mask of a photo, in the photo's frame as stored, 0 where the photo is
+        transparent.
         """
         return self._onto_photo(read_labels(file, self._meanings), file, name)
+
+    def read_truth(self, file: Path, name: str, zero_margin: float | None = None) -> np.ndarray:
+        """(H, W) uint8 of a truth mask of a photo, in the photo's frame as stored: ids and `OTHER`; 0 = not
+        judged, as where the photo is transparent. zero_margin: as in `judged_labels`
+        """
+        table, meanings = self._truth_meanings
+        return self._onto_photo(judged_labels(read_labels(file, meanings), table, zero_margin), file, name)
 
     def read_confidence(self, file: Path, name: str) -> np.ndarray:
         """(H, W) uint8 of a confidence map, as `read_mask`."""
@@ -167,6 +181,11 @@ class Scene:
     @cached_property
     def _meanings(self) -> Meanings:
         return meanings_of(self.class_table())
+
+    @cached_property
+    def _truth_meanings(self) -> tuple[ClassTable, Meanings]:
+        table = self.class_table()
+        return table, meanings_of_truth(table)
 
     def _onto_photo(self, pixels: np.ndarray, file: Path, name: str) -> np.ndarray:
         mask, opaque = turned_onto(pixels, file, self.photo(name)), self._opaque(name)
@@ -183,12 +202,15 @@ class Scene:
 
     def opaque_pixels(self, view: View, target: View) -> np.ndarray | None:
         """(H, W) bool pixels of `target`, a view of the same pose, that lie in the photo of `view` and are
-        opaque there; None if the photo has no transparent pixels.
+        opaque there; None if all are.
         """
-        from sc3d.geometry.cameras import resample
+        from sc3d.geometry.cameras import in_photo, resample
 
-        opaque = self._opaque(view.name)
-        return None if opaque is None else resample(opaque.astype(np.uint8), view, target, labels=True) > 0
+        opaque, inside = self._opaque(view.name), in_photo(view, target)
+        if opaque is None:
+            return inside
+        shown = resample(opaque.astype(np.uint8), view, target, labels=True) > 0
+        return shown if inside is None else shown & inside
 
     def _opaque(self, name: str) -> np.ndarray | None:
         photo = self.photo(name)
@@ -219,15 +241,17 @@ class Scene:
         found = {name: others.same_letters(name) for name in missing}
         return {name: photos[0] for name, photos in found.items() if len(photos) == 1}
 
-    def mask_files(self, folder: Path, class_table: ClassTable | None = None) -> dict[str, Path]:
-        """Masks (or truth masks, or confidence maps) of the views, by view name; all checked. Those of photos
-        without a camera are left out; `warn_of_unplaced` says so.
+    def mask_files(
+        self, folder: Path, class_table: ClassTable | None = None, truth: bool = False
+    ) -> dict[str, Path]:
+        """Masks (or truth masks: `truth`, or confidence maps) of the views, by view name; all checked. Those
+        of photos without a camera are left out; `warn_of_unplaced` says so.
 
         Raises InputError for an empty folder, a mask without a photo, one that fits several photos, another
         aspect than the photo, or ids outside the class table.
         """
         sizes = {view.name: (view.width, view.height) for view in self.model.views}
-        return match_masks(folder, sizes, class_table, self.photo_names, self.images)
+        return match_masks(folder, sizes, class_table, self.photo_names, self.images, truth)
 
     def mask_file(self, folder: Path, name: str) -> Path | None:
         """The mask of one photo in a folder, not looked into; None if there is none."""
@@ -334,10 +358,12 @@ def match_masks(
     class_table: ClassTable | None,
     names: PhotoNames | None = None,
     photos: Path | None = None,
+    truth: bool = False,
 ) -> dict[str, Path]:
     """Match the files of a folder of masks to photos and check them.
 
     photo_sizes: (width, height) px as stored by photo name; photos: their folder, for their EXIF orientation
+    truth: truth masks, which may hold `OTHER` and `UNJUDGED` beside the ids of the table
     names: all photos, of which those without a size are not checked and not returned; None = no others
     returns: path of the mask by photo name, for photos that have one
     """
@@ -350,7 +376,9 @@ def match_masks(
             f"none of the {len(found)} masks in {folder} is of a photo with a camera: "
             f"the model has {len(photo_sizes)}, such as {next(iter(photo_sizes), 'none')}"
         )
-    meanings, turns = None if class_table is None else meanings_of(class_table), list[str]()
+    meaning, turns = meanings_of_truth if truth else meanings_of, list[str]()
+    meanings = None if class_table is None else meaning(class_table)
+    reserved = {OTHER, UNJUDGED} if meanings is not None and meanings.truth else set[int]()
     for name, file in matched.items():
         require_within(file, folder)
         turn, assumed = mask_orientation(file, None if photos is None else photos / name)
@@ -358,14 +386,24 @@ def match_masks(
             turns.append(name)
         check_mask_aspect(file, turned_size(image_size(file), turn), photo_sizes[name])
         if class_table is not None and meanings is not None:
-            unknown = class_table.unknown(read_labels(file, meanings))
+            unknown = [
+                label for label in class_table.unknown(read_labels(file, meanings)) if label not in reserved
+            ]
             if unknown:
                 raise InputError(
-                    f"{file} has class id {unknown[0]}, which is not in the class table (ids {[entry.id for entry in class_table]})"
+                    f"{file} has class id {unknown[0]}, which is not in the class table "
+                    f"(ids {[entry.id for entry in class_table]}){_advice(unknown[0], truth)}"
                 )
     if class_table is not None:
         tell_of_turned(folder, len(turns), *turns[:1])
     return matched
+
+
+def _advice(unknown: int, truth: bool) -> str:
+    if unknown < OTHER:
+        return ""
+    rule = f"{OTHER} is other and {UNJUDGED} not judged in truth masks alone"
+    return f"; {rule}" + (f", if all classes have ids up to {OTHER - 1}" if truth else "")
 
 
 @cache  # tiles look at the same masks again and again

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from sc3d.errors import InputError
 from sc3d.settings.common import Resources
 
 
@@ -181,16 +182,33 @@ class Propagate(Resources):
 
 @dataclass(frozen=True)
 class Evaluate(Resources):
-    """OA, mIoU and IoU per class against truth masks, through the first surface."""
+    """OA, mIoU, IoU, precision and recall per class against truth masks, through the first surface."""
 
     truth: Path | None = None
-    """Folder of truth masks; SCENE/truth otherwise."""
+    """Folder of truth masks; SCENE/truth otherwise. Their values are ids of classes, 254 = other: looked at,
+    and none of the classes, 255 = not judged.
+    """
+    truth_zero: Literal["ignore", "other"] = "ignore"
+    """What 0 in truth masks stands for: ignore = not judged; other = somebody looked, and found none of the
+    classes.
+    """
+    margin: float = 10.0
+    """With --truth-zero other: 0 nearer to a class than this is not judged, as outlines are not sure, px."""
     labelled: Path | None = None
     """Labelled cloud; SCENE/labelled.ply otherwise."""
     band: float = 10.0
     """Half width of the band around depth edges that is also reported apart, px."""
     output: Path | None = None
     """Metrics file; SCENE/metrics.json otherwise."""
+
+    def __post_init__(self) -> None:
+        if not self.margin >= 0:
+            raise InputError("margin must not be negative")
+
+    @property
+    def zero_margin(self) -> float | None:
+        """Distance from classes at which 0 in truth masks is other, px; None = it is not judged."""
+        return self.margin if self.truth_zero == "other" else None
 
 
 @dataclass(frozen=True)

@@ -92,6 +92,13 @@ class Depth(Workers):
     """Longest side of the depth maps, px."""
     num_sources: int = 6
     """Other photos that each is compared with."""
+    sky_masks: Path | None = None
+    """Masks that show the sky, in any format of `sc3d segment --masks`: binary (255 or 1 is sky, 0 is not), or of
+    classes, of which those without surface are sky. SCENE/masks otherwise, where there are masks and classes.json
+    has such a class.
+    """
+    ignore_masks: bool = False
+    """Do not look at SCENE/masks: find sky by its look and place alone."""
 
     def __post_init__(self) -> None:
         if self.max_size < 32 or self.num_sources < 1:
@@ -122,8 +129,18 @@ class Extract:
     others, seen by one photo (leaves before the camera), at the farthest depth that no other photo looks
     through.
     """
+    crop: int = 0
+    """Leave out the surface that fewer photos than this see, such as 3 against the frayed border of a flight; 0 =
+    keep all.
+    """
     min_opacity: float = 0.3
     """Smallest opacity of a Gaussian whose center becomes a point (centers)."""
+
+    def __post_init__(self) -> None:
+        if self.crop < 0:
+            raise InputError("crop must be a number of photos, or 0 = off")
+        if self.crop and self.method == "centers":
+            raise InputError("--crop needs a surface that hides what lies behind it: --from tsdf or depth")
 
 
 @dataclass(frozen=True)

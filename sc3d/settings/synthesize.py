@@ -30,7 +30,9 @@ class Synthesize:
     mask_noise: float = 1.0
     """Strength of the mask errors: 0 = perfect masks, 1 = about 77 % of the pixels right."""
     extent: float | None = None
-    """Side of the square site, m; what lies outside of it is truth 0. Aerial: 120 by default; street: 60."""
+    """Side of the square site, m; what lies outside of it is truth 0, other objects and sky 254. Aerial: 120
+    by default; street: 60.
+    """
     altitude: float = 60.0
     """Height of the nadir photos above the ground, m; aerial only."""
     num_points: int = 1_000_000

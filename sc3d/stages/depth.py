@@ -8,16 +8,25 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, left_out
 from sc3d.geometry.cameras import undistorted
 from sc3d.geometry.view_selection import neighbor_views
 from sc3d.georeferencing.georeference import georeference_path
 from sc3d.georeferencing.up_direction import find_up, view_poses
 from sc3d.io.atomic import atomic_path
 from sc3d.scene.depth_map import hardly_confirmed
-from sc3d.scene.scene import Scene, SparseModel, check_photos
+from sc3d.scene.photo_names import photo_name
+from sc3d.scene.scene import Scene, SparseModel, check_photos, photo_sizes
 from sc3d.settings.reconstruction import Depth
-from sc3d.stereo.multi_view import MIN_SPARSE, StereoJob, estimate_depths, inverse_range, sparse_seeds
+from sc3d.stereo.given_sky import GivenSky, read_given_sky, shows_sky, sky_of_scene
+from sc3d.stereo.multi_view import (
+    MIN_SPARSE,
+    StereoJob,
+    estimate_depths,
+    inverse_range,
+    sparse_seeds,
+    write_sky,
+)
 from sc3d.tiling.executor import open_executor
 from sc3d.tiling.work_folder import WorkFolder
 
@@ -25,7 +34,10 @@ logger = logging.getLogger(__name__)
 
 
 def inputs(scene: Scene, settings: Depth) -> list[Path]:
-    return [scene.images, scene.sparse]
+    always = [scene.images, scene.sparse]
+    if settings.sky_masks is not None:
+        return [*always, settings.sky_masks, *([scene.classes] if scene.classes.exists() else [])]
+    return [*always, *([scene.masks, scene.classes] if _uses_masks(scene, settings) else [])]
 
 
 def outputs(scene: Scene, settings: Depth) -> list[Path]:
@@ -35,8 +47,10 @@ def outputs(scene: Scene, settings: Depth) -> list[Path]:
 def run(scene: Scene, settings: Depth) -> dict[str, object]:
     model = scene.model
     check_photos(scene, [view.name for view in model.views])
-    work = WorkFolder(scene.depth, "depth", [scene.images, scene.sparse], settings)
-    job, left_out = _job(scene, settings, work)
+    masks = _sky_masks(scene, settings)
+    work = WorkFolder(scene.depth, "depth", inputs(scene, settings), settings)
+    job, dropped = _job(scene, settings, work)
+    write_sky(job, masks)
     with open_executor(settings) as tasks, atomic_path(scene.depth) as folder:
         folder.mkdir()
         shares = np.array(estimate_depths(replace(job, output=folder), tasks))
@@ -50,12 +64,40 @@ def run(scene: Scene, settings: Depth) -> dict[str, object]:
     one, two, known, sky = shares.mean(axis=0)
     return {
         "photos": len(job.views),
-        **({"left_out": left_out} if left_out else {}),
+        **({"left_out": dropped} if dropped else {}),
         "size": f"{job.views[0].width}x{job.views[0].height}",
         "confirmed": f"{one:.1%} of the pixels by another view, {two:.1%} by two",
         "continued": f"{known - one:.1%} of the pixels",
         "sky": f"{sky:.1%} of the pixels",
+        **({"sky_masks": f"of {len(masks)} photos"} if masks else {}),
     }
+
+
+def _uses_masks(scene: Scene, settings: Depth) -> bool:
+    return settings.sky_masks is None and not settings.ignore_masks and shows_sky(scene)
+
+
+def _sky_masks(scene: Scene, settings: Depth) -> GivenSky:
+    """What masks say of the sky, by view name; empty where none are to be used."""
+    if settings.sky_masks is not None:
+        table = scene.class_table() if scene.classes.exists() else None
+        sizes = photo_sizes(scene.images)
+        given = read_given_sky(settings.sky_masks, sizes, table, scene.images)
+    elif _uses_masks(scene, settings):
+        given = sky_of_scene(scene)
+    else:
+        return {}
+    names = {view.name: photo_name(scene.photo(view.name), scene.images) for view in scene.model.views}
+    found = {name: given[photo] for name, photo in names.items() if photo in given}
+    source = settings.sky_masks or scene.masks
+    if not found:
+        raise InputError(
+            f"none of the {len(given)} masks in {source} is of a photo with a camera in {scene.sparse}"
+        )
+    if bare := sorted(names.keys() - found.keys()):
+        told = f"photos have no mask in {source}; their sky is found by its look"
+        logger.info(left_out(bare, len(names), told))
+    return found
 
 
 def _job(scene: Scene, settings: Depth, work: WorkFolder) -> tuple[StereoJob, list[str]]:

@@ -45,6 +45,10 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
         write_geometry(scene.cloud, _placed(cloud, origin))
         return {"points": len(cloud.point.positions)}
     require_views(scene)
+    if settings.crop > len(scene.model.views):
+        raise InputError(
+            f"--crop {settings.crop}: only {len(scene.model.views)} photos have a camera; take a smaller number"
+        )
     with tempfile.TemporaryDirectory(prefix=temporary_name("sc3d-depth")) as folder:
         store = EvidenceStore(Path(folder))
         surfaces, origin = (_from_depth if settings.method == "depth" else _from_gaussians)(
@@ -52,7 +56,7 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
         )
     write_geometry(scene.mesh, _placed(surfaces.mesh, origin))
     write_geometry(scene.cloud, _placed(surfaces.cloud, origin))
-    return _figures(surfaces)
+    return _figures(surfaces, settings.crop)
 
 
 def _from_gaussians(scene: Scene, settings: Extract, store: EvidenceStore) -> tuple[Surfaces, np.ndarray]:
@@ -72,7 +76,7 @@ def _from_gaussians(scene: Scene, settings: Extract, store: EvidenceStore) -> tu
             store.write(row, maps.evidence(row, settings.min_views))
     footprint = write_rendered(gaussians, data, store, settings.min_views, settings.depth_mode)
     voxel_size = settings.voxel_size or default_voxel_size(points, footprint)
-    return fuse_views(data, store, voxel_size, settings.fill), origin
+    return fuse_views(data, store, voxel_size, settings.fill, settings.crop), origin
 
 
 def _from_depth(scene: Scene, settings: Extract, store: EvidenceStore) -> tuple[Surfaces, np.ndarray]:
@@ -98,7 +102,7 @@ def _from_depth(scene: Scene, settings: Extract, store: EvidenceStore) -> tuple[
     voxel_size = settings.voxel_size or default_voxel_size(
         model.points, float(np.median(footprints)) if footprints else 1.0
     )
-    return fuse_views(data, store, voxel_size, settings.fill), origin
+    return fuse_views(data, store, voxel_size, settings.fill, settings.crop), origin
 
 
 def _views(
@@ -143,8 +147,9 @@ def _require_room(data: DepthViews) -> None:
     require_room(Path(tempfile.gettempdir()) / "depth", size)
 
 
-def _figures(surfaces: Surfaces) -> dict[str, object]:
-    """What is said of a surface."""
+def _figures(surfaces: Surfaces, crop: int) -> dict[str, object]:
+    """What is said of a surface; crop: photos that see each of it, 0 = no matter how many."""
+    told = f"{surfaces.cropped:.1%} of the area, seen by fewer than {crop} photos, is left out"
     shares = {
         name: getattr(surfaces, name) for name in ("confirmed", "continued", "occluders", "sky", "coverage")
     }
@@ -153,6 +158,7 @@ def _figures(surfaces: Surfaces) -> dict[str, object]:
         "triangles": len(surfaces.mesh.triangle.indices),
         "voxel_size": round(surfaces.voxel_size, 5),
         **{name: f"{share:.1%} of the pixels" for name, share in shares.items()},
+        **({"cropped": told} if crop else {}),
     }
 
 

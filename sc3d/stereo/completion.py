@@ -35,7 +35,7 @@ COLOR_STEP = 8.0  # gray values that cost as much as a pixel
 FLATTEST = (
     0.35  # sine of the angle at which ground is seen; steeper, its patches match, and what does not is a tree
 )
-FARTHEST = 3.0  # of the farthest confirmed depth, how far ground goes on
+FARTHEST = 0.01  # quantile of a view's confirmed inverse depths: ground goes on no farther
 EVEN = 20  # gray values within 5x5 px
 FATTENED = 7  # px of the small image, by which surface is carried over its outline
 SKY_PIXELS = 50  # at least, of the small image
@@ -314,7 +314,7 @@ def _continue_ground(
     result: (H, W, 3) planes so far; level: (H, W, 3) of the ground; steep: (H, W) sine of `horizon` above it
     source: (H, W) confirmed pixel of each
     """
-    reachable = (level[..., 0] > 0) & (level[..., 0] * FARTHEST > result[..., 0][confirmed].min())
+    reachable = (level[..., 0] > 0) & (level[..., 0] > np.quantile(result[..., 0][confirmed], FARTHEST))
     reachable &= steep > -FLATTEST
     on_ground = _on_ground(result, level) & confirmed
     hidden = (result[..., 0] > 0) & (result[..., 0] < level[..., 0])

@@ -32,6 +32,7 @@ from sc3d.stereo.completion import (
     not_below,
     without_speckles,
 )
+from sc3d.stereo.given_sky import SKY, SURFACE, GivenSky
 from sc3d.stereo.patch_match import Stereo, evaluate, sweep
 from sc3d.stereo.pinhole_pairs import GrayView, smaller, stacked, transfers
 from sc3d.tiling.executor import Executor
@@ -114,6 +115,15 @@ class StereoJob:
         """(2, H, W) uint8, how many sources confirm a pixel of the last pass, and how many loosely."""
         return self.work / f"checked-{row}.npy"
 
+    def sky_file(self, row: int) -> Path:
+        """(H, W) uint8, what a mask says of the pixels of a view (`given_sky`), if there is one."""
+        return self.work / f"sky-{row}.npy"
+
+    def told(self, row: int, what: int) -> np.ndarray:
+        """(H, W) bool: pixels of which a mask says so; none without a mask."""
+        file, view = self.sky_file(row), self.views[row]
+        return np.load(file) == what if file.exists() else np.zeros((view.height, view.width), bool)
+
     def gray(self, row: int) -> GrayView:
         return GrayView(self.views[row], np.load(self.gray_file(row)).astype(np.float32) / np.float32(255))
 
@@ -154,6 +164,14 @@ def estimate_depths(job: StereoJob, tasks: Executor) -> list[tuple[float, float,
     points = tasks.run("confirming", partial(check_view, job), rows)
     ground = fit_ground(np.concatenate(points), np.array([view.center for view in job.views]), job.up)
     return tasks.run("completing", partial(finish_view, job, ground), rows)
+
+
+def write_sky(job: StereoJob, masks: GivenSky) -> None:
+    """What masks, by view name, say of the pixels of the views, unless it is already there."""
+    for row, photo_view in enumerate(job.photo_views):
+        if photo_view.name in masks and not job.sky_file(row).exists():
+            told = masks[photo_view.name]()
+            save(job.sky_file(row), resample(told, photo_view, job.views[row], labels=True))
 
 
 def write_gray(job: StereoJob, row: int) -> None:
@@ -295,14 +313,14 @@ def check_view(job: StereoJob, row: int) -> np.ndarray:
     last = len(passes(job.longest)) - 1
     planes, view, sources = np.load(job.file(last, row)), job.view(last, row), job.sources[row]
     inverse = np.ascontiguousarray(planes[..., 0])
-    others = [np.load(job.file(last, source))[..., :3] for source in sources]
+    others = [_planes_in_photo(job, source) for source in sources]
     other_views = [job.view(last, source) for source in sources]
     counts = count_agreements(inverse, view, others, other_views)
     loose = count_agreements(inverse, view, others, other_views, LOOSE)
     costs = np.empty(inverse.shape, np.float32)
     evaluate(_problem(job, last, row, geometric=False), planes, costs)
     opaque = Scene(job.scene).opaque_pixels(job.photo_views[row], view)
-    unsure = (costs > MAX_COST) | (False if opaque is None else ~opaque)
+    unsure = (costs > MAX_COST) | job.told(row, SKY) | (False if opaque is None else ~opaque)
     counts[unsure], loose[unsure] = 0, 0
     counts[~without_speckles(inverse, counts >= 1)] = 0
     counts[(counts > 1) & ~without_speckles(inverse, counts > 1)] = 1
@@ -314,6 +332,16 @@ def check_view(job: StereoJob, row: int) -> np.ndarray:
     rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1) @ np.linalg.inv(view.matrix).T
     points = rays / inverse[rows, columns, None]
     return (points - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
+
+
+def _planes_in_photo(job: StereoJob, row: int) -> np.ndarray:
+    """(H, W, 3) planes that a view ends with, 0 where its photo shows nothing, or sky that it was told of."""
+    last = len(passes(job.longest)) - 1
+    planes = np.load(job.file(last, row))[..., :3] * ~job.told(row, SKY)[..., None]
+    opaque = Scene(job.scene).opaque_pixels(job.photo_views[row], job.view(last, row))
+    if opaque is not None:
+        planes[~opaque] = 0
+    return planes
 
 
 def finish_view(job: StereoJob, ground: Ground | None, row: int) -> tuple[float, float, float, float]:
@@ -331,12 +359,14 @@ def finish_view(job: StereoJob, ground: Ground | None, row: int) -> tuple[float,
     if ground is not None:
         below = ~not_below(view, planes, loose >= 1, ground)
         counts[below], loose[below] = 0, 0
-    sky = find_sky(image, counts >= 1, horizon(view, job.up))
+    sky = find_sky(image, counts >= 1, horizon(view, job.up)) & ~job.told(row, SURFACE) | job.told(row, SKY)
+    if opaque is not None:
+        sky &= opaque
     counts[sky] = 0
     sure = counts >= min(SURE, len(job.sources[row]))
     complete = continued_planes(view, planes, sure, image, ground)
     complete[loose >= 1] = planes[loose >= 1, :3]
-    complete[sky if opaque is None else sky | ~opaque] = 0
+    complete[sky | (False if opaque is None else ~opaque)] = 0
     inverse, file = complete[..., 0], depth_file(job.output, view.name)
     depth = np.where(inverse > 0, 1 / np.maximum(inverse, 1e-30), 0).astype(np.float32)
     write_depth_map(file, DepthMap(depth, plane_normals(view, complete), counts, sky))

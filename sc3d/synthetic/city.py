@@ -16,15 +16,15 @@ from tqdm import tqdm
 from sc3d.geometry.cameras import View, pixel_centers, rays
 from sc3d.io.images import write_image
 from sc3d.io.json_files import write_json
+from sc3d.scene.class_table import OTHER
 from sc3d.scene.scene import Scene
 from sc3d.settings.synthesize import Synthesize, SynthesizeCity
 from sc3d.synthetic.city_files import CloudWriter, MeshWriter, open_cloud, open_mesh, write_cameras
 from sc3d.synthetic.city_flight import fly_over
 from sc3d.synthetic.cloud import truth_cloud
 from sc3d.synthetic.generate import CLASSES
-from sc3d.synthetic.masks import noisy_mask
-from sc3d.synthetic.mesh import OTHER
-from sc3d.synthetic.shading import surface_labels
+from sc3d.synthetic.masks import noisy_mask, without_other
+from sc3d.synthetic.shading import surface_labels, truth_labels
 from sc3d.synthetic.world import World, build_world, ray_tensor
 
 # of the city's middle in the world, m: coordinates of the size of UTM's
@@ -73,28 +73,26 @@ class City:
             SiteLabels(site.middle, site.world.ints[own], ground.half, ground.rasters, ground.rects)
         )
 
-    def label(self, view: View) -> np.ndarray:
-        """(H, W) uint8 true label of the pixels of a view in the city's frame; 0 = other objects, nothing
-        there.
-        """
+    def truth(self, view: View) -> np.ndarray:
+        """(H, W) uint8 truth of the pixels of a view in the city's frame, as `truth_labels`."""
         band = max(1, RAYS // view.width)
         parts = [
-            self._label_rows(view, row, min(row + band, view.height)) for row in range(0, view.height, band)
+            self._truth_rows(view, row, min(row + band, view.height)) for row in range(0, view.height, band)
         ]
         return np.concatenate(parts).reshape(view.height, view.width)
 
-    def _label_rows(self, view: View, first: int, last: int) -> np.ndarray:
+    def _truth_rows(self, view: View, first: int, last: int) -> np.ndarray:
         directions, _ = rays(view, pixel_centers(view.width, last - first) + [0.0, first])
         hits = self.scene.cast_rays(ray_tensor(np.broadcast_to(view.center, directions.shape), directions))
         distance, triangles, numbers = (
             hits[name].numpy() for name in ("t_hit", "primitive_ids", "geometry_ids")
         )
-        label = np.full(len(directions), OTHER, np.uint8)
+        truth = np.full(len(directions), OTHER, np.uint8)
         for number in np.unique(numbers[np.isfinite(distance)]):
             rows = np.flatnonzero(numbers == number)
             points = view.center + directions[rows] * distance[rows, None]
-            label[rows] = self.sites[number].labels(points, triangles[rows].astype(np.int64))
-        return label
+            truth[rows] = self.sites[number].truth(points, triangles[rows].astype(np.int64))
+        return truth
 
 
 @dataclass(frozen=True)
@@ -109,10 +107,13 @@ class SiteLabels:
     rasters: np.ndarray
     rects: np.ndarray
 
-    def labels(self, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-        """(N,) uint8 of surface points (N, 3), city's frame, on triangles (N,) of the site."""
-        local = (points - self.middle).astype(np.float32)
-        return surface_labels(local, triangles, self.ints, self.half, EXTENT / 2, self.rasters, self.rects)
+    def truth(self, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+        """(N,) uint8 as `truth_labels` of surface points (N, 3), city's frame, on triangles (N,) of the site."""
+        local, plan = (
+            (points - self.middle).astype(np.float32),
+            (self.half, EXTENT / 2, self.rasters, self.rects),
+        )
+        return truth_labels(surface_labels(local, triangles, self.ints, *plan), local, triangles, EXTENT / 2)
 
 
 def make_sites(settings: SynthesizeCity) -> Iterator[Site]:
@@ -137,7 +138,7 @@ def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
     """Write cloud.ply (a link to truth.ply, which has the true labels), mesh.ply, sparse/0, truth/, masks/,
     confidence/ and classes.json.
 
-    returns: points, views, triangles, mask_accuracy (over pixels with truth != 0)
+    returns: points, views, triangles, mask_accuracy (over pixels of a class)
     """
     scene, city = Scene(settings.scene), City(o3d.t.geometry.RaycastingScene(), [])
     columns, rows = settings.sites
@@ -176,10 +177,11 @@ def _write_masks(scene: Scene, city: City, views: list[View], seed: int) -> floa
     """
     right = labelled = 0
     for number, view in enumerate(tqdm(views, desc="masks", unit="view", disable=None)):
-        truth = city.label(view)
-        mask, confidence = noisy_mask(truth, Synthesize.mask_noise, np.random.default_rng([seed, 4, number]))
-        right += int(((mask == truth) & (truth != OTHER)).sum())
-        labelled += int((truth != OTHER).sum())
+        truth = city.truth(view)
+        label = without_other(truth)
+        mask, confidence = noisy_mask(label, Synthesize.mask_noise, np.random.default_rng([seed, 4, number]))
+        right += int(((mask == label) & (label != 0)).sum())
+        labelled += int((label != 0).sum())
         for folder, image in ((scene.truth, truth), (scene.masks, mask), (scene.confidence, confidence)):
             write_image(folder / f"{Path(view.name).stem}.png", image)
     return right / max(labelled, 1)

@@ -53,7 +53,7 @@ def synthesize(
     Writes images/, truth_depth/<stem>.npy (float32 z, m), truth/, masks/, confidence/, sparse/0, truth.ply,
     truth_mesh.ply and classes.json; of a street also truth_sky/ (255 = sky).
     progress: called with the finished share (0..1) and what is being done; None = silent
-    returns: summary: num_views, num_triangles, num_buildings, mask_accuracy (over pixels with truth != 0),
+    returns: summary: num_views, num_triangles, num_buildings, mask_accuracy (over pixels of a class),
         num_sparse_points, seconds_per_view
     """
     report = progress or (lambda share, text: None)
@@ -128,7 +128,7 @@ def _write_view(
         Image.fromarray(photo.color).save(temporary, quality=95, subsampling=0, exif=exif)
     with atomic_path(scene_path / "truth_depth" / f"{name.stem}.npy") as temporary:
         np.save(temporary, photo.depth)
-    for folder, image in (("truth", photo.label), ("masks", segmented[0]), ("confidence", segmented[1])):
+    for folder, image in (("truth", photo.truth), ("masks", segmented[0]), ("confidence", segmented[1])):
         write_image(scene_path / folder / f"{name.stem}.png", image)
 
 

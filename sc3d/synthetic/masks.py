@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from sc3d.scene import class_table
 from sc3d.synthetic.mesh import BUILDING, GRASS, OTHER, ROAD, TREE
 
 NUM_LABELS = 5
@@ -53,6 +54,11 @@ def noisy_mask(label: np.ndarray, strength: float, rng: np.random.Generator) -> 
     mask = table[segments, whole]
     mean = np.where(missed | confused, 0.62 + 0.16 * quality, 0.84 + 0.09 * quality)
     return mask, _confidence(mask, mean[segments], strength, scale, grain, hope[segments])
+
+
+def without_other(truth: np.ndarray) -> np.ndarray:
+    """uint8 class of each pixel of a truth mask, 0 = none: what `noisy_mask` starts from."""
+    return np.where(truth == class_table.OTHER, OTHER, truth).astype(np.uint8)
 
 
 def _displacement(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sc3d.geometry.cameras import View, pixel_centers, rays
+from sc3d.synthetic.masks import without_other
 from sc3d.synthetic.shading import display
 from sc3d.synthetic.world import World
 
@@ -16,13 +17,18 @@ SAMPLES_PER_BAND = 2_000_000  # rows are rendered in bands: large photos must no
 
 @dataclass(frozen=True)
 class Photo:
-    """color (H, W, 3) uint8; depth (H, W) float32 z of the pixel center's ray, m, 0 = nothing there; label
-    (H, W) uint8 of the same ray.
+    """color (H, W, 3) uint8; depth (H, W) float32 z of the pixel center's ray, m, 0 = nothing there; truth
+    (H, W) uint8 of the same ray, as `World.truth`.
     """
 
     color: np.ndarray
     depth: np.ndarray
-    label: np.ndarray
+    truth: np.ndarray
+
+    @property
+    def label(self) -> np.ndarray:
+        """(H, W) uint8 class, 0 = none."""
+        return without_other(self.truth)
 
 
 def photograph(world: World, view: View) -> Photo:
@@ -37,22 +43,22 @@ def photograph(world: World, view: View) -> Photo:
     parts = [
         _render_rows(world, view, row, min(row + band, view.height)) for row in range(0, view.height, band)
     ]
-    light, depth, label = (np.concatenate(part) for part in zip(*parts))
+    light, depth, truth = (np.concatenate(part) for part in zip(*parts))
     noise = 1.2 * rng.standard_normal(light.shape, dtype=np.float32)
-    return Photo(display(light, exposure, noise), depth, label)
+    return Photo(display(light, exposure, noise), depth, truth)
 
 
 def _render_rows(
     world: World, view: View, first: int, last: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Linear light (h, W, 3), depth and label (h, W) of the rows [first, last)."""
+    """Linear light (h, W, 3), depth and truth (h, W) of the rows [first, last)."""
     shape = (last - first, view.width)
     centers = pixel_centers(*shape[::-1]) + [0.0, first]
     directions, cosines = rays(view, centers)
     range_, triangles = world.cast(view.center, directions)
     hit = triangles >= 0
     depth = np.where(hit, range_ * cosines, 0.0).astype(np.float32)
-    label = world.labels(_points(view.center, directions, range_, hit), triangles)
+    truth = world.truth(_points(view.center, directions, range_, hit), triangles)
     light = np.zeros((len(centers), 3), np.float32)
     for offset in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
         directions, cosines = rays(view, centers + offset)
@@ -65,7 +71,7 @@ def _render_rows(
         seen = world.light(_points(view.center, directions, range_, hit), triangles, footprints)
         seen[~hit] = world.sky(directions[~hit])
         light += 0.25 * seen
-    return light.reshape(*shape, 3), depth.reshape(shape), label.reshape(shape)
+    return light.reshape(*shape, 3), depth.reshape(shape), truth.reshape(shape)
 
 
 def _points(center: np.ndarray, directions: np.ndarray, range_: np.ndarray, hit: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from sc3d.scene import class_table
 from sc3d.synthetic.close_up import facade_color
 from sc3d.synthetic.mesh import (
     BRICK,
@@ -124,6 +125,14 @@ def shade(
         out[n, 1] = max(g, 0.002) * (1.85 * direct + 0.37 * sky + 0.09)
         out[n, 2] = max(b, 0.002) * (1.65 * direct + 0.46 * sky + 0.07)
     return out
+
+
+def truth_labels(labels: np.ndarray, points: np.ndarray, triangles: np.ndarray, site: float) -> np.ndarray:
+    """(N,) uint8 truth of surface points: their `surface_labels` (N,), but `scene.class_table.OTHER` for sky
+    and for what is no class on the site (half side `site`, m); 0, not judged, is left outside of the site.
+    """
+    outside = (triangles >= 0) & (np.abs(points[:, :2]).max(axis=1) > site)
+    return np.where((labels == OTHER) & ~outside, class_table.OTHER, labels).astype(np.uint8)
 
 
 @njit(cache=True, parallel=True)

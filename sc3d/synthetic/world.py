@@ -13,7 +13,7 @@ from sc3d.synthetic.ground import Ground, add_ground, plan_ground
 from sc3d.synthetic.layout import build_fences, park_cars, place_buildings, plant
 from sc3d.synthetic.mesh import LEAF, MeshBuilder, face_normals
 from sc3d.synthetic.objects import Building, add_building
-from sc3d.synthetic.shading import SKY, SUN, shade, surface_labels
+from sc3d.synthetic.shading import SKY, SUN, shade, surface_labels, truth_labels
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,12 @@ class World:
             self.ground.rasters,
             self.ground.rects,
         )
+
+    def truth(self, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+        """(N,) uint8 as `labels`, but other objects and sky are told from what lies outside the site, as in
+        `truth_labels`.
+        """
+        return truth_labels(self.labels(points, triangles), points, triangles, self.ground.extent / 2)
 
     def light(self, points: np.ndarray, triangles: np.ndarray, footprints: np.ndarray) -> np.ndarray:
         """(N, 3) float32 linear RGB of surface points (N, 3) float32 in sun and shadow; `footprints` (N,)

@@ -40,12 +40,13 @@ BYTES = 260  # of a point while pixels look for the nearest one
 
 @dataclass(frozen=True)
 class EvaluateJob:
-    """What the task of a tile needs to know. truth: file of the truth mask of each view; reach: largest
-    distance of a pixel's point, world units
+    """What the task of a tile needs to know. truth: file of the truth mask of each view; zero_margin: as in
+    `Scene.read_truth`; reach: largest distance of a pixel's point, world units
     """
 
     scene: Path
     truth: dict[str, Path]
+    zero_margin: float | None
     extent_low: np.ndarray
     store: TileStore
     results: Results
@@ -114,7 +115,16 @@ def find_points(
         Results(folder.subfolder("results"), store),
         {view.name: truth[view.name] for view in views},
     )
-    job = EvaluateJob(scene.path, files, statistics.extent.low, store, results, maps, REACH * spacing)
+    job = EvaluateJob(
+        scene.path,
+        files,
+        settings.zero_margin,
+        statistics.extent.low,
+        store,
+        results,
+        maps,
+        REACH * spacing,
+    )
     executor.run("looking", partial(find_points_in_tile, job), store.tiles)
     return TiledSurface(job)
 
@@ -134,7 +144,7 @@ def find_points_in_tile(job: EvaluateJob, tile: int) -> None:
     for name, file in job.truth.items():
         if not may_see(views[name], low, high):
             continue
-        truth = Scene(job.scene).read_mask(file, name)
+        truth = Scene(job.scene).read_truth(file, name, job.zero_margin)
         view = views[name].resized(*truth.shape[::-1])
         ranges = job.maps.cast(view, camera_rays(view.camera))[0].reshape(truth.shape)
         rows, columns = np.nonzero(np.isfinite(ranges) & (truth > 0))

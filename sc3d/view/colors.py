@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.scene.class_table import ClassTable
+from sc3d.scene.class_table import OTHER, ClassTable
 from sc3d.scene.labelled_cloud import read_votes
 
 if TYPE_CHECKING:
@@ -155,6 +155,9 @@ def legend_entries(
     if present is None or 0 in present:
         red, green, blue = class_table.palette[0].tolist()
         entries.append(("unlabelled", (red, green, blue)))
+    if present is not None and OTHER in present and class_table.leaves_other:
+        red, green, blue = class_table.palette[OTHER].tolist()
+        entries.append((class_table.name(OTHER), (red, green, blue)))
     return entries
 
 

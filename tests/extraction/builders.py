@@ -50,10 +50,14 @@ def data() -> DepthViews:
 
 
 def surface_of(
-    gaussians: Gaussians, views_: DepthViews, fill: Fill = "occluders", mode: DepthMode = "blended"
+    gaussians: Gaussians,
+    views_: DepthViews,
+    fill: Fill = "occluders",
+    mode: DepthMode = "blended",
+    crop: int = 0,
 ) -> Surfaces:
     """As `sc3d extract` without the maps of `sc3d depth`."""
     with tempfile.TemporaryDirectory() as folder:
         store = EvidenceStore(Path(folder))
         write_rendered(gaussians, views_, store, 1, mode)
-        return fuse_views(views_, store, 0.15, fill)
+        return fuse_views(views_, store, 0.15, fill, crop)

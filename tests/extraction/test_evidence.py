@@ -89,6 +89,16 @@ def test_what_one_view_shows_before_the_wall_is_put_where_nobody_looks_through(t
         assert (gap < 0.02)[4:-4, 4:-4].mean() > 0.995
 
 
+def test_nothing_is_put_where_a_view_has_sky(tmp_path):
+    """Though the wall behind has another color: a mask says that there is no surface."""
+    scene = wall(tmp_path)
+    scene.images[0][PATCH] = (20, 160, 30)
+    scene.evidence[0].confirmed[PATCH] = 0
+    scene.evidence[0].sky[PATCH] = True
+    found = scene.fused("occluders")
+    assert found.occluders == 0 and not (scene.seen(found, 0)[PATCH] < 0.9 * scene.depths[0][PATCH]).any()
+
+
 @pytest.mark.parametrize("fill", ["nothing", "continued"])
 def test_without_occluders_the_wall_stays_whole_behind(tmp_path, fill):
     scene = wall(tmp_path)

@@ -1,5 +1,6 @@
 """Projection, rays and undistortion against analytic cameras and round trips."""
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -109,10 +110,47 @@ def test_undistorted_photo_shows_what_the_pinhole_view_projects(model):
         .uniform([20, 20], [pinhole.width - 20, pinhole.height - 20], (200, 2))
         .astype(int)
     )
+    inside = cameras.in_photo(view, pinhole)
+    if inside is not None:
+        pixels = pixels[cv2.erode(inside.astype(np.uint8), np.ones((7, 7)))[pixels[:, 1], pixels[:, 0]] > 0]
+    assert len(pixels) > 150
     directions, _ = cameras.rays(pinhole, pixels + 0.5)
     expected, _ = cameras.project(view, view.center + 10 * directions)
     found = warped[pixels[:, 1], pixels[:, 0], :2] * [5, 3] + 0.5
     assert np.abs(found - expected).max() < 0.1
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"])
+def test_undistorted_view_holds_the_whole_photo_and_knows_what_is_beside_it(model):
+    view = make_view(model)
+    pinhole = cameras.undistorted(view, 640)
+    inside = cameras.in_photo(view, pinhole)
+    columns, rows = cameras.pixel_centers(pinhole.width, pinhole.height).T
+    directions, _ = cameras.rays(pinhole)
+    pixels, _ = cameras.project(view, view.center + 10 * directions)
+    gap = np.minimum(pixels, [1280, 720] - pixels).min(axis=1)  # px from the photo's border, negative outside
+    found = np.ones(len(columns), bool) if inside is None else inside.ravel()
+    sure = np.abs(gap) > 3
+    np.testing.assert_array_equal(found[sure], gap[sure] > 0)
+    assert found.mean() < 1
+    if model == "OPENCV_FISHEYE":  # sees too much
+        return
+    corners = np.array([[1, 1], [1279, 1], [1, 719], [1279, 719.0]])
+    seen = pinhole.camera.img_from_cam(np.c_[view.camera.cam_from_img(corners), np.ones(4)])
+    assert cameras.in_image(pinhole, seen).all()
+
+
+def test_strong_distortion_grows_the_view_by_a_tenth_of_a_side_only():
+    camera = pycolmap.Camera(
+        model="OPENCV_FISHEYE", width=1000, height=800, params=[330, 330, 500, 400, 0.01, 0, 0, 0]
+    )
+    view = cameras.View("a.jpg", camera, np.eye(4))
+    pinhole = cameras.undistorted(view)
+    options = pycolmap.UndistortCameraOptions()
+    options.blank_pixels = 0.0
+    least = pycolmap.undistort_camera(options, camera)
+    assert pinhole.width <= 1.2 * least.width + 2 and pinhole.height <= 1.2 * least.height + 2
+    assert pinhole.focal == pytest.approx(least.mean_focal_length())
 
 
 def test_resampled_labels_are_never_mixed():

@@ -306,6 +306,23 @@ def test_training_sheet_is_shown(tmp_path):
         write_report(Scene(tmp_path), tmp_path / "report.html")
 
 
+def test_held_out_photos_have_a_row_for_each_kind(tmp_path):
+    summary = {"held_out_photos": 3, "held_out_psnr": 21.456, "held_out_seen": 0.98765}
+    summary |= {"held_out_sector_photos": 8, "held_out_sector_psnr": 17.0, "held_out_sector_seen_depth": 0.5}
+    record = {"stage": "train", "settings": {"test_every": 8, "test_sector": 0.2}, "summary": summary}
+    for chosen, expected in ((summary, 2), ({"held_out_photos": 3}, 1), ({"psnr": 20}, 0), ("broken", 0)):
+        write_json(tmp_path / "gaussians.ply.json", record | {"summary": chosen})
+        write_report(Scene(tmp_path), tmp_path / "report.html")
+        text = " ".join(Page((tmp_path / "report.html").read_text()).text)
+        assert ("one of every 8" in text) + ("a sector of 20%" in text) == expected
+        if expected == 2:
+            for name, row in (
+                ("one of every 8", ["3", "21.46", "–", "98.8%", "–", "–", "–"]),
+                ("a sector of 20%", ["8", "17.00", "–", "–", "–", "–", "50.0%"]),
+            ):
+                assert text.split(name)[1].split()[:7] == row
+
+
 def test_labels_without_truth_give_no_accuracy(toy, tmp_path):
     scene = Scene(tmp_path)
     for path in (toy.labelled, toy.classes):
@@ -316,6 +333,22 @@ def test_labels_without_truth_give_no_accuracy(toy, tmp_path):
     assert quality_section(data) == "" and processing_section(data) == ""
     assert "IoU" not in found_section(data) and "8,000 points in 2 classes." in summary_line(data)
     assert "seed" in certainty_section(data)
+
+
+@pytest.mark.parametrize(
+    ("counts", "told"),
+    [
+        ({"pixels": 2000, "right": 1950}, "nothing is hit: &lt;sky&gt; 97.5% of 2,000 pixels."),
+        ({"pixels": 0, "right": 0}, ""),
+        ({"pixels": "many"}, ""),
+        ([1], ""),
+    ],
+)
+def test_truth_without_surface_is_told_of(tmp_path, counts, told):
+    metrics = {"labels": {"iou": {"grass": 0.5}}, "without_surface": {"<sky>": counts}}
+    write_json(tmp_path / "metrics.json", metrics)
+    section = quality_section(load_report_data(Scene(tmp_path)))
+    assert "nothing is hit" in section and told in section if told else "nothing is hit" not in section
 
 
 def test_page_is_made_again_when_objects_were_exported_since(toy, tmp_path):

@@ -199,9 +199,10 @@ def _read_sidecars(folder: Path) -> object:
     from sc3d.report.data import load_report_data
     from sc3d.runner import _finished
     from sc3d.scene.scene import Scene
+    from sc3d.settings.labels import Label
 
     record = {"stage": "label", "settings": {"consensus": 0.66}, "inputs": {"cloud.ply": "00"}}
-    return _finished(record, [folder / "seeds.ply"], Scene(folder), set()), load_report_data(
+    return _finished(record, [folder / "seeds.ply"], Scene(folder), Label()), load_report_data(
         Scene(folder)
     ).records
 

@@ -156,6 +156,25 @@ def test_sidecars_of_earlier_versions_stay_valid(copying, site, prefix):
     assert len(copying) == 2
 
 
+@pytest.mark.parametrize(
+    ("unknown", "asked", "again"),
+    [
+        (["model_dir", "output"], Copying(), False),
+        (["factor"], Copying(), True),  # who knows how it was before
+        (["model_dir"], Copying(model_dir=Path("photos")), True),
+        (["source"], Copying(factor=2), True),
+    ],
+)
+def test_options_that_a_sidecar_does_not_know_count_as_off(copying, site, unknown, asked, again):
+    execute("copying", Scene(site), Copying())
+    record = json.loads(sidecar(site / "copy.txt").read_text())
+    for name in unknown:
+        del record["settings"][name]
+    sidecar(site / "copy.txt").write_text(json.dumps(record))
+    execute("copying", Scene(site), asked)
+    assert len(copying) == 1 + again
+
+
 def test_unfinished_tiles_are_found_by_every_path(site, tmp_path):
     cloud = site / "cloud.ply"
     cloud.write_bytes(b"1")

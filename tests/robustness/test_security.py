@@ -446,6 +446,8 @@ def reading_runs(scene: Path) -> dict[str, tuple[str, object]]:
     return stage_runs() | {
         "georeference gps": ("georeference", reconstruction.GeoreferenceOptions(from_gps=True)),
         "georeference again": ("georeference", reconstruction.GeoreferenceOptions(epsg=32632)),
+        "depth masks": ("depth", reconstruction.Depth()),
+        "depth sky": ("depth", reconstruction.Depth(sky_masks=scene / "truth")),
         "extract depth": ("extract", reconstruction.Extract(method="depth")),
         "segment masks": ("segment", labels.Segment(masks=scene / "truth")),
         "segment in place": ("segment", labels.Segment()),
@@ -457,7 +459,7 @@ def reading_runs(scene: Path) -> dict[str, tuple[str, object]]:
 
 
 READS = [
-    *STAGES[1:], "georeference gps", "georeference again", "extract depth", "segment masks", "segment in place", "label cloud", "label density",
+    *STAGES[1:], "georeference gps", "georeference again", "depth masks", "depth sky", "extract depth", "segment masks", "segment in place", "label cloud", "label density",
     "import cloud",
 ]  # fmt: skip
 
@@ -475,6 +477,9 @@ def test_every_file_that_a_stage_reads_is_an_input(packed, here, tmp_path, monke
     attack.unpack(stage)
     scene, module = Scene(attack.scene), importlib.import_module(f"sc3d.stages.{stage}")
     (scene.path / "georeference.json").write_text('{"epsg": 32615, "offset": [0, 0, 0]}')
+    if name == "depth masks":
+        table = json.loads(scene.classes.read_text())
+        scene.classes.write_text(json.dumps([table[0], *(entry | {"surface": False} for entry in table[1:])]))
     if name == "extract depth":
         write_flat_depth(scene)  # the photos are noise: stereo confirms nothing
     inputs, outputs = module.inputs(scene, settings), module.outputs(scene, settings)
@@ -490,7 +495,8 @@ def test_every_file_that_a_stage_reads_is_an_input(packed, here, tmp_path, monke
     def covered(file: Path, by: list[Path]) -> bool:
         return any(file == path or path in file.parents for path in by)
 
-    warned_of = [scene.sparse] if name == "segment masks" else []  # photos without a camera, not more
+    # photos without a camera, not more; whether a class has no surface: if one has, the table is an input
+    warned_of = {"segment masks": [scene.sparse], "depth": [scene.classes]}.get(name, [])
     made = [*outputs, *warned_of, *(module.besides(scene, settings) if hasattr(module, "besides") else [])]
     names = {name for name in opened.names() if ".tmp" not in name and ".parts/" not in name}
     read = {name for name in names if not (scene.path / name).name.startswith(".seeds.ply.cloud")}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -12,12 +13,15 @@ import pytest
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import resample, undistorted
+from sc3d.io.images import write_image
 from sc3d.runner import execute
 from sc3d.scene.depth_map import DepthMap, depth_file, depth_map_size, read_depth_map, write_depth_map
 from sc3d.scene.scene import Scene
 from sc3d.settings.reconstruction import Depth, Extract
 from sc3d.settings.synthesize import Synthesize
+from sc3d.stages import depth
 from sc3d.stereo import multi_view
+from sc3d.stereo.given_sky import SKY, SURFACE
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +39,7 @@ def scene(site, tmp_path_factory) -> Scene:
 
 
 def copy_of(site: Scene, folder: Path) -> Scene:
+    folder.mkdir(exist_ok=True)
     (folder / "images").symlink_to(site.images)
     shutil.copytree(site.path / "sparse", folder / "sparse")
     return Scene(folder)
@@ -137,8 +142,6 @@ def test_what_is_missing_or_damaged_is_said(site, tmp_path):
 def test_without_any_confirmed_depth_the_command_fails_and_little_of_it_is_told(
     site, tmp_path, monkeypatch, caplog
 ):
-    from sc3d.stages import depth
-
     scene, shares = copy_of(site, tmp_path), [(0.0, 0.0, 0.4, 0.1)] * 8
     monkeypatch.setattr(depth, "estimate_depths", lambda job, tasks: shares)
     with pytest.raises(InputError, match="no depth of the 8 photos is confirmed"):
@@ -148,6 +151,86 @@ def test_without_any_confirmed_depth_the_command_fails_and_little_of_it_is_told(
     names = [view.name for view in scene.model.views]
     execute("depth", scene, Depth(max_size=64))
     assert f"3 of 8 photos have under 5% confirmed depth: {', '.join(names[:3])}" in caplog.text
+
+
+CLASSES = [
+    {"id": 1, "name": "ground", "color": [9, 9, 9]},
+    {"id": 7, "name": "people", "color": [8, 8, 8], "surface": False},
+]
+
+
+def with_masks(site: Scene, folder: Path, classes: list[dict], photos: int = 7) -> Scene:
+    """The site with masks: people in the middle, ground above, below nothing."""
+    scene = copy_of(site, folder)
+    scene.classes.write_text(json.dumps(classes))
+    scene.masks.mkdir()
+    for view in scene.model.views[:photos]:
+        mask = np.zeros((view.height, view.width), np.uint8)
+        mask[: view.height // 2] = 1
+        mask[view.height // 3 : -view.height // 3, view.width // 3 : -view.width // 3] = 7
+        write_image(scene.masks / f"{Path(view.name).stem}.png", mask)
+    return scene
+
+
+def test_what_masks_say_has_no_surface_is_sky(site, tmp_path, caplog):
+    scene, plain = with_masks(site, tmp_path / "masks", CLASSES), copy_of(site, tmp_path / "plain")
+    with caplog.at_level("INFO"):
+        figures = execute("depth", scene, Depth(max_size=64))
+    assert figures["sky_masks"] == "of 7 photos"
+    assert f"1 of 8 photos have no mask in {scene.masks}" in caplog.text
+    assert "sky_masks" not in execute("depth", plain, Depth(max_size=64))
+    for row, view in enumerate(scene.model.views):
+        found, before = (read_depth_map(depth_file(each.depth, view.name)) for each in (scene, plain))
+        if row == 7:
+            np.testing.assert_array_equal(found.sky, before.sky)
+            continue
+        mask = scene.read_mask(scene.masks / f"{Path(view.name).stem}.png", view.name)
+        told = resample(mask, view, undistorted(view, 64), labels=True)
+        np.testing.assert_array_equal(found.sky, (told == 7) | before.sky & (told != 1))
+        assert before.depth[told == 7].mean() > 10 and (before.num_views[told == 7] > 0).mean() > 0.3
+        assert not found.depth[told == 7].any() and not found.num_views[told == 7].any()
+        assert (found.depth[told == 1] > 0).mean() > 0.3
+    assert execute("extract", scene, Extract(method="depth", crop=2))["cropped"].endswith(
+        "fewer than 2 photos, is left out"
+    )
+    with pytest.raises(InputError, match="only 8 photos have a camera"):
+        execute("extract", scene, Extract(method="depth", crop=9))
+
+
+def test_masks_count_only_where_a_class_has_no_surface(site, tmp_path):
+    scene = with_masks(site, tmp_path, [CLASSES[0], CLASSES[1] | {"surface": True}])
+    always = [scene.images, scene.sparse]
+    assert depth.inputs(scene, Depth()) == always
+    given = Depth(sky_masks=tmp_path / "sky")
+    assert depth.inputs(scene, given) == [*always, tmp_path / "sky", scene.classes]
+    scene.classes.write_text(json.dumps(CLASSES))
+    assert depth.inputs(scene, Depth()) == [*always, scene.masks, scene.classes]
+    assert depth.inputs(scene, given) == [*always, tmp_path / "sky", scene.classes]
+    assert depth.inputs(scene, Depth(ignore_masks=True)) == always
+    shutil.rmtree(scene.masks)
+    assert depth.inputs(scene, Depth()) == always
+    scene.classes.unlink()
+    assert depth.inputs(scene, given) == [*always, tmp_path / "sky"]
+
+
+def test_given_masks_of_sky_are_used(site, tmp_path, monkeypatch):
+    scene = copy_of(site, tmp_path)
+    view, folder = scene.model.views[3], tmp_path / "sky"
+    folder.mkdir()
+    mask = np.zeros((view.height, view.width), np.uint8)
+    mask[:, : view.width // 2] = 255
+    write_image(folder / f"{Path(view.name).stem}.png", mask)
+    told = {}
+
+    def estimated(job, tasks):
+        told.update({row: (job.told(row, SKY), job.told(row, SURFACE)) for row in range(8)})
+        return [(0.5, 0.4, 0.6, 0.1)] * 8
+
+    monkeypatch.setattr(depth, "estimate_depths", estimated)
+    assert execute("depth", scene, Depth(max_size=64, sky_masks=folder))["sky_masks"] == "of 1 photos"
+    assert [row for row in told if np.any(told[row])] == [3]
+    sky, surface = told[3]
+    assert sky[:, :31].all() and surface[:, 33:].all() and not (sky & surface).any()
 
 
 def small_map() -> DepthMap:

@@ -18,6 +18,7 @@ from sc3d.geometry.cameras import View, in_image, local_origin, pixel_centers, p
 from sc3d.geometry.raycast import Surface, first_surface, surface_points
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.mask_images import read_index_image
+from sc3d.scene.class_table import OTHER
 from sc3d.scene.scene import Scene
 from sc3d.settings.synthesize import SynthesizeCity
 from sc3d.synthetic import city
@@ -92,7 +93,7 @@ def test_cloud_and_mesh(made):
         np.linalg.norm(cloud.point.normals.numpy(), axis=1), 1, atol=1e-5
     )
     left = points[:, 0] < middle[0]
-    assert left.sum() == POINTS and set(np.unique(cloud.point.label.numpy())) == {0, 1, 2, 3, 4}
+    assert left.sum() == POINTS and set(np.unique(cloud.point.label.numpy())) == {1, 2, 3, 4, OTHER}
     assert not np.allclose(points[left][:100, 2], points[~left][:100, 2])  # each site has a seed of its own
 
 
@@ -123,7 +124,7 @@ def test_every_truth_mask_agrees_with_the_cloud(made, surface):
     for view in scene.model.views:
         truth, first = truth_of(scene, view), first_surface(surface, view)
         rows, columns = np.nonzero(np.isfinite(first.range))
-        assert len(rows) > 2000 and (truth[~np.isfinite(first.range)] == 0).mean() > 0.999
+        assert len(rows) > 2000 and (truth[~np.isfinite(first.range)] == OTHER).mean() > 0.999
         near, nearest = tree.query(surface_points(first, view, rows, columns) - city.OFFSET)
         assert (label[nearest] == truth[rows, columns])[near < 0.2].mean() > 0.97
         pixels, _ = project(view, points)

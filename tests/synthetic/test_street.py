@@ -10,6 +10,7 @@ from PIL import ExifTags, Image
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, pinhole_view, project, rays
 from sc3d.io.mask_images import read_index_image
+from sc3d.scene import class_table
 from sc3d.scene.scene import read_sparse_model
 from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.facades import RECESS, Opening, _add_opening, _add_wall, choose_style
@@ -94,6 +95,8 @@ def test_every_class_cars_sky_and_the_ground_at_the_feet_are_in_sight(street, ph
     depth = np.stack([photo.depth for photo in photos])
     label = np.stack([photo.label for photo in photos])
     assert (depth == 0).mean() > 0.02 and (label[depth == 0] == OTHER).all()
+    truth = np.stack([photo.truth for photo in photos])
+    assert (truth[depth == 0] == class_table.OTHER).all() and (truth[depth > 0] == class_table.OTHER).any()
     on_ground = np.isin(label[:6], (ROAD, GRASS))
     assert depth[:6][on_ground].min() < 3.0
     boughs = [(photo.depth[photo.label == TREE] < 2.5).sum() for photo in photos[:6]]

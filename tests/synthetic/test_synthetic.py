@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import in_image, project, rays
+from sc3d.scene import class_table
 from sc3d.scene.scene import read_sparse_model
 from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.cloud import truth_cloud
@@ -122,6 +123,38 @@ def test_truth_ends_at_the_border_of_the_site(views, photos):
         assert (photo.label.ravel()[outside] == OTHER).all()
 
 
+def test_other_is_what_stands_on_the_site_and_is_no_class(world, views, photos):
+    for view, photo in zip(views, photos):
+        truth, sky = photo.truth.ravel(), photo.depth.ravel() == 0
+        outside = ~sky & (np.abs(surface_points(view, photo.depth)[:, :2]).max(1) > SETTINGS.extent / 2)
+        assert np.array_equal(
+            truth[truth != class_table.OTHER], photo.label.ravel()[truth != class_table.OTHER]
+        )
+        assert (truth[sky] == class_table.OTHER).all()
+        at_border = np.isclose(np.abs(surface_points(view, photo.depth)[:, :2]).max(1), SETTINGS.extent / 2)
+        assert ((truth == 0) == outside)[~at_border].all()
+    cars = np.concatenate([photo.truth[photo.depth > 0] for photo in photos]) == class_table.OTHER
+    assert 0.001 < cars.mean() < 0.1
+    objects = world.ints[:, 1] == OTHER  # cars and garden walls
+    middles = world.corners.mean(axis=1)
+    inside = np.abs(middles[:, :2]).max(axis=1) < SETTINGS.extent / 2
+    told = world.truth(middles[objects], np.flatnonzero(objects))
+    assert np.array_equal(told, np.where(inside[objects], class_table.OTHER, 0))
+
+
+def test_masks_do_not_know_other(scene):
+    path, settings, _ = scene
+    for number in range(settings.views):
+        truth, mask, confidence = (
+            np.array(Image.open(path / folder / f"view_{number:03d}.png"))
+            for folder in ("truth", "masks", "confidence")
+        )
+        rng = np.random.default_rng([settings.seed, 4, number])
+        expected = noisy_mask(np.where(truth == class_table.OTHER, 0, truth), settings.mask_noise, rng)
+        assert np.array_equal(mask, expected[0]) and np.array_equal(confidence, expected[1])
+    assert (truth == class_table.OTHER).any()
+
+
 def test_crowns_let_the_ground_shine_through(photos):
     label = photos[2].label
     tree_share = np.stack(
@@ -199,7 +232,7 @@ def test_truth_cloud_agrees_with_truth_masks(world, views, photos):
         visible = (np.abs(photo.depth[rows, columns] - depth[inside]) < 0.05) & plain(photo.label)[
             rows, columns
         ]
-        right += (photo.label[rows, columns] == label[inside])[visible].sum()
+        right += (photo.truth[rows, columns] == label[inside])[visible].sum()
         total += visible.sum()
     assert total > 20_000 and right / total > 0.99
 

@@ -22,6 +22,7 @@ from sc3d.io.json_files import write_json
 from sc3d.io.mask_images import read_index_image
 from sc3d.io.splats import write_splat_ply
 from sc3d.labelling.cloud import Cloud
+from sc3d.scene.class_table import OTHER
 from sc3d.scene.depth_map import depth_file
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label, Propagate
@@ -34,7 +35,7 @@ from tools.benchmark.__main__ import main
 from tools.benchmark.fusion_page import markdown as fusion_markdown
 from tools.benchmark.settings import BenchmarkTables
 from tools.benchmark.surface_page import page, voxel_size_of
-from tools.benchmark.table_page import DIFFERENCES, markdown, spread
+from tools.benchmark.table_page import BOUND, DIFFERENCES, MASKS, markdown, spread
 from tools.benchmark.table_rows import DEFAULT, OURS, ablation, turned
 from tools.make_manual import helps
 
@@ -125,7 +126,7 @@ def test_rows_equal_the_stages(folder, record, tmp_path, name, method, how):
         read_cloud(path).point["label"].numpy().ravel()
         for path in (folder / "seed0" / "truth.ply", tmp_path / "full.ply")
     )
-    assert found["points"]["oa"] == pytest.approx((truth == label)[truth > 0].mean())
+    assert found["points"]["oa"] == pytest.approx((truth == label)[(truth > 0) & (truth != OTHER)].mean())
     believed = metrics["reliability"]
     assert found["reliability"] == believed
     assert 0 < believed["ece"] < 0.5 and sum(
@@ -262,6 +263,23 @@ def test_page_shows_means_spread_and_differences():
     assert "| synthetic | +0.00 ± 0.00 |" in text
     assert f"| {OURS} | 95.0 ± 7.1 | 85.0 ± 7.1 | 85.0 ± 7.1 |" in text and "every 4th photo" in text
     assert spread([1.0]) == "1.0" and spread([np.nan]) == "–"
+
+
+def test_page_shows_all_judged_pixels(record):
+    text = markdown(record)
+    lines = text.partition("### All judged pixels")[2].partition("\n## ")[0].strip().splitlines()
+    heads, *rows = [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in lines if "---" not in line
+    ]
+    assert heads[1:4] == ["other given a class", "building precision", "building recall"]
+    found = {row[0]: row for row in rows}
+    masks = record["results"][0]["rows"]["masks"]["all"]
+    assert masks["other"]["pixels"] > 100
+    assert found[MASKS][1] == f"{100 * masks['other']['given_class']:.1f}"
+    assert found[MASKS][2] == f"{100 * masks['precision']['building']:.1f}"
+    bound = record["results"][0]["rows"]["masks"]["bound"]["all"]
+    assert bound["other"]["given_class"] < 0.5 < masks["other"]["given_class"]
+    assert DEFAULT in found and found[BOUND][1] == f"{100 * bound['other']['given_class']:.1f}"
 
 
 def test_bad_input(folder, tmp_path, capsys):

@@ -26,8 +26,10 @@ DIFFERENCES = [
     ("default - majority voting with the filter", None, DEFAULT, "majority voting"),
 ]
 NOTE = (
-    "Per cent, over the pixels with truth of every {every}th photo: first surface, nearest cloud point, no label counts as wrong. Edges: within 10 px of a depth "
-    "edge; elsewhere some classes are rare (trees are all edges), so look at OA there. Points: mIoU over the points of the cloud, where their labels are known. "
+    "Per cent, over the pixels with truth of every {every}th photo: first surface, nearest cloud point, no label "
+    "counts as wrong. Edges: within 10 px of a depth edge; elsewhere some classes are rare (trees are all edges), "
+    "so look at OA there. All judged pixels: with what the truth marks as other. "
+    "Points: mIoU over the points of the cloud, where their labels are known. "
     "ECE: expected calibration error of the confidence, 10 bins. ± is the standard deviation over {seeds}. CPU s: label and propagate, all "
     "threads, without reading cloud and mesh. MB: peak memory of the process, the loaded scene included. Code {code}."
 )
@@ -57,6 +59,8 @@ def markdown(record: dict) -> str:
         parts.append(f"## {group[0].upper()}{group[1:]}: {', '.join(result['scene'] for result in results)}")
         for title, rows in layout.items():
             parts += [f"### {title}", _table(rows, results)]
+        if any(np.isfinite(_given(result["rows"]["masks"]["all"])) for result in results):
+            parts += ["### All judged pixels", _open_table(layout, results)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -91,17 +95,7 @@ def _table(rows: list[dict], results: list[dict]) -> str:
         "MB",
     ]
     lines = []
-    masks = [result["rows"]["masks"] for result in results]
-    bounds = (
-        [(BOUND, [figures["bound"] for figures in masks])]
-        if all("bound" in figures for figures in masks)
-        else []
-    )
-    for name, found in [
-        (MASKS, masks),
-        *((row["name"], [result["rows"][row["key"]] for result in results]) for row in rows),
-        *bounds,
-    ]:
+    for name, found in _figures(rows, results):
         cells = [
             _percent(found, lambda figures: figures["all"]["oa"]),
             _percent(found, lambda figures: figures["all"]["miou"]),
@@ -126,6 +120,42 @@ def _table(rows: list[dict], results: list[dict]) -> str:
         ]
         lines.append([name, *cells])
     return _grid(["", *heads], lines)
+
+
+def _figures(rows: list[dict], results: list[dict]) -> list[tuple[str, list[dict]]]:
+    """Name and figures on every scene: of masks, rows, and the bound, where the points' truth is known."""
+    masks = [result["rows"]["masks"] for result in results]
+    bounds = (
+        [(BOUND, [figures["bound"] for figures in masks])]
+        if all("bound" in figures for figures in masks)
+        else []
+    )
+    made = [(row["name"], [result["rows"][row["key"]] for result in results]) for row in rows]
+    return [(MASKS, masks), *made, *bounds]
+
+
+def _open_table(layout: dict[str, list[dict]], results: list[dict]) -> str:
+    """Share of other that is given a class, precision and recall of every class over all judged pixels."""
+    unique = list({row["key"]: row for rows in layout.values() for row in rows}.values())
+    classes, lines = results[0]["classes"], []
+    for name, found in _figures(unique, results):
+        cells = [_percent(found, lambda figures: _given(figures["all"]))]
+        for label in classes:
+            for figure in ("precision", "recall"):
+                cells.append(
+                    _percent(
+                        found,
+                        lambda figures, label=label, figure=figure: figures["all"][figure].get(label, np.nan),
+                    )
+                )
+        lines.append([name, *cells])
+    heads = [f"{label} {figure}" for label in classes for figure in ("precision", "recall")]
+    return _grid(["", "other given a class", *heads], lines)
+
+
+def _given(figures: dict) -> float:
+    share = figures.get("other", {}).get("given_class")  # records of earlier versions have none
+    return np.nan if share is None else share
 
 
 def _differences(layout: dict[str, list[dict]], groups: dict[str, list[dict]]) -> str:

@@ -27,7 +27,7 @@ from sc3d.scene.labelled_cloud import REACH, point_arrays, read_surface, spacing
 from sc3d.scene.scene import Scene
 from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.generate import synthesize
-from sc3d.synthetic.masks import noisy_mask
+from sc3d.synthetic.masks import noisy_mask, without_other
 
 logger = logging.getLogger(__name__)
 
@@ -48,8 +48,8 @@ FEW = 8  # photos are judged in any case, if there are so many
 class Place:
     """A scene without its masks: loaded once, whatever masks are tried on it.
 
-    cloud: points and normals; colors: (N, 3) uint8 or None; truth: (N,) uint8 true label per point, None =
-        not known
+    cloud: points and normals; colors: (N, 3) uint8 or None; truth: (N,) uint8 true label per point, maybe
+        `OTHER`, None = not known
     judged: the evaluated pixels of `photos`, in this order
     """
 
@@ -99,7 +99,8 @@ def with_masks(scene: Scene, folder: Path, settings: Synthesize) -> Scene:
     with atomic_path(made.confidence) as confidences, atomic_path(made.masks) as masks:
         for number, view in enumerate(scene.model.views):
             generator = np.random.default_rng([settings.seed, 4, number])
-            mask, confidence = noisy_mask(read_index_image(truth[view.name]), settings.mask_noise, generator)
+            label = without_other(read_index_image(truth[view.name]))
+            mask, confidence = noisy_mask(label, settings.mask_noise, generator)
             for temporary, image in ((masks, mask), (confidences, confidence)):
                 write_image(temporary / f"{Path(view.name).stem}.png", image)
     return made
@@ -115,7 +116,7 @@ def load_place(scene: Scene, every: int) -> Place:
         scene.cloud,
         hint="the tables need a scene with cloud.ply, classes.json and truth masks",
     )
-    views, truth_files = scene.model.views, scene.mask_files(scene.truth, scene.class_table())
+    views, truth_files = scene.model.views, scene.mask_files(scene.truth, scene.class_table(), truth=True)
     cloud = read_cloud(scene.cloud)
     points, normals = point_arrays(cloud, np.array([view.center for view in views]))
     surface = read_surface(scene.mesh, points, normals, local_origin(views))
@@ -124,7 +125,7 @@ def load_place(scene: Scene, every: int) -> Place:
     photos = photos[:: max(1, min(every, len(photos) // FEW))]
     parts = []
     for view in tqdm(photos, desc=f"judged pixels of {scene.path.name}", unit="photo", disable=None):
-        truth = read_index_image(truth_files[view.name])
+        truth = scene.read_truth(truth_files[view.name], view.name)
         sized = view.resized(*truth.shape[::-1])
         first = first_surface(surface, sized)
         parts.append(
@@ -149,7 +150,7 @@ def judge_masks(place: Place, masks: Masks) -> tuple[Confusion, Confusion]:
     """
     truth_files, parts = place.scene.mask_files(place.scene.truth), []
     for view in place.photos:
-        truth = read_index_image(truth_files[view.name])
+        truth = place.scene.read_truth(truth_files[view.name], view.name)
         mask = np.zeros_like(truth)
         if view.name in masks.files:
             mask = cv2.resize(

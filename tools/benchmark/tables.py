@@ -31,6 +31,7 @@ from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label, Propagate
 from sc3d.settings.synthesize import Synthesize
+from sc3d.synthetic.masks import without_other
 from tools.benchmark.publish import publish
 from tools.benchmark.settings import BenchmarkTables
 from tools.benchmark.table_page import MASKS, markdown
@@ -203,7 +204,8 @@ def _run_variant(place: Place | None, variant: Variant, command: BenchmarkTables
         figures["masks"] = {"name": MASKS} | _areas(judge_masks(place, masks), table)
         if place.truth is not None:
             figures["masks"]["bound"] = _areas(
-                place.judged.confusions(place.judged.look_up(place.truth), place.num_ids), table
+                place.judged.confusions(without_other(place.judged.look_up(place.truth)), place.num_ids),
+                table,
             )
         write_json(_file(command, variant, None), figures["masks"])
     _warm_up(place, masks)
@@ -253,7 +255,9 @@ def judge(place: Place, labels: Labels) -> dict[str, dict]:
     figures = _areas(place.judged.confusions(place.judged.look_up(labels.label), place.num_ids), table)
     if place.truth is not None:
         figures["points"] = Confusion.from_labels(place.truth, labels.label, place.num_ids).summary(table)
-    return figures | {"reliability": place.judged.reliability(labels.label, labels.confidence).summary()}
+    return figures | {
+        "reliability": place.judged.reliability(labels.label, labels.confidence, place.num_ids).summary()
+    }
 
 
 def _areas(confusions: tuple[Confusion, Confusion], table) -> dict[str, dict]:
