@@ -71,7 +71,8 @@ class Masks:
         views = scene.model.views
         masked = [view for view in views if view.name in files]
         without = tuple(view.name for view in views if view.name not in files)
-        return cls(files, confidences, masked, scene, table, without, unlabelled == "evidence")
+        evidence = unlabelled == "evidence" and table.rest is None
+        return cls(files, confidences, masked, scene, table, without, evidence)
 
     def tell_of_left_out(self, low: np.ndarray, high: np.ndarray) -> None:
         """One line for each reason why photos do not vote, or not as others do. low, high: (3,) box of the
@@ -92,17 +93,21 @@ class Masks:
             logger.warning(left_out(sure, count, "photos have no confidence map; their masks count as sure"))
 
     def read(self, view: View) -> Mask:
-        """As `fuse` wants it: channels, not ids; what shows no surface says nothing of the one behind its
-        outline.
+        """As `fuse` wants it: channels, not ids. A pixel without a class, or of one that has no surface, says
+        nothing, or that there is none of the classes where it was looked at: where its confidence is not 0.
         """
         confidence = self.confidences.get(view.name)
         sure = None if confidence is None else self.scene.read_confidence(confidence, view.name)
         file = self.files[view.name]
         labels = self.scene.read_mask(file, view.name)
-        nothing = labels == 0
         if self.table.without_surface:
             labels = np.where(self.table.shows_no_surface(labels), np.uint8(0), labels)
-        return self.channels.with_none(self.channels.from_ids(labels, file), nothing), sure
+        if self.none or self.table.rest is not None:
+            looked = self.scene.opaque_pixels_of(labels.shape, view.name) if sure is None else sure > 0
+            if self.table.rest is not None:
+                labels = np.where(looked & (labels == 0), np.uint8(self.table.rest.id), labels)
+            return self.channels.with_none(self.channels.from_ids(labels, file), looked), sure
+        return self.channels.from_ids(labels, file), sure
 
     def size(self, view: View) -> tuple[int, int]:
         """(width, height) px of the mask of a view."""
