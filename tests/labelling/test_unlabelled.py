@@ -1,22 +1,34 @@
 """What masks leave unlabelled: holes are voted away, a surface of none of the classes stays unlabelled."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.geometry.raycast import Surface
+from sc3d.io.clouds import read_cloud
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.fusion import fuse
+from sc3d.labelling.label import label_scene
 from sc3d.propagation.labelled_points import LabelledPoints
 from sc3d.propagation.none_evidence import NoneRates, count_votes, none_share
-from sc3d.propagation.propagate import propagate
+from sc3d.propagation.propagate import propagate, propagate_scene
 from sc3d.scene.channels import Channels
+from sc3d.scene.class_table import parse_classes
 from sc3d.scene.labelled_cloud import vote_channels
 from sc3d.scene.labels import SEED
+from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label, Propagate
+from sc3d.tiling import label as tiled_label
+from sc3d.tiling import propagate as tiled_propagate
+from sc3d.tiling.label import label_scene as label_by_tiles
+from sc3d.tiling.propagate import propagate_scene as propagate_by_tiles
+from tests.builders import CLASSES, ORIGIN, truth_mask, views, write_bare_scene
 
 SIZE, NONE = 160, 3  # classes 1 and 2; channel 3 = looked at, none of them
 VIEWS = [
@@ -137,3 +149,79 @@ def test_channels_of_none():
 @pytest.mark.parametrize("method", ["direct", "majority", "paper"])
 def test_baselines_ignore_what_is_unlabelled(method):
     assert Label(method=method).resolved.unlabelled == "ignore"
+
+
+def scene_without_grass(folder: Path, confidence: int | None, entries: list[dict] = CLASSES) -> Scene:
+    """The scene of the builders, whose masks say road or nothing; confidence: of what has no class, None = no map."""
+    scene = Scene(write_bare_scene(folder))
+    scene.classes.write_text(json.dumps(entries))
+    for view in views():
+        road = truth_mask(view) == 1
+        name = f"{Path(view.name).stem}.png"
+        Image.fromarray(np.where(road, np.uint8(1), np.uint8(0))).save(scene.masks / name)
+        if confidence is not None:
+            scene.confidence.mkdir(exist_ok=True)
+            Image.fromarray(np.where(road, np.uint8(200), np.uint8(confidence))).save(scene.confidence / name)
+    return scene
+
+
+def final_labels(scene: Scene, **options) -> dict[str, np.ndarray]:
+    label_scene(scene, Label(**options))
+    propagate_scene(scene, Propagate())
+    return {name: values.numpy() for name, values in read_cloud(scene.labelled).point.items()}
+
+
+@pytest.mark.parametrize("confidence", [None, 200])
+def test_what_is_looked_at_and_not_found_stays_unlabelled(tmp_path, confidence):
+    found = final_labels(scene_without_grass(tmp_path / "scene", confidence))
+    label, right = found["label"].ravel(), found["positions"][:, 0] - ORIGIN[0]
+    assert (label[right < -0.4] == 1).all() and (label[right > 0.4] == 0).all()
+    assert (found["confidence"].ravel()[right > 0.4] > 0.5).all()  # it is known to be none of the classes
+
+
+def test_what_is_not_looked_at_says_nothing(tmp_path):
+    scene = scene_without_grass(tmp_path / "scene", 0)
+    assert (final_labels(scene)["label"] == 1).all()
+    assert not read_cloud(scene.seeds).point["votes_none"].numpy().any()
+    label_scene(scene, Label(unlabelled="ignore", output=tmp_path / "old.ply"))
+    assert "votes_none" not in read_cloud(tmp_path / "old.ply").point
+
+
+def test_a_class_may_be_the_rest(tmp_path):
+    scene = scene_without_grass(tmp_path / "scene", None, [CLASSES[0], CLASSES[1] | {"rest": True}])
+    found = final_labels(scene)
+    inside = np.abs(found["positions"] - ORIGIN).max(axis=1) < 3.6  # of what the masks show
+    label, right = found["label"].ravel()[inside], found["positions"][inside, 0] - ORIGIN[0]
+    assert (label[right < -0.4] == 1).all() and (label[right > 0.4] == 3).all()
+
+
+@pytest.mark.parametrize(
+    "entries", [[{"rest": 1}, {}], [{"rest": True}, {"rest": True}], [{"rest": True, "surface": False}, {}]]
+)
+def test_a_rest_that_cannot_be_is_refused(entries):
+    with pytest.raises(InputError, match="rest"):
+        parse_classes([entry | more for entry, more in zip(CLASSES, entries, strict=True)], "classes.json")
+
+
+def test_by_tiles_it_is_the_same(tmp_path, monkeypatch):
+    scene = scene_without_grass(tmp_path / "scene", 200)
+    label_scene(scene, Label(output=tmp_path / "whole.ply"))
+    for module in (tiled_label, tiled_propagate):
+        monkeypatch.setattr(module, "max_points", lambda *_: 4000)
+    label_by_tiles(scene, Label(cloud=tmp_path / "whole.ply", output=tmp_path / "tiled.ply"))
+    label_scene(scene, Label(cloud=tmp_path / "whole.ply", output=tmp_path / "again.ply", surface="surfels"))
+    first, second = (read_cloud(tmp_path / name).point for name in ("again.ply", "tiled.ply"))
+    assert set(first) == set(second) and "votes_none" in first
+    for name in first:  # surfels by tile may differ in the last digit of a range, and so of a vote
+        allowed = 1e-3 if name.startswith("votes") or name == "confidence" else 0
+        np.testing.assert_allclose(first[name].numpy(), second[name].numpy(), atol=allowed, err_msg=name)
+    results = []
+    for run, name in ((propagate_scene, "a.ply"), (propagate_by_tiles, "b.ply")):
+        settings = Propagate(seeds=tmp_path / "tiled.ply", output=tmp_path / name)
+        figures = run(scene, settings).figures()
+        results.append((read_cloud(tmp_path / name).point, figures["labelled"]))
+    (whole, share), (tiled, other) = results
+    assert share == other and share != "100.0%"
+    np.testing.assert_array_equal(whole["label"].numpy(), tiled["label"].numpy())
+    np.testing.assert_array_equal(whole["state"].numpy(), tiled["state"].numpy())
+    np.testing.assert_allclose(whole["confidence"].numpy(), tiled["confidence"].numpy(), atol=1e-3)
