@@ -11,7 +11,7 @@ from PIL import Image
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.geometry.raycast import Surface
-from sc3d.io.clouds import read_cloud
+from sc3d.io.clouds import read_cloud, write_geometry
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.fusion import fuse
 from sc3d.labelling.label import label_scene
@@ -205,7 +205,10 @@ def test_a_rest_that_cannot_be_is_refused(entries):
 
 def test_by_tiles_it_is_the_same(tmp_path, monkeypatch):
     scene = scene_without_grass(tmp_path / "scene", 200)
-    label_scene(scene, Label(output=tmp_path / "whole.ply"))
+    label_scene(scene, Label(output=tmp_path / "whole.ply"))  # which has normals
+    cloud = read_cloud(tmp_path / "whole.ply")  # off the regular grid, where neighbors are as near as others
+    cloud.point["positions"] += np.random.default_rng(1).normal(0, 0.01, cloud.point["positions"].shape)
+    write_geometry(tmp_path / "whole.ply", cloud)
     for module in (tiled_label, tiled_propagate):
         monkeypatch.setattr(module, "max_points", lambda *_: 4000)
     label_by_tiles(scene, Label(cloud=tmp_path / "whole.ply", output=tmp_path / "tiled.ply"))
