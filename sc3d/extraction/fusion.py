@@ -68,8 +68,8 @@ def fuse_views(
 
     voxel_size: world units. Raises Sc3dError where nothing is confirmed.
     """
-    fusion, confirmed = _fused(data, store, voxel_size)
-    parts = [_part(fusion)]
+    part, confirmed = _fused(data, store, voxel_size)
+    parts = [part]
     _see(data, store, parts[0][0])
     shares = {"continued": 0.0, "occluders": 0.0}
     steps = {"continued": _continued, "occluders": _occluding}
@@ -88,8 +88,8 @@ def fuse_views(
     return Surfaces(mesh, cloud, voxel_size, confirmed, **shares, coverage=coverage, cropped=left_out)
 
 
-def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[DepthFusion, float]:
-    """The field of all confirmed depth in range, and its share of all pixels."""
+def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[Part, float]:
+    """The surface of all confirmed depth in range, and its share of all pixels."""
     fusion, shares = DepthFusion(voxel_size), list[float]()
     for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
         known = store.read(row, "confirmed")
@@ -103,7 +103,7 @@ def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[D
     if few := hardly_confirmed([view.name for view in data.views], shares):
         logger.warning(few)
     sizes = [view.width * view.height for view in data.views]
-    return fusion, float(np.average(shares, weights=sizes))
+    return _part(fusion), float(np.average(shares, weights=sizes))
 
 
 def _part(fusion: DepthFusion) -> Part:
