@@ -38,7 +38,7 @@ class Channels:
         return [*map(str, self.ids.tolist()), *(["none"] if self.none else [])]
 
     def with_none(self, labels: np.ndarray, found: np.ndarray) -> np.ndarray:
-        """Channels (any shape, uint8) with the last one where `found` (bool) says so and there is no class."""
+        """Channels (any shape, uint8) with the last one where `found` (bool) says so and no class is."""
         return np.where(found & (labels == 0), np.uint8(self.count - 1), labels) if self.none else labels
 
     @property

@@ -193,7 +193,7 @@ class Scene:
         return mask if opaque.all() else np.where(opaque, mask, 0).astype(np.uint8)
 
     def opaque_pixels_of(self, shape: tuple[int, int], name: str) -> np.ndarray:
-        """(H, W) bool pixels of a mask of this shape, in the frame of the photo as stored, where it is opaque."""
+        """(H, W) bool pixels of a mask of this shape, in the photo's frame as stored, where it is opaque."""
         opaque = self._opaque(name)
         if opaque is None:
             return np.ones(shape, bool)

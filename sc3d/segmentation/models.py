@@ -70,8 +70,8 @@ class PromptedSegmenter(ABC):
         """What the models find in an (H, W, 3) uint8 RGB image, in one look."""
 
     def segment(self, image: np.ndarray) -> Segmentation:
-        """Segment a photo, (H, W, 3) uint8 RGB, as a whole and in tiles. Pixels on which nothing is found, while
-        all classes are looked for, have a confidence as well.
+        """Segment a photo, (H, W, 3) uint8 RGB, as a whole and in tiles. Pixels on which nothing is
+        found, while all classes are looked for, have a confidence as well.
         """
         found = segment_tiled(image, self.find, self._settings.tile, self._settings.overlap)
         if self._looks_for_all:

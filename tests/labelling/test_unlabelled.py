@@ -152,7 +152,7 @@ def test_baselines_ignore_what_is_unlabelled(method):
 
 
 def scene_without_grass(folder: Path, confidence: int | None, entries: list[dict] = CLASSES) -> Scene:
-    """The scene of the builders, whose masks say road or nothing; confidence: of what has no class, None = no map."""
+    """The scene of the builders, whose masks say road or nothing; confidence: of what has no class."""
     scene = Scene(write_bare_scene(folder))
     scene.classes.write_text(json.dumps(entries))
     for view in views():
