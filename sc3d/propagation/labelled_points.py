@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sc3d.propagation.none_evidence import NoneRates
 from sc3d.scene.labels import CORRECTED, SEED, UNLOCKED, Labels
 
 # seeds to learn from: seen by so many views, this share of their votes
@@ -20,6 +21,8 @@ class LabelledPoints:
     points: (N, 3) world; seeds: labels of fusion, which are channels (`sc3d.scene.channels`); votes: (N, C + 1)
         float32 or None, column 0 is ignored; colors: (N, 3) uint8 or None
     up: (3,) of the cameras, None = not known
+    none: the last of the C labels, and the last column of the votes, stand for none of the classes; rates:
+    what is known of the votes for it
     """
 
     points: np.ndarray
@@ -27,6 +30,8 @@ class LabelledPoints:
     votes: np.ndarray | None
     colors: np.ndarray | None
     up: np.ndarray | None = None
+    none: bool = False
+    rates: NoneRates | None = None
 
     def ordered(self, order: np.ndarray) -> LabelledPoints:
         votes, colors = (None if part is None else part[order] for part in (self.votes, self.colors))
@@ -67,6 +72,8 @@ class LabelledPoints:
         """
         sure, start = self.sure if core is None else self.sure & core, self.seed_labels
         sightings = self.sightings
+        if self.none:
+            sure = sure & (start < self.num_classes)
         return np.stack(
             [
                 np.bincount(start[sure & (sightings >= least)], minlength=256)

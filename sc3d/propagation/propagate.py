@@ -5,6 +5,7 @@ method, in the paper's order. By tiles, with the same signature: `tiling.propaga
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from sc3d.georeferencing.up_direction import scene_up
 from sc3d.io.clouds import write_geometry
 from sc3d.propagation.appearance import learn_appearance, plausible, uses_appearance
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
+from sc3d.propagation.none_evidence import NoneRates, count_votes
 from sc3d.propagation.potts import minimize_energy
 from sc3d.propagation.region_growing import grow_regions, reachable, vote_nearest
 from sc3d.scene.channels import Channels
@@ -33,6 +35,8 @@ def propagate(
     geometry, knn: seeds keep their label (with verify_seeds: those that look like their class); map: needs votes
     """
     graph = graph or neighbor_graph(points, normals, settings)  # normals, curvature, similarity (eq. 5 to 7)
+    if points.none:  # how often views find nothing, where there is something
+        points = replace(points, rates=NoneRates.from_counts(count_votes(points.known_votes)))
     known = points.ordered(graph.order)
     appearance = learn_appearance(graph, known) if uses_appearance(settings) else None
     seeds = known.seed_labels
@@ -128,22 +132,30 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     corrections = Corrections.of_scene(scene)
     seeds, counts = corrections.apply(seeds, positions)
     corrections.warn_of_missing(counts, path)
-    if not (seeds.label > 0).any():
+    if not (seeds.label > 0).any():  # none of the classes alone is no start
         raise no_seeds(path)
     colors = cloud.point.colors.numpy() if "colors" in cloud.point else None
     channels = Channels.of_classes(np.unique(seeds.label).tolist()) if votes is None else votes.channels
-    seeds = replace(seeds, label=channels.from_ids(seeds.label, path))
+    seeds = seeds_in_channels(seeds, channels, path)
     values = None if votes is None else votes.values
-    points = LabelledPoints(positions, seeds, values, colors, scene_up(scene))
+    points = LabelledPoints(positions, seeds, values, colors, scene_up(scene), channels.none)
     normals = cloud.point.normals.numpy()
     labels = propagate(points, normals, settings)
     labels = replace(labels, label=channels.to_ids(labels.label))
     write_geometry(settings.output or scene.labelled, with_labels(cloud, normals, labels))
     labelled, sure = labels.label > 0, labels.confidence
-    propagated = int((labels.state == PROPAGATED).sum())
+    propagated = int((labelled & (labels.state == PROPAGATED)).sum())
     total = float(sure[labelled].sum(dtype=np.float64))
     corrected = int((labels.state == CORRECTED).sum())
     return PropagateSummary(len(labelled), int(labelled.sum()), propagated, total, corrected)
+
+
+def seeds_in_channels(seeds: Labels, channels: Channels, origin: Path | str) -> Labels:
+    """Labels of fusion, which are ids, as channels; seeds without a class are of none of them. origin: for
+    errors.
+    """
+    label = channels.from_ids(seeds.label, origin)
+    return replace(seeds, label=channels.with_none(label, np.isin(seeds.state, (SEED, UNLOCKED, CORRECTED))))
 
 
 def no_seeds(path: object) -> InputError:

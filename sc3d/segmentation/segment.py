@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 class Segmentation(NamedTuple):
     """What a backend says of a photo: (H, W) uint8 class id, 0 = unlabelled; (H, W) uint8 confidence, 255 =
-    sure; objects, None if it finds none.
+    sure, of unlabelled pixels that they are of no class, 0 = not looked at; objects, None if it finds none.
     """
 
     labels: np.ndarray

@@ -10,7 +10,7 @@ otherwise than in one piece.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -34,6 +34,7 @@ from sc3d.propagation.appearance import (
     uses_appearance,
 )
 from sc3d.propagation.labelled_points import MIN_EXAMPLES, views_to_agree
+from sc3d.propagation.none_evidence import NoneRates, count_votes
 from sc3d.propagation.potts import STEPS, appearance_marginals, decided, sure_examples, vote_marginals
 from sc3d.propagation.propagate import PropagateSummary, fill_from_nearest, no_seeds, spread, with_states
 from sc3d.propagation.quantile_sketch import QuantileSketch
@@ -112,8 +113,10 @@ def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
         sum(summary.seeds for summary in summaries) > 0,
         views_to_agree(sum(summary.agreement for summary in summaries)),
     )
-    if not offered.any():
+    if not offered[: len(job.channels.ids) - 1].any():
         raise no_seeds(path)
+    if job.channels.none:
+        job = replace(job, rates=NoneRates.from_counts(sum(summary.found for summary in summaries)))
     statistics = (
         _learn(job, executor, NormalStatistics.merge([summary.lean for summary in summaries]), least)
         if uses_appearance(job.settings)
@@ -137,13 +140,14 @@ def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
 @dataclass(frozen=True)
 class TileSummary:
     """First look at a tile. seeds: (C,) int64 of each class; agreement: as `LabelledPoints.agreement`; lean: of its
-    surfaces; touched: as counts of `Corrections.apply`
+    surfaces; touched: as counts of `Corrections.apply`; found: as `none_evidence.count_votes`
     """
 
     seeds: np.ndarray
     agreement: np.ndarray
     lean: NormalStatistics
     touched: np.ndarray
+    found: np.ndarray
 
 
 def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
@@ -154,6 +158,7 @@ def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
         part.known.agreement(core),
         NormalStatistics.from_normals(part.graph.normals[core], part.graph.spacings[core]),
         job.results.read(tile, "touched"),
+        count_votes(part.known.known_votes[core]) if job.channels.none else np.zeros((0, 2), np.int64),
     )
 
 
@@ -245,7 +250,7 @@ def _turn_task(
             raise ValueError("a round needs examples of two classes")
         evidence, marginals = appearance_marginals(part.graph, known, offered, rating, job.settings)
         examples = sure_examples(marginals, known)
-        label, confidence = decided(part.graph, evidence, marginals)
+        label, confidence = decided(part.graph, known, evidence, marginals)
         names = (f"round{turn}_label", f"round{turn}_confidence", f"round{turn}_examples")
         job.results.write(
             tile,
@@ -266,9 +271,8 @@ def _once_task(
     """map without appearance, geometry or knn, within the margin."""
     part = TileGraph.load(job, tile)
     if job.settings.method == "map":
-        label, confidence = decided(
-            part.graph, *vote_marginals(part.graph, part.known, offered, job.settings)
-        )
+        found = vote_marginals(part.graph, part.known, offered, job.settings)
+        label, confidence = decided(part.graph, part.known, *found)
     else:
         start = _start(job, part, statistics)
         label, confidence = spread(part.graph, part.known.points, start, job.settings)
@@ -369,7 +373,7 @@ def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
             for name, _ in kept:
                 result[name] = values[name] if name in values else records[name]
             labelled = values["label"] > 0
-            states = [(values["state"] == state).sum() for state in (PROPAGATED, CORRECTED)]
+            states = (labelled & (values["state"] == PROPAGATED)).sum(), (values["state"] == CORRECTED).sum()
             counts[:] += len(records), labelled.sum(), *states
             confidence[0] += float(values["confidence"][labelled].sum(dtype=np.float64))
             yield result

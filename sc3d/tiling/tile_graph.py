@@ -4,7 +4,7 @@ arrays of the tile's own points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,8 @@ from sc3d.propagation.appearance import (
     Histogram,
 )
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
+from sc3d.propagation.none_evidence import NoneRates
+from sc3d.propagation.propagate import seeds_in_channels
 from sc3d.propagation.terrain import NUM_FEATURES
 from sc3d.scene.channels import Channels
 from sc3d.scene.corrections import Corrections
@@ -36,8 +38,9 @@ KNOWN = ("points", "votes", *(field.name for field in fields(Labels)), "colors")
 
 @dataclass(frozen=True)
 class PropagateJob:
-    """What the task of a tile needs to know. margin: world units; channels: of the votes; shared:
-    folder for what all tiles read; up: (3,) of the cameras, None = not known
+    """What the task of a tile needs to know. margin: world units; channels: of the votes; shared: folder
+    for what all tiles read; up: (3,) of the cameras, None = not known; rates: of votes for none, once
+    counted
     """
 
     settings: Propagate
@@ -49,6 +52,7 @@ class PropagateJob:
     shared: Path
     up: np.ndarray | None = None
     corrections: Corrections = Corrections()
+    rates: NoneRates | None = None
 
     @property
     def colored(self) -> bool:
@@ -73,7 +77,12 @@ class TileGraph:
             _build(job, tile, halo)
         graph, known = Graph(*_mapped(job, tile, GRAPH)), _mapped(job, tile, KNOWN)
         evidence = LabelledPoints(
-            known[0], Labels(*known[2:-1]), known[1], known[-1] if job.colored else None
+            known[0],
+            Labels(*known[2:-1]),
+            known[1],
+            known[-1] if job.colored else None,
+            none=job.channels.none,
+            rates=job.rates,
         )
         return cls(tile, halo, graph, evidence, halo.core[graph.order])
 
@@ -149,7 +158,7 @@ def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np
         )
     )
     labels, touched = job.corrections.apply(labels, points)
-    labels = replace(labels, label=job.channels.from_ids(labels.label, "the cloud"))
-    votes = columns(records, [f"{VOTES}{label}" for label in job.channels.ids])
+    labels = seeds_in_channels(labels, job.channels, "the cloud")
+    votes = columns(records, [f"{VOTES}{name}" for name in job.channels.names])
     known = LabelledPoints(points, labels, votes, columns(records, ("red", "green", "blue")))
     return known, columns(records, ("nx", "ny", "nz")), touched
