@@ -59,13 +59,14 @@ def test_run_makes_masks_first_where_depth_takes_sky_from_them(scene, monkeypatc
     stages: list[str] = []
     table = [{"id": 1, "name": "road", "color": [1, 1, 1]}, {"id": 3, "name": name, "color": [9, 9, 9]}]
     (scene / "classes.json").write_text(json.dumps(table))
-    for step in ("check", "prepare", "reconstruct"):
+    for step in ("check", "prepare", "tell_plan"):
         monkeypatch.setattr(run, step, lambda *arguments: None)
     monkeypatch.setattr(run, "execute", lambda stage, *arguments: stages.append(stage))
     main(["run", "photos", str(scene), *options])
     others = [stage for stage in stages if stage != "segment"]
-    assert others == ["depth", "train", "extract", "label", "propagate", "report"]
-    assert stages[0] == first and stages.index("segment") in (0, 3)
+    surface = ["depth", "train", "extract", "label", "propagate", "report"]
+    assert others == ["map_photos", "reconstruct", *surface]
+    assert stages[2] == first and stages.index("segment") in (2, 5)
 
 
 @pytest.mark.parametrize(
@@ -294,9 +295,9 @@ def test_options_as_they_were_spelled_before_are_taken_with_a_warning(before, no
 
 
 def test_old_spellings_reach_the_records(tmp_path):
-    assert parse("extract", current([str(tmp_path), "--from", "centres"])).settings.method == "centers"
-    assert parse("train", current([str(tmp_path), "--num-neighbours", "5"])).settings.num_neighbors == 5
-    assert parse("run", current(["a", "b", "--label.incidence"])).label.mechanisms.incidence
+    assert parse("extract", current([str(tmp_path), "--from", "centres"]))[0].settings.method == "centers"
+    assert parse("train", current([str(tmp_path), "--num-neighbours", "5"]))[0].settings.num_neighbors == 5
+    assert parse("run", current(["a", "b", "--label.incidence"]))[0].label.mechanisms.incidence
 
 
 @pytest.mark.parametrize(
@@ -305,9 +306,9 @@ def test_old_spellings_reach_the_records(tmp_path):
 def test_coverage_is_told_what_it_is_now(tmp_path, caplog, share, fill):
     for arguments in (["--coverage", share], [f"--coverage={share}"]):
         caplog.clear()
-        assert parse("extract", current([str(tmp_path), *arguments])).settings.fill == fill
+        assert parse("extract", current([str(tmp_path), *arguments]))[0].settings.fill == fill
         assert f"--coverage {share} is --fill {fill} now" in caplog.text
-    assert parse("run", current(["a", "b", "--extract.coverage", share])).extract.fill == fill
+    assert parse("run", current(["a", "b", "--extract.coverage", share]))[0].extract.fill == fill
 
 
 def test_commands_that_became_tools_say_where_they_are(capsys):

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import open3d as o3d
-from tqdm import tqdm
 
 from sc3d.errors import Sc3dError
 from sc3d.extraction.crop import cropped
@@ -18,6 +17,7 @@ from sc3d.extraction.free_space import MARGIN, count_opposed, farthest_free
 from sc3d.geometry.cameras import View
 from sc3d.geometry.raycast import Surface, first_surface
 from sc3d.geometry.tsdf import DepthFusion, Part, cloud_in_order, drop_small_parts, near_mesh, pixel_squares
+from sc3d.io.progress import progress
 from sc3d.scene.depth_map import hardly_confirmed
 from sc3d.settings.reconstruction import Fill
 from sc3d.stereo.completion import nearest_by_color
@@ -91,7 +91,7 @@ def fuse_views(
 def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[DepthFusion, float]:
     """The field of all confirmed depth in range, and its share of all pixels."""
     fusion, shares = DepthFusion(voxel_size), list[float]()
-    for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
+    for row, view in enumerate(progress(data.views, "fusing", "view")):
         known = store.read(row, "confirmed")
         known[known >= data.depth_range[1]] = 0
         added = fusion.integrate(view, known, data.image(row), data.depth_range[1])
