@@ -89,6 +89,7 @@ def _execute(name: str, scene: Scene, settings: object, overwrite: bool) -> dict
         logger.info("%s: up to date (--overwrite runs it again)", name)
         return previous["summary"]
     besides = stage.besides(scene, settings) if hasattr(stage, "besides") else []
+    logger.debug("%s: settings %s, inputs %s", name, record["settings"], record["inputs"])
     _prepare(scene, outputs, besides, getattr(settings, "output", None))
     started = time.perf_counter()
     reset_peak_memory()

@@ -31,7 +31,7 @@ def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) 
     images: folder; names: photos relative to it
     """
     pycolmap.set_random_seed(settings.seed)
-    pycolmap.logging.minloglevel = 2
+    pycolmap.logging.minloglevel = 0 if logger.isEnabledFor(logging.DEBUG) else 2
     if settings.camera_model not in pycolmap.CameraModelId.__members__ or settings.camera_model == "INVALID":
         raise InputError(
             f"unknown camera model {settings.camera_model!r}: one of {', '.join(list(pycolmap.CameraModelId.__members__)[1:])}"
