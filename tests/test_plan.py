@@ -91,7 +91,10 @@ def test_the_plan_names_what_runs_and_adds_up_only_that(stages):
 
 
 def test_what_was_never_measured_has_no_time(stages):
-    stages = [(name, replace(settings, backend="strokes") if name == "segment" else settings) for name, settings in stages]
+    stages = [
+        (name, replace(settings, backend="strokes") if name == "segment" else settings)
+        for name, settings in stages
+    ]
     told = plan(stages, [name == "segment" for name, _ in stages], [(1600, 900)] * 18)
     assert told.count("not known how long") == 2 and "and what is not known" in told
 

@@ -30,7 +30,7 @@ def write_rendered(
     of a pixel on the surface, world units.
     """
     footprint = _render(gaussians, data, store, mode)
-    for row in range(len(data.views)):
+    for row in progress(range(len(data.views)), "confirming", "view"):
         store.write(row, _evidence(data, store, row, min_views))
     return footprint
 

@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, cast
 
 from sc3d.errors import Sc3dError
-from sc3d.io.progress import Progress
+from sc3d.io.progress import Progress, show_bars
 
 RETRIES = 3  # of a task whose worker is lost; more, and the task itself is what kills it
 Message = tuple[str, int, str]  # name of the logger, level, text
@@ -178,6 +178,7 @@ def _work(connection: Connection) -> None:
     messages = _Messages()
     logging.getLogger().addHandler(messages)
     logging.captureWarnings(True)
+    show_bars(False)  # its parent has one
     function: Callable | None = None
     while True:
         try:

@@ -130,9 +130,7 @@ def test_steps_from_several_threads_are_all_counted(board):
     import threading
 
     with Progress(8000, "voting", "view", board=board) as task:
-        threads = [
-            threading.Thread(target=lambda: [task.update() for _ in range(1000)]) for _ in range(8)
-        ]
+        threads = [threading.Thread(target=lambda: [task.update() for _ in range(1000)]) for _ in range(8)]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -166,7 +164,14 @@ def test_an_interrupted_loop_is_not_under_way_any_more(board):
 
 @pytest.mark.parametrize(
     ("seconds", "told"),
-    [(0, "0 s"), (99.4, "99 s"), (99.5, "2 min"), (3600, "60 min"), (5999, "1 h 40 min"), (86400, "24 h 0 min")],
+    [
+        (0, "0 s"),
+        (99.4, "99 s"),
+        (99.5, "2 min"),
+        (3600, "60 min"),
+        (5999, "1 h 40 min"),
+        (86400, "24 h 0 min"),
+    ],
 )
 def test_durations(seconds, told):
     assert duration(seconds) == told
@@ -206,7 +211,9 @@ def test_a_terminal_gets_a_bar_instead_and_the_file_all_lines(logs, monkeypatch,
     text = told_to(Terminal(), monkeypatch, log)
     assert "4/4" in text and "so far" not in text and text.count("a message?") == 4
     written = log.read_text(encoding="utf-8")
-    assert written.startswith("before\n") and written.count("so far\n") == 2 and written.count("message?") == 4
+    assert (
+        written.startswith("before\n") and written.count("so far\n") == 2 and written.count("message?") == 4
+    )
     assert not CONTROL.search(written)
     assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d \S", line) for line in written.splitlines()[1:])
 
