@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sc3d.errors import InputError
@@ -75,6 +78,25 @@ def _opened(path: Path) -> LogFile:
         raise InputError(
             f"--log {path}: cannot write ({error.strerror}): name a file in a folder that exists"
         ) from None
+
+
+@contextmanager
+def messages_to(descriptor: int) -> Iterator[None]:
+    """Write to `descriptor`, where stderr leads to outside, while the block has its number lead elsewhere."""
+    stderr = 2
+    found = []
+    for handler in logging.getLogger().handlers:
+        with suppress(OSError, ValueError):  # a stream without number, as in tests
+            if isinstance(handler, ErrorStream) and handler.stream.fileno() == stderr:
+                found.append((handler, handler.stream))
+    with open(os.dup(descriptor), "w", encoding=sys.stderr.encoding, errors="backslashreplace") as stream:
+        for handler, _ in found:
+            handler.setStream(stream)
+        try:
+            yield
+        finally:
+            for handler, before in found:
+                handler.setStream(before)
 
 
 def write_to_log_file(text: str) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import logging
+import os
 import re
 import sys
 from pathlib import Path
@@ -238,3 +239,27 @@ def test_bars_are_made_in_one_place_only():
         if re.search(r"^\s*(from|import) tqdm", file.read_text("utf-8"), re.M)
     ]
     assert users == ["io/progress.py"]
+
+
+def test_messages_are_not_lost_where_a_library_is_kept_quiet(logs, monkeypatch, tmp_path):
+    """As the pictures of the report are: file descriptor 2 leads elsewhere meanwhile."""
+    heard, kept = tmp_path / "heard", tmp_path / "kept"
+    saved = os.dup(2)
+    with heard.open("w") as first, kept.open("w") as second:
+        try:
+            os.dup2(first.fileno(), 2)
+            monkeypatch.setattr(sys, "stderr", open(2, "w", closefd=False))
+            monkeypatch.setattr(logging.getLogger(), "handlers", [])
+            messages.start_logging()
+            outside = os.dup(2)
+            os.dup2(second.fileno(), 2)
+            with messages.messages_to(outside):
+                logging.getLogger("sc3d.x").info("during")
+                os.write(2, b"chatter")
+            os.dup2(outside, 2)
+            os.close(outside)
+            logging.getLogger("sc3d.x").info("after")
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+    assert heard.read_text() == "during\nafter\n" and kept.read_text() == "chatter"
