@@ -78,7 +78,7 @@ def test_the_log_has_plan_stages_and_results_and_no_control_characters(scene):
     log = (scene.parent / "file.log").read_text(encoding="utf-8")
     assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", log)
     places = [
-        log.index(told) for told in ("plan: 9 of 9 stages", "wrote", "look at", "labelled cloud", "--web")
+        log.index(told) for told in ("plan: 10 of 10 stages", "wrote", "look at", "labelled cloud", "--web")
     ]
     assert places == sorted(places)
 
