@@ -198,7 +198,8 @@ def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
     far = np.where(covered, (1 - MARGIN) * hit, np.where(inside, data.depth_range[1], 0)).astype(np.float32)
     depth = farthest_free(far, nearest, view, *others)
     depth = cv2.medianBlur(depth, 5)
-    depth = np.where(empty & (depth == 0), _spread(depth, data.image(row)), depth)
+    before_sky = np.where(inside, depth, 0)  # as leaves do that go on where nothing is known
+    depth = np.where(empty & (depth == 0), _spread(before_sky, data.image(row)), depth)
     return farthest_free(depth, nearest, view, *others, bounded=True), None
 
 

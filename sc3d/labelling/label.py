@@ -52,7 +52,7 @@ class LabelSummary:
         states = {
             name: f"{share:.1%}"
             for name, share in zip(STATE_NAMES, shares, strict=True)
-            if name != "propagated"
+            if name not in ("propagated", "corrected")
         }
         size = round(self.voxel_size, 5)
         turned = {"normals_turned": self.num_turned} if self.num_turned else {}

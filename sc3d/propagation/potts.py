@@ -50,6 +50,7 @@ def vote_marginals(
     """
     likelihood = vote_likelihood(known.known_votes)
     likelihood[:, ~offered] = -np.inf
+    hold_corrected(likelihood, known)
     # else the votes would take one edge per step to reach points without any
     grown, _ = grow_regions(graph, known.seed_labels)
     marginals = softmax(likelihood)
@@ -64,12 +65,25 @@ def appearance_marginals(
     """The same from votes and appearance; rating: (N, C) of the appearance, overwritten."""
     rating += np.float32(TRUST) * vote_likelihood(known.known_votes)
     rating[:, ~offered] = -np.inf
+    hold_corrected(rating, known)
     return rating, mean_field(graph, rating, settings.smoothness)  # afresh: sure marginals would not move
+
+
+def hold_corrected(likelihood: np.ndarray, known: LabelledPoints) -> None:
+    """Make the log-likelihood (N, C), in place, certain of what people have corrected; what is none of
+    the classes is no evidence of any.
+    """
+    label = known.seeds.label.astype(np.int64)
+    likelihood[known.corrected & (label == 0)] = 0
+    rows = np.flatnonzero(known.corrected & (label > 0))
+    likelihood[rows] = -np.inf
+    likelihood[rows, label[rows] - 1] = 0
 
 
 def sure_examples(marginals: np.ndarray, known: LabelledPoints) -> np.ndarray:
     """(N,) bool points that a later round learns from."""
-    return (marginals.max(axis=1) > SURE) & (known.seeds.num_views > 0)
+    is_none = known.corrected & (known.seeds.label == 0)
+    return (marginals.max(axis=1) > SURE) & (known.sightings > 0) & ~is_none
 
 
 def decided(graph: Graph, evidence: np.ndarray, marginals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

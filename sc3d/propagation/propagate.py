@@ -17,8 +17,9 @@ from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
 from sc3d.propagation.potts import minimize_energy
 from sc3d.propagation.region_growing import grow_regions, reachable, vote_nearest
 from sc3d.scene.channels import Channels
+from sc3d.scene.corrections import Corrections
 from sc3d.scene.labelled_cloud import read_labelled, read_votes, with_labels
-from sc3d.scene.labels import LOCKED, PROPAGATED, SEED, UNLOCKED, Labels
+from sc3d.scene.labels import CORRECTED, LOCKED, PROPAGATED, SEED, UNLOCKED, Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
 
@@ -41,7 +42,9 @@ def propagate(
         )  # eq. 8, with the sign of Potts
         label = np.where(reachable(graph, seeds), label, 0).astype(np.uint8)
     else:
-        seeds = seeds if appearance is None else plausible(seeds, appearance.log_likelihood(seeds))
+        if appearance is not None:
+            kept = plausible(seeds, appearance.log_likelihood(seeds))
+            seeds = np.where(known.corrected, seeds, kept)
         label, confidence = spread(graph, known.points, seeds, settings)  # eq. 9
     if settings.fill:
         label, confidence = fill_from_nearest(known.points, label, confidence)
@@ -77,11 +80,14 @@ def fill_from_nearest(
 def with_states(
     given: Labels, seeds: np.ndarray, found: tuple[np.ndarray, np.ndarray], settings: Propagate
 ) -> Labels:
-    """The labels found, (N,) each with its confidence, and what they mean: kept seeds, propagated, or doubted seeds."""
-    label, confidence = found
+    """The labels found, (N,) each with its confidence, and what they mean: kept seeds, propagated, or
+    doubted seeds; what people have corrected is theirs.
+    """
+    corrected = given.state == CORRECTED
+    label, confidence = np.where(corrected, given.label, found[0]), np.where(corrected, 1, found[1])
     kept = (seeds > 0) & (label == seeds)
     doubted = np.where(np.isin(given.state, (SEED, UNLOCKED)) & (label == 0), LOCKED, given.state)
-    state = np.where(kept, given.state, np.where(label > 0, PROPAGATED, doubted))
+    state = np.where(kept | corrected, given.state, np.where(label > 0, PROPAGATED, doubted))
     confidence = np.where(kept & (settings.method != "map"), given.confidence, confidence)
     confidence = np.where(label == 0, 0, confidence).astype(np.float32)
     return Labels(label.astype(np.uint8), confidence, state.astype(np.uint8), given.num_views)
@@ -89,14 +95,15 @@ def with_states(
 
 @dataclass(frozen=True)
 class PropagateSummary:
-    """Of a finished cloud: points, those with a label, those that got it here, and the sum of the labelled points'
-    confidences.
+    """Of a finished cloud: points, those with a label, those that got it here, the sum of the labelled
+    points' confidences, and those that people corrected.
     """
 
     num_points: int
     labelled: int
     propagated: int
     confidence: float
+    corrected: int = 0
 
     def figures(self) -> dict[str, object]:
         """What the stage reports."""
@@ -105,7 +112,7 @@ class PropagateSummary:
             "labelled": f"{self.labelled / self.num_points:.1%}",
             "propagated": f"{self.propagated / self.num_points:.1%}",
             "mean_confidence": round(self.confidence / max(self.labelled, 1), 3),
-        }
+        } | ({"corrected": self.corrected} if self.corrected else {})
 
 
 def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
@@ -117,13 +124,17 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
         raise InputError(
             f"{path} has no votes, which --method map needs: run `sc3d label` again, or choose --method geometry"
         )
+    positions = cloud.point.positions.numpy().astype(np.float64)
+    corrections = Corrections.of_scene(scene)
+    seeds, counts = corrections.apply(seeds, positions)
+    corrections.warn_of_missing(counts, path)
     if not (seeds.label > 0).any():
         raise no_seeds(path)
     colors = cloud.point.colors.numpy() if "colors" in cloud.point else None
     channels = Channels.of_classes(np.unique(seeds.label).tolist()) if votes is None else votes.channels
     seeds = replace(seeds, label=channels.from_ids(seeds.label, path))
-    values, positions = None if votes is None else votes.values, cloud.point.positions.numpy()
-    points = LabelledPoints(positions.astype(np.float64), seeds, values, colors, scene_up(scene))
+    values = None if votes is None else votes.values
+    points = LabelledPoints(positions, seeds, values, colors, scene_up(scene))
     normals = cloud.point.normals.numpy()
     labels = propagate(points, normals, settings)
     labels = replace(labels, label=channels.to_ids(labels.label))
@@ -131,7 +142,8 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     labelled, sure = labels.label > 0, labels.confidence
     propagated = int((labels.state == PROPAGATED).sum())
     total = float(sure[labelled].sum(dtype=np.float64))
-    return PropagateSummary(len(labelled), int(labelled.sum()), propagated, total)
+    corrected = int((labels.state == CORRECTED).sum())
+    return PropagateSummary(len(labelled), int(labelled.sum()), propagated, total, corrected)
 
 
 def no_seeds(path: object) -> InputError:

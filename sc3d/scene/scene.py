@@ -121,6 +121,10 @@ class Scene:
         return self.path / "labelled.ply"
 
     @property
+    def corrections(self) -> Path:
+        return self.path / "corrections.json"
+
+    @property
     def metrics(self) -> Path:
         return self.path / "metrics.json"
 

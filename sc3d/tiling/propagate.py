@@ -22,7 +22,7 @@ from sc3d.errors import InputError
 from sc3d.georeferencing.up_direction import scene_up
 from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.ply import read_header, write_records
-from sc3d.io.provenance import PhotoFrames
+from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.propagation.appearance import (
     AppearanceModel,
     AppearanceStatistics,
@@ -38,8 +38,9 @@ from sc3d.propagation.potts import STEPS, appearance_marginals, decided, sure_ex
 from sc3d.propagation.propagate import PropagateSummary, fill_from_nearest, no_seeds, spread, with_states
 from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.terrain import WINDOWS, GroundModel, NormalStatistics
+from sc3d.scene.corrections import Corrections
 from sc3d.scene.labelled_cloud import VOTES, vote_channels
-from sc3d.scene.labels import PROPAGATED
+from sc3d.scene.labels import CORRECTED, PROPAGATED
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
 from sc3d.tiling.executor import Executor, open_executor
@@ -82,8 +83,10 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
             raise InputError(f"{cloud.path} has no attribute {name!r}: it was not written by `sc3d label`")
     if channels is None:
         raise InputError(f"{cloud.path} has votes of no class: it was not written by `sc3d label`")
+    corrections = Corrections.of_scene(scene)
+    decisive: list[Input] = [cloud.path, scene.sparse, PhotoFrames(scene.images), *corrections.files]
     folder, statistics = (
-        WorkFolder(output, "propagate", [cloud.path, scene.sparse, PhotoFrames(scene.images)], settings),
+        WorkFolder(output, "propagate", decisive, settings),
         CloudStatistics.from_cloud(cloud),
     )
     room = max_points(settings, bytes_per_point(channels.count))
@@ -91,7 +94,8 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
     margin = HOPS * EDGE * sample_spacing(store, statistics)[0]
     results, shared = Results(folder.subfolder("results"), store), folder.subfolder("shared")
-    job = PropagateJob(settings, statistics.extent, store, results, margin, channels, shared, scene_up(scene))
+    up = scene_up(scene)
+    job = PropagateJob(settings, statistics.extent, store, results, margin, channels, shared, up, corrections)
     with open_executor(settings) as executor:
         _solve(job, executor, cloud.path)
     summary = _write(output, cloud, job)
@@ -103,6 +107,7 @@ def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
     """All passes; leaves arrays `label`, `confidence` and `state` of every tile."""
     tiles = job.store.tiles
     summaries = executor.run("graph", partial(_graph_task, job), tiles)
+    job.corrections.warn_of_missing(np.sum([summary.touched for summary in summaries], axis=0), path)
     offered, least = (
         sum(summary.seeds for summary in summaries) > 0,
         views_to_agree(sum(summary.agreement for summary in summaries)),
@@ -132,12 +137,13 @@ def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
 @dataclass(frozen=True)
 class TileSummary:
     """First look at a tile. seeds: (C,) int64 of each class; agreement: as `LabelledPoints.agreement`; lean: of its
-    surfaces
+    surfaces; touched: as counts of `Corrections.apply`
     """
 
     seeds: np.ndarray
     agreement: np.ndarray
     lean: NormalStatistics
+    touched: np.ndarray
 
 
 def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
@@ -147,6 +153,7 @@ def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
         np.bincount(start[core], minlength=job.channels.count)[1:],
         part.known.agreement(core),
         NormalStatistics.from_normals(part.graph.normals[core], part.graph.spacings[core]),
+        job.results.read(tile, "touched"),
     )
 
 
@@ -274,7 +281,11 @@ def _start(job: PropagateJob, part: TileGraph, statistics: AppearanceStatistics 
     return (
         start
         if statistics is None or job.settings.method == "map"
-        else plausible(start, part.appearance(job).log_likelihood(statistics, start))
+        else np.where(
+            part.known.corrected,
+            start,
+            plausible(start, part.appearance(job).log_likelihood(statistics, start)),
+        )
     )
 
 
@@ -349,7 +360,7 @@ def _state_task(
 
 def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
     kept = [(name, cloud.dtype[name].str[1:]) for name in cloud.names if not name.startswith(VOTES)]
-    counts, confidence = np.zeros(3, np.int64), [0.0]
+    counts, confidence = np.zeros(4, np.int64), [0.0]
 
     def chunks():
         found = job.results.in_order(["label", "confidence", "state"], cloud.rows_at_once)
@@ -358,10 +369,11 @@ def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
             for name, _ in kept:
                 result[name] = values[name] if name in values else records[name]
             labelled = values["label"] > 0
-            counts[:] += len(records), labelled.sum(), (values["state"] == PROPAGATED).sum()
+            states = [(values["state"] == state).sum() for state in (PROPAGATED, CORRECTED)]
+            counts[:] += len(records), labelled.sum(), *states
             confidence[0] += float(values["confidence"][labelled].sum(dtype=np.float64))
             yield result
 
     write_records(path, chunks(), np.dtype(kept), cloud.num_points, ["sc3d"])
-    num_points, labelled, propagated = counts.tolist()
-    return PropagateSummary(num_points, labelled, propagated, confidence[0])
+    num_points, labelled, propagated, corrected = counts.tolist()
+    return PropagateSummary(num_points, labelled, propagated, confidence[0], corrected)

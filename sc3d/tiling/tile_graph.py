@@ -23,6 +23,7 @@ from sc3d.propagation.appearance import (
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
 from sc3d.propagation.terrain import NUM_FEATURES
 from sc3d.scene.channels import Channels
+from sc3d.scene.corrections import Corrections
 from sc3d.scene.labelled_cloud import VOTES
 from sc3d.scene.labels import Labels
 from sc3d.settings.labels import Propagate
@@ -47,6 +48,7 @@ class PropagateJob:
     channels: Channels
     shared: Path
     up: np.ndarray | None = None
+    corrections: Corrections = Corrections()
 
     @property
     def colored(self) -> bool:
@@ -110,7 +112,7 @@ def cells_of(appearance: AppearanceModel) -> np.ndarray:
 
 
 def _build(job: PropagateJob, tile: int, halo: TileWithHalo) -> None:
-    evidence, normals = _evidence(job, halo)
+    evidence, normals, touched = _evidence(job, halo)
     colors, box = evidence.colors if job.settings.color else None, (job.extent.low, job.extent.high)
     graph = build_graph(
         evidence.points, normals, job.settings.num_neighbors, colors, tie_breakers(evidence, normals), box
@@ -122,6 +124,7 @@ def _build(job: PropagateJob, tile: int, halo: TileWithHalo) -> None:
         *(getattr(known.seeds, field.name) for field in fields(Labels)),
         known.colors if job.colored else np.empty(0),
     )
+    job.results.write(tile, touched=touched)
     for names, arrays in ((GRAPH, [getattr(graph, name) for name in GRAPH]), (KNOWN, values)):
         job.results.write(tile, **{f"part_{name}": array for name, array in zip(names, arrays, strict=True)})
 
@@ -130,9 +133,10 @@ def _mapped(job: PropagateJob, tile: int, names: tuple[str, ...]) -> list[np.nda
     return [np.asarray(job.results.read(tile, f"part_{name}", mapped=True)) for name in names]
 
 
-def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np.ndarray | None]:
-    """What is known of the window's points, by row, and their normals."""
+def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np.ndarray | None, np.ndarray]:
+    """What is known of the window's points, by row, their normals, and how many lie in each correction."""
     records = halo.gather(job.store.records)
+    points = positions(records)
     labels = Labels(
         *(
             records[name].astype(kind)
@@ -144,8 +148,8 @@ def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np
             )
         )
     )
+    labels, touched = job.corrections.apply(labels, points)
     labels = replace(labels, label=job.channels.from_ids(labels.label, "the cloud"))
     votes = columns(records, [f"{VOTES}{label}" for label in job.channels.ids])
-    return LabelledPoints(
-        positions(records), labels, votes, columns(records, ("red", "green", "blue"))
-    ), columns(records, ("nx", "ny", "nz"))
+    known = LabelledPoints(points, labels, votes, columns(records, ("red", "green", "blue")))
+    return known, columns(records, ("nx", "ny", "nz")), touched
