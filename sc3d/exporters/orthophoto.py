@@ -9,7 +9,6 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 import open3d as o3d
-from tqdm import tqdm
 
 from sc3d.exporters.packages import load
 from sc3d.exporters.projected_cloud import ProjectedCloud, read_projected_cloud
@@ -18,6 +17,7 @@ from sc3d.geometry.raster import Raster, close_gaps, highest_points, spacing_of_
 from sc3d.geometry.raycast import Surface
 from sc3d.io.atomic import atomic_path
 from sc3d.io.clouds import read_mesh
+from sc3d.io.progress import progress
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import REACH
 from sc3d.scene.scene import Scene
@@ -177,7 +177,7 @@ def _fill(
         )
         for dataset, name in ((classes, "class"), (height, "height of the surface")):
             dataset.set_band_description(1, name)
-        for first_row in tqdm(range(0, grid.height, TILE), desc="rendering maps", unit="strip", disable=None):
+        for first_row in progress(range(0, grid.height, TILE), "rendering maps", "strip"):
             num_rows = min(TILE, grid.height - first_row)
             heights, rows = view.render_rows(first_row, num_rows)
             window = rasterio.windows.Window(0, first_row, grid.width, num_rows)

@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from tqdm import tqdm
 
 from sc3d.geometry.cameras import View, may_see
 from sc3d.geometry.raycast import RayTarget
 from sc3d.geometry.voxels import LabelGrid
+from sc3d.io.progress import progress
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.observation import ReadMask, observations
 from sc3d.labelling.voting import SCALE, VoteAccumulator, VoteWeighting
@@ -66,7 +66,7 @@ def fuse(
     )
     # pixel to first surface (eq. 4), semantic confidence voting
     seen = observations(views, read_mask, surface if settings.depth_filter else None, settings)
-    for view, observation in tqdm(seen, desc="voting", unit="view", total=len(views), disable=None):
+    for view, observation in progress(seen, "voting", "view", total=len(views)):
         accumulator.add_view(view, observation, weighting)
     if settings.method == "direct":
         return _fusion(_last_photo_wins(accumulator), accumulator)
