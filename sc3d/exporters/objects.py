@@ -15,7 +15,7 @@ from sc3d.exporters.packages import load
 from sc3d.exporters.polygonize import orthogonalized, polygonize, simplified
 from sc3d.exporters.projected_cloud import ProjectedCloud, find_projection, read_projected_cloud
 from sc3d.exporters.regions import cells_by_number
-from sc3d.exporters.terrain import ground_height
+from sc3d.exporters.terrain import ground_classes, ground_height, tree_codes
 from sc3d.exporters.trees import MIN_CROWN, canopy_height, split_crowns
 from sc3d.exporters.vector_files import Feature, has_geopackage, write_geojson, write_geopackage
 from sc3d.geometry.raster import Raster, spacing_of_all
@@ -31,9 +31,7 @@ else:
 LAYERS = ("buildings", "trees")
 CELL = 1.5  # side of the cells, in point spacings
 MIN_CELL = 0.05  # m
-BUILDING, LOW, MEDIUM, HIGH = 6, 3, 4, 5  # ASPRS codes: building; low, medium and high vegetation
-GROUND = (2, LOW, 9, 10, 11)  # ground, low vegetation, water, rail, road
-NOISE = (7, 18)
+BUILDING, NOISE = 6, (7, 18)  # ASPRS codes
 TREE_TOP = 0.99  # quantile of the crown that is its height: a single point is no tree top
 
 logger = logging.getLogger(__name__)
@@ -150,8 +148,8 @@ def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
     labels: (N,) uint8 class ids
     """
     codes = {entry.id: entry.asprs for entry in table}
-    tree_codes = {MEDIUM, HIGH} if {MEDIUM, HIGH} & set(codes.values()) else {LOW}
-    if BUILDING not in codes.values() and not tree_codes & set(codes.values()):
+    trees = tree_codes(table)
+    if BUILDING not in codes.values() and not trees & set(codes.values()):
         raise InputError(
             'no class has the ASPRS code of buildings (6) or vegetation (3 to 5): add "asprs" to the classes in classes.json'
         )
@@ -159,8 +157,8 @@ def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
     def having(wanted: set[int]) -> np.ndarray:
         return np.isin(labels, [label for label, code in codes.items() if code in wanted])
 
-    building, tree = having({BUILDING}), having(tree_codes)
-    ground = having(set(GROUND) - tree_codes)
+    building, tree = having({BUILDING}), having(trees)
+    ground = np.isin(labels, ground_classes(table))
     if not ground.any():
         ground = (labels > 0) & ~building & ~tree & ~having(set(NOISE))
     if not ground.any():
