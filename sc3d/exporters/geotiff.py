@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from sc3d.exporters.packages import load
 from sc3d.exporters.projected_cloud import MapProjection
 from sc3d.geometry.raster import Raster
 from sc3d.io.atomic import atomic_path
+from sc3d.scene.class_table import ClassTable
 
 rasterio = load("rasterio")
 enums, transforms = load("rasterio.enums"), load("rasterio.transform")
@@ -40,6 +42,22 @@ def open_geotiff(file: Path, projection: MapProjection, grid: Raster, **profile:
     )
 
 
+def set_palette(dataset, table: ClassTable) -> None:
+    """Colors of the class ids in an open file; 0 is transparent."""
+    dataset.write_colormap(
+        1, {label: (*map(int, table.palette[label]), 255 if label else 0) for label in range(table.num_ids)}
+    )
+
+
+def category_names(table: ClassTable) -> str:
+    """GDAL's side file: the name of each class id, in the order of the ids, for the legend."""
+    names = "".join(
+        f"<Category>{escape(table.name(label)) if label in {entry.id for entry in table} | {0} else ''}</Category>"
+        for label in range(table.num_ids)
+    )
+    return f'<PAMDataset><PAMRasterBand band="1"><CategoryNames>{names}</CategoryNames></PAMRasterBand></PAMDataset>\n'
+
+
 def add_overviews(file: Path, resampling: object) -> None:
     """Smaller copies inside the file."""
     with rasterio.open(file, "r+") as dataset:
@@ -49,6 +67,11 @@ def add_overviews(file: Path, resampling: object) -> None:
             dataset.build_overviews(factors, resampling)
 
 
+def scaled_grid(grid: Raster, unit: float) -> Raster:
+    """A grid in m as one in units of the CRS, of `unit` m."""
+    return Raster(grid.left / unit, grid.top / unit, grid.pixel / unit, grid.height, grid.width)
+
+
 def write_lengths(
     path: Path, lengths: np.ndarray, projection: MapProjection, grid: Raster, description: str
 ) -> None:
@@ -56,13 +79,26 @@ def write_lengths(
 
     lengths: (H, W) m, NaN = none; grid: m
     """
-    unit = projection.unit
-    scaled = Raster(grid.left / unit, grid.top / unit, grid.pixel / unit, grid.height, grid.width)
-    values = np.where(np.isfinite(lengths), lengths / unit, NO_HEIGHT).astype(np.float32)
+    values = np.where(np.isfinite(lengths), lengths / projection.unit, NO_HEIGHT).astype(np.float32)
     with atomic_path(path) as temporary:
         profile = {"count": 1, "dtype": "float32", "predictor": 3, "nodata": NO_HEIGHT}
-        with open_geotiff(temporary, projection, scaled, **profile) as dataset:
+        with open_geotiff(temporary, projection, scaled_grid(grid, projection.unit), **profile) as dataset:
             dataset.set_band_description(1, description)
             dataset.units = (projection.crs.axis_info[0].unit_name if projection.crs else "metre",)
             dataset.write(values, 1)
         add_overviews(temporary, enums.Resampling.average)
+
+
+def write_labels(
+    path: Path, labels: np.ndarray, projection: MapProjection, grid: Raster, table: ClassTable
+) -> None:
+    """One band of class ids with palette, and their names in GDAL's side file; labels: (H, W) uint8, 0 = none; grid: m."""
+    with atomic_path(path) as temporary:
+        scaled = scaled_grid(grid, projection.unit)
+        with open_geotiff(temporary, projection, scaled, count=1, dtype="uint8", nodata=0) as dataset:
+            set_palette(dataset, table)
+            dataset.set_band_description(1, "class")
+            dataset.write(labels, 1)
+        add_overviews(temporary, enums.Resampling.mode)
+    with atomic_path(path.with_name(f"{path.name}.aux.xml")) as temporary:
+        temporary.write_text(category_names(table), encoding="utf-8")

@@ -110,7 +110,8 @@ def _find_buildings(site: Site, settings: Export) -> list[Feature]:
     }
     ground = _quantiles(site.ground, buildings, 0.5)
     heights = roof_tops(buildings, roofs, grid.pixel) - ground
-    return _features(site, buildings, is_building, outlines, (heights, ground))
+    volumes = _volumes(roofs - site.ground, buildings, grid)
+    return _features(site, buildings, is_building, outlines, (heights, ground, volumes))
 
 
 def _find_trees(site: Site, settings: Export) -> list[Feature]:
@@ -124,7 +125,8 @@ def _find_trees(site: Site, settings: Export) -> list[Feature]:
         for number, traced in polygonize(crowns, grid).items()
     }
     heights, ground = _quantiles(canopy, crowns, TREE_TOP), _quantiles(site.ground, crowns, 0.5)
-    return _features(site, crowns, is_tree, outlines, (heights, ground))
+    volumes = _volumes(canopy, crowns, grid)
+    return _features(site, crowns, is_tree, outlines, (heights, ground, volumes))
 
 
 def _tell_of_left_out(kind: str, chosen: np.ndarray, regions: np.ndarray, site: Site, why: str) -> None:
@@ -139,6 +141,12 @@ def _quantiles(values: np.ndarray, regions: np.ndarray, share: float) -> np.ndar
     """(R,) float64 quantile of the values (H, W) in each of the regions (H, W) numbered from 1."""
     cells = cells_by_number(regions, int(regions.max()))
     return np.array([np.quantile(values.ravel()[region], share) for region in cells])
+
+
+def _volumes(above: np.ndarray, regions: np.ndarray, grid: Raster) -> np.ndarray:
+    """(R,) float64 m3 between the heights above the ground (H, W), m, and the ground; below it counts nothing."""
+    heights = np.maximum(np.nan_to_num(above), 0.0)
+    return (np.bincount(regions.ravel(), heights.ravel()) * grid.pixel**2)[1:]
 
 
 def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
@@ -173,10 +181,10 @@ def _features(
     regions: np.ndarray,
     chosen: np.ndarray,
     outlines: dict[int, shapely.Polygon],
-    heights: tuple[np.ndarray, np.ndarray],
+    sizes: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> list[Feature]:
     """Features of the regions (H, W) numbered from 1; chosen: (N,) bool points of their kind; outlines: m;
-    heights: (R,) of the top above the ground and z of the ground, m.
+    sizes: (R,) of the top above the ground and z of the ground, m, and volume, m3.
     """
     cloud, unit = site.projected, site.projected.projection.unit
     members = np.where(chosen & site.above, regions.ravel()[site.grid.flat_cells(site.points)], 0)
@@ -184,10 +192,10 @@ def _features(
     for number, rows in enumerate(cells_by_number(members, int(regions.max())), start=1):
         outline, label = outlines[number], int(np.argmax(np.bincount(cloud.labels.label[rows], minlength=1)))
         polygon = outline if unit == 1 else shapely.transform(outline, lambda corners: corners / unit)
-        height, ground = (float(values[number - 1]) for values in heights)
+        height, ground, volume = (float(values[number - 1]) for values in sizes)
         confidence = float(cloud.labels.confidence[rows].astype(np.float64).mean()) if len(rows) else 0.0
         name = site.table.name(label)
         features.append(
-            Feature(polygon, number, name, label, outline.area, height, ground, confidence, len(rows))
+            Feature(polygon, number, name, label, outline.area, height, ground, confidence, len(rows), volume)
         )
     return features

@@ -5,13 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
-from xml.sax.saxutils import escape
 
 import numpy as np
 import open3d as o3d
 from tqdm import tqdm
 
-from sc3d.exporters.geotiff import NO_HEIGHT, TILE, add_overviews, enums, open_geotiff
+from sc3d.exporters.geotiff import (
+    NO_HEIGHT,
+    TILE,
+    add_overviews,
+    category_names,
+    enums,
+    open_geotiff,
+    set_palette,
+)
 from sc3d.exporters.packages import load
 from sc3d.exporters.projected_cloud import ProjectedCloud, read_projected_cloud
 from sc3d.geometry.neighbors import NeighborIndex
@@ -143,15 +150,6 @@ def round_to_digit(length: float) -> float:
     return float(f"{length:.0e}")
 
 
-def category_names(table: ClassTable) -> str:
-    """GDAL's side file: the name of each class id, in the order of the ids, for the legend."""
-    names = "".join(
-        f"<Category>{escape(table.name(label)) if label in {entry.id for entry in table} | {0} else ''}</Category>"
-        for label in range(table.num_ids)
-    )
-    return f'<PAMDataset><PAMRasterBand band="1"><CategoryNames>{names}</CategoryNames></PAMRasterBand></PAMDataset>\n'
-
-
 def _fill(
     view: OrthographicView, projected: ProjectedCloud, table: ClassTable, files: tuple[Path, Path, Path]
 ) -> float:
@@ -170,10 +168,7 @@ def _fill(
             enums.ColorInterp.blue,
             enums.ColorInterp.alpha,
         ]
-        classes.write_colormap(
-            1,
-            {label: (*map(int, table.palette[label]), 255 if label else 0) for label in range(table.num_ids)},
-        )
+        set_palette(classes, table)
         for dataset, name in ((classes, "class"), (height, "height of the surface")):
             dataset.set_band_description(1, name)
         for first_row in tqdm(range(0, grid.height, TILE), desc="rendering maps", unit="strip", disable=None):

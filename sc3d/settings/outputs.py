@@ -73,6 +73,24 @@ class Export:
 
 
 @dataclass(frozen=True)
+class Compare:
+    """What changed between two dates: heights and classes on a common grid, and a picture."""
+
+    before: Annotated[Positional[Path], arg(help="Scene folder of the earlier date.")]
+    after: Annotated[Positional[Path], arg(help="Scene folder of the later date.")]
+    output: Path | None = None
+    """Folder to write; AFTER/export/compare otherwise."""
+    min_height: float = 0.5
+    """Smaller differences of height are no change, m."""
+    min_area: float = 5.0
+    """Smaller regions are no change, m2."""
+    pixel_size: float = 0.0
+    """Side of a cell on the ground, m; 0 = four times the spacing of the points of the sparser cloud."""
+    epsg: int = 0
+    """EPSG code of a projected CRS for the results; 0 = that of the earlier scene."""
+
+
+@dataclass(frozen=True)
 class Report:
     """One self-contained HTML page with figures and pictures."""
 

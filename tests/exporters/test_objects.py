@@ -18,6 +18,7 @@ from sc3d.exporters.regions import cells_by_number, connected_cells, renumbered
 from sc3d.exporters.terrain import block_medians, ground_height
 from sc3d.exporters.trees import split_crowns, watershed
 from sc3d.geometry.raster import Raster
+from sc3d.scene.class_table import OTHER
 from sc3d.settings.outputs import Export
 from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.cloud import truth_cloud
@@ -34,7 +35,10 @@ UTM = {"epsg": 32615, "offset": [576000.0, 5188000.0, 200.0]}
 def site():
     """A small synthetic site and its true cloud."""
     world = build_world(Synthesize(extent=80.0, seed=3))
-    return world, truth_cloud(world, 250_000, np.random.default_rng(0))
+    cloud = truth_cloud(world, 250_000, np.random.default_rng(0))
+    label = cloud.point.label.numpy()
+    cloud.point.label = np.where(label == OTHER, 0, label)  # cars and walls: of no class in a labelled cloud
+    return world, cloud
 
 
 def exported(scene, settings=Export()) -> tuple[list[dict], list[dict]]:
