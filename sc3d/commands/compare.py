@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
+import numpy as np
+
 from sc3d.errors import InputError
 from sc3d.exporters.change_picture import draw_changes
 from sc3d.exporters.changes import (
@@ -37,10 +39,16 @@ def main(command: Compare) -> None:
     folder = command.output or scenes[1].export / "compare"
     settings = Export(epsg=_check(command, *scenes))
     require_writable(folder)
-    clouds = [read_points(scene, settings) for scene in scenes]
-    projection = clouds[0].projection
-    grid = common_grid(*clouds, command.pixel_size)
-    dates = read_dates(*clouds, grid, (scenes[0].class_table(), scenes[1].class_table()))
+    before, after = (read_points(scene, settings) for scene in scenes)
+    projection, grid = before.projection, common_grid(before, after, command.pixel_size)
+    dates = read_dates(before, after, grid, (scenes[0].class_table(), scenes[1].class_table()))
+    logger.info(
+        "common grid: %d x %d cells of %g m, %.1f %% of them seen at both dates",
+        grid.width,
+        grid.height,
+        grid.pixel,
+        100 * np.isfinite(dates.rise).mean(),
+    )
     _tell_noise(measure_noise(dates), command.min_height)
     changes = find_changes(dates, command.min_height, command.min_area, projection.unit)
     folder.mkdir(parents=True, exist_ok=True)

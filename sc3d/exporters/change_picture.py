@@ -15,6 +15,7 @@ from sc3d.view.captions import INK, PAPER, add_legend, caption_font
 
 if TYPE_CHECKING:
     from PIL import ImageDraw
+    from PIL.ImageFont import FreeTypeFont
 
 LONGEST = 900  # of a panel, px
 GAP = 12  # between panels, px
@@ -90,7 +91,7 @@ def _outline(
     changes: list[Change],
     grid: Raster,
     place: tuple[int, int, float, float],
-    font: object,
+    font: FreeTypeFont,
 ) -> None:
     """place: left and top of the panel, px; px per cell; m per unit of the CRS."""
     left, top, factor, unit = place
@@ -108,7 +109,7 @@ def _outline(
         )  # fmt: skip
 
 
-def _shortened(text: str, font, width: int) -> str:
+def _shortened(text: str, font: FreeTypeFont, width: int) -> str:
     while len(text) > 4 and font.getlength(text) > width - 2 * GAP:
         text = text[:-4] + "..."
     return text

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +15,7 @@ from sc3d.exporters.polygonize import polygonize, simplified
 from sc3d.exporters.regions import cells_by_number, disk, renumbered
 from sc3d.exporters.terrain import ground_classes
 from sc3d.geometry.raster import Raster
-from sc3d.scene.class_table import ClassTable, SemanticClass
+from sc3d.scene.class_table import ClassTable
 
 if TYPE_CHECKING:
     import shapely
@@ -101,7 +101,7 @@ def joint_table(before: ClassTable, after: ClassTable) -> tuple[ClassTable, np.n
                 raise InputError("the two scenes have more than 255 classes together")
             known = entry.id if entry.id in free else free[0]
             free.remove(known)
-            classes.append(_renumbered(entry, known))
+            classes.append(replace(entry, id=known))
         ids[entry.id] = known
     return ClassTable(tuple(sorted(classes, key=lambda entry: entry.id))), ids
 
@@ -153,15 +153,7 @@ def find_changes(dates: Dates, min_height: float, min_area: float, unit: float) 
     for kind, cells in (("higher", higher), ("lower", lower), ("class", other)):
         found += _changes(dates, kind, _large(cells, min_area / pixel**2), unit)
     found.sort(key=lambda change: -change.area)
-    return [_numbered(change, number) for number, change in enumerate(found, start=1)]
-
-
-def _renumbered(entry: SemanticClass, label: int) -> SemanticClass:
-    return SemanticClass(label, entry.name, entry.color, entry.prompts, entry.asprs, entry.surface)
-
-
-def _numbered(change: Change, number: int) -> Change:
-    return Change(**(vars(change) | {"number": number}))
+    return [replace(change, number=number) for number, change in enumerate(found, start=1)]
 
 
 def _range(heights: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -204,7 +196,8 @@ def _changes(dates: Dates, kind: str, regions: np.ndarray, unit: float) -> list[
         outline = simplified(outlines[number], grid.pixel)
         polygon = shapely.transform(outline, lambda corners: corners / unit)
         area, volume = len(cells) * grid.pixel**2, float(rise[cells].sum()) * grid.pixel**2
-        found.append(Change(polygon, 0, kind, *names, area, float(np.median(rise[cells])), volume))
+        before, after = names
+        found.append(Change(polygon, 0, kind, before, after, area, float(np.median(rise[cells])), volume))
     return found
 
 

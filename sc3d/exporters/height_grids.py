@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from sc3d.errors import InputError
 from sc3d.exporters.projected_cloud import MapProjection, projected_chunks
-from sc3d.exporters.terrain import CELL, ground_height, require_ground
+from sc3d.exporters.terrain import CELL, ground_height, low_objects, require_ground
 from sc3d.geometry.raster import Raster, close_gaps, highest_points, interpolate
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
@@ -22,7 +22,7 @@ from sc3d.settings.outputs import Export
 
 PIXEL = 4.0  # side of a cell, in point spacings
 MIN_PIXEL = 0.1  # m
-NEAR = 0.6  # points of the ground farther from what the ground around says are something else, m
+NEAR = 0.4  # points of the ground farther from what the ground around says are something else, m
 SKIN = 0.2  # the surface of a cell is the mean of the points this far below its highest, m
 GAP = 2  # cells: holes of the surface up to about twice this wide are filled
 FIXED = 1e4  # heights are summed as whole numbers of 0.1 mm: their order does not matter
@@ -136,13 +136,14 @@ def ground_grid(cloud: LabelledPoints, grid: Raster, table: ClassTable) -> Groun
 
 
 def _filled(fine: _Means, rough: _Means, covered: np.ndarray, grid: Raster) -> GroundGrid:
-    known = fine.count.reshape(grid.shape) > 0
+    heights = fine.means()
+    known = np.isfinite(heights)
     if not known.any():
         raise InputError("the points of ground classes lie far apart in height: check the labels")
     inside = _footprint(covered, CELL / grid.pixel)
-    height = interpolate(fine.means(), known)
+    height = interpolate(heights, known)
     distance = ndimage.distance_transform_edt(~known) * grid.pixel
-    dropped = 1.0 - fine.count.sum() / rough.count.sum()
+    dropped = 1.0 - fine.count[known.ravel()].sum() / rough.count.sum()
     return GroundGrid(
         grid, np.where(inside, height, np.nan), np.where(inside, distance, np.nan), float(dropped)
     )
@@ -152,8 +153,9 @@ def _expected(rough: _Means, grid: Raster) -> tuple[np.ndarray, np.ndarray]:
     """(H * W,) height that the ground around each cell says, m, and how far points may lie from it: more on
     slopes.
     """
-    known = rough.count > 0
-    samples = np.column_stack([grid.centers()[known], rough.means().ravel()[known]])
+    means = rough.means()
+    known = ((rough.count > 0).reshape(grid.shape) & ~low_objects(means, grid.pixel)).ravel()
+    samples = np.column_stack([grid.centers()[known], means.ravel()[known]])
     around = ground_height(samples, np.ones(len(samples), bool), grid)
     if min(grid.shape) < 2:
         return around.ravel(), np.full(around.size, NEAR)
