@@ -68,8 +68,8 @@ def fuse_views(
 
     voxel_size: world units. Raises Sc3dError where nothing is confirmed.
     """
-    fusion, confirmed = _fused(data, store, voxel_size)
-    parts = [_part(fusion)]
+    part, confirmed = _fused(data, store, voxel_size)
+    parts = [part]
     _see(data, store, parts[0][0])
     shares = {"continued": 0.0, "occluders": 0.0}
     steps = {"continued": _continued, "occluders": _occluding}
@@ -88,8 +88,8 @@ def fuse_views(
     return Surfaces(mesh, cloud, voxel_size, confirmed, **shares, coverage=coverage, cropped=left_out)
 
 
-def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[DepthFusion, float]:
-    """The field of all confirmed depth in range, and its share of all pixels."""
+def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[Part, float]:
+    """The surface of all confirmed depth in range, and its share of all pixels."""
     fusion, shares = DepthFusion(voxel_size), list[float]()
     for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
         known = store.read(row, "confirmed")
@@ -103,7 +103,7 @@ def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[D
     if few := hardly_confirmed([view.name for view in data.views], shares):
         logger.warning(few)
     sizes = [view.width * view.height for view in data.views]
-    return fusion, float(np.average(shares, weights=sizes))
+    return _part(fusion), float(np.average(shares, weights=sizes))
 
 
 def _part(fusion: DepthFusion) -> Part:
@@ -187,7 +187,7 @@ def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
         empty &= opaque
     known = store.read(row, "known")
     as_known = np.abs(known / np.where(np.isfinite(hit), hit, 1) - 1) < MARGIN
-    covered = _unlike_surface(data, store, row, (known > 0) & np.isfinite(hit) & as_known)
+    covered = _unlike_surface(data, store, row, (known > 0) & np.isfinite(hit) & as_known, np.isfinite(hit))
     empty = _large(empty | covered) & empty  # a few pixels at a border say nothing
     others, nearest = _others(data, store, row), NEAREST * data.depth_range[0]
     beyond = np.where(empty & ~covered, np.float32(BEYOND * data.depth_range[1]), np.float32(0))
@@ -210,17 +210,21 @@ def _spread(depth: np.ndarray, image: np.ndarray) -> np.ndarray:
     return np.where((source >= 0) & (gap < BESIDE * max(depth.shape)), depth.ravel()[source], 0)
 
 
-def _unlike_surface(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray) -> np.ndarray:
+def _unlike_surface(
+    data: DepthViews, store: EvidenceStore, row: int, known: np.ndarray, hit: np.ndarray
+) -> np.ndarray:
     """(H, W) bool: regions in which the photo does not look like the surface behind: something is before it.
 
-    The measure is how the two differ where this view confirms the surface.
+    The measure is how the two differ where this view confirms the surface. What continues it has no look of its
+    own and goes with the more alike of what is confirmed and what is not. known, hit: (H, W) bool, the
+    confirmed surface, any surface
     """
-    confirmed = (store.read(row, "confirmed") > 0) & hit
+    confirmed = (store.read(row, "confirmed") > 0) & known
     if not confirmed.any():
         return np.zeros_like(hit)
     photo, shown = data.image(row).astype(np.float32), store.read(row, "colors").astype(np.float32)
     gap = np.abs(cv2.blur(photo, (9, 9)) - cv2.blur(shown, (9, 9))).max(axis=2)
-    unlike = hit & ~confirmed & (gap > np.quantile(gap[confirmed], UNLIKE))
+    unlike = known & ~confirmed & (gap > np.quantile(gap[confirmed], UNLIKE))
     seeds = _large(unlike)
     source, _ = nearest_by_color(data.image(row), seeds | confirmed | ~hit)
     return seeds.ravel()[source] & hit & ~confirmed

@@ -10,6 +10,8 @@ from sc3d.errors import InputError
 
 BORDER = 0.125  # of a block's side, on each side
 MIN_POINTS = 10  # of a block
+# of the sparse points that a photo sees, or of those in the block: fewer, and the photo is not worth its time
+SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,17 @@ def split_blocks(points: np.ndarray, count: int) -> list[Block]:
         raise InputError(f"{len(points)} sparse points are too few for {count} blocks: lower --blocks")
     axes = tuple(sorted(np.argsort(_sides(points), kind="stable")[1:].tolist()))
     return _cut(points[:, axes], count, Block(axes, (-np.inf, -np.inf), (np.inf, np.inf), (0.0, 0.0)))
+
+
+def views_of(block: Block, points: np.ndarray, tracks: list[np.ndarray]) -> list[int]:
+    """Indices of the views that see enough of a block's core. points: (N, 3) sparse points; tracks: per view
+    the rows of those that it sees
+    """
+    inside, chosen = block.holds(points), []
+    for index, rows in enumerate(tracks):
+        if inside[rows].sum() >= max(MIN_POINTS, SHARE * min(len(rows), int(inside.sum()))):
+            chosen.append(index)
+    return chosen
 
 
 def _sides(points: np.ndarray) -> np.ndarray:

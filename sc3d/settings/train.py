@@ -36,7 +36,13 @@ class TrainSettings:
     exposure: bool = True
     """fit a brightness gain and offset per photo"""
     test_every: int = 0
-    """hold out every Nth photo and report PSNR and SSIM on them; 0 = none"""
+    """hold out every Nth photo and report PSNR, SSIM and depth agreement on them; 0 = none. Tells how views
+    between others look
+    """
+    test_sector: float = 0.0
+    """share of the photos to hold out as one contiguous part of the capture, and to report on like
+    test_every, which then takes every Nth of the others; 0 = none. Tells how views beyond the others look
+    """
     checkpoint_every: int = 500
     """save a checkpoint every N iterations, to continue an interrupted run; 0 = never"""
 
@@ -98,14 +104,21 @@ class TrainSettings:
             raise InputError(
                 "iterations and max_gaussians must be at least 1, max_size at least 16, sh_degree 0 to 3, downscale not negative"
             )
+        if self.test_every < 0 or not 0 <= self.test_sector < 1:
+            raise InputError(
+                f"test_every must not be negative, and test_sector a share of the photos from 0 to below 1, such as 0.2: they are {self.test_every} and {self.test_sector}"
+            )
 
     def size(self, longest: int) -> int:
         """Longest side of the training image of a photo whose longest side is `longest`, px."""
         return round(longest / self.downscale) if self.downscale else min(longest, self.max_size)
 
-    def held_out(self, num_views: int) -> list[int]:
-        """Indices of the views that are not trained on."""
-        return list(range(self.test_every - 1, num_views, self.test_every)) if self.test_every else []
+    @property
+    def seen_by(self) -> int:
+        """Photos that must see a sparse point to start on it: with a sector held out, those that only the
+        sector's photos have found are not known.
+        """
+        return 2 if self.test_sector else 0
 
     def active_sh_degree(self, iteration: int) -> int:
         """One degree more every 30th of the run."""

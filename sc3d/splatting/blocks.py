@@ -19,15 +19,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-import cv2
 import numba
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from sc3d.errors import InputError
-from sc3d.geometry.blocks import MIN_POINTS, Block
-from sc3d.geometry.cameras import View, in_image, project
+from sc3d.geometry.blocks import Block, views_of
+from sc3d.geometry.shown import enlarged, shown_cells
 from sc3d.io.atomic import claim
 from sc3d.io.json_files import read_json, write_json
 from sc3d.io.provenance import peak_memory_mb
@@ -40,10 +38,6 @@ from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.trainer import TrainResult, train
 from sc3d.tiling.executor import Executor
 
-# of the sparse points that a photo sees, or of those in the block: fewer, and the photo is not worth its time
-SHARE = 0.05
-NEAREST = 5  # sparse points that say what a pixel shows
-CELL = 4  # px, side of the cells of which that is asked
 GPU = {"GPU": 1.0}  # what a worker must offer to get a block, with --device cuda
 
 
@@ -65,8 +59,8 @@ class BlockJob:
 
     def views(self, data: TrainingData, index: int) -> list[int]:
         """Those that a block is trained on."""
-        held_out = set(self.settings.held_out(len(data.views)))  # of the whole run: no block may see them
-        return [view for view in views_of(data, self.blocks[index]) if view not in held_out]
+        trained = set(data.held_out(self.settings).trained)  # of the whole run: no block may see the rest
+        return [view for view in views_of(self.blocks[index], data.points, data.sightings) if view in trained]
 
 
 def train_blocks(job: BlockJob, data: TrainingData, tasks: Executor) -> tuple[TrainResult, dict[str, object]]:
@@ -80,7 +74,7 @@ def train_blocks(job: BlockJob, data: TrainingData, tasks: Executor) -> tuple[Tr
     for index in indices:
         if len(job.views(data, index)) < 2:
             raise InputError(
-                f"block {index} of {len(indices)} is seen by fewer than 2 photos: lower --blocks"
+                f"block {index} of {len(indices)} is seen by fewer than 2 photos that are trained on: lower --blocks"
             )
     claim(job.folder).mkdir(exist_ok=True)
     tasks.run("blocks", partial(train_block, job), indices, GPU if job.settings.device == "cuda" else None)
@@ -111,7 +105,7 @@ def train_block(job: BlockJob, index: int) -> None:
     block, views = job.blocks[index], job.views(data, index)
     settings, checkpoint = share_settings(job.settings, data, block, views), job.file(index, "checkpoint")
     with one_thread():
-        part = restrict(data, block, views)
+        part = restrict(data, block, views, job.settings.seen_by)
         result = train(part, settings, checkpoint if settings.checkpoint_every else None, job.progress)
     write_splat_ply(job.file(index, "ply"), result.gaussians.arrays())
     record = {"views": views, "exposures": result.exposures.tolist(), "log": result.log}
@@ -135,43 +129,22 @@ def one_thread() -> Iterator[None]:
         numba.set_num_threads(before[1])
 
 
-def views_of(data: TrainingData, block: Block) -> list[int]:
-    """Indices of the views that see enough of a block's core."""
-    inside, chosen = block.holds(data.points), []
-    for index in range(len(data.views)):
-        rows = data.seen(index)
-        if inside[rows].sum() >= max(MIN_POINTS, SHARE * min(len(rows), int(inside.sum()))):
-            chosen.append(index)
-    return chosen
-
-
-def restrict(data: TrainingData, block: Block, views: list[int]) -> TrainingData:
-    """What a block is trained on: its views, the sparse points in core and border, masks of the pixels that
-    show those.
+def restrict(data: TrainingData, block: Block, views: list[int], seen_by: int = 0) -> TrainingData:
+    """What a block is trained on: its views, the sparse points in core and border (that at least `seen_by` of
+    the views see), masks of the pixels that show those.
     """
-    near = block.holds(data.points, border=True)
-    position = np.cumsum(near) - 1
-    seen = [data.seen(index) for index in views]
+    part = data.subset(views, seen_by)
+    near = block.holds(part.points, border=True)
     shown = [
-        _shown(data.views[index], data.points[rows], near[rows])
-        for index, rows in zip(views, seen, strict=True)
+        shown_cells(view, part.points[rows], near[rows])
+        for view, rows in zip(part.views, part.sightings, strict=True)
     ]
 
     def mask(row: int) -> np.ndarray:
-        view, own = data.views[views[row]], data.mask(views[row])
-        size = (view.width, view.height)
-        found = cv2.resize(shown[row], size, interpolation=cv2.INTER_NEAREST).astype(bool)
+        found, own = enlarged(shown[row], part.views[row]), part.mask(row)
         return found if own is None else found & own
 
-    return TrainingData(
-        [data.views[index] for index in views],
-        lambda row: data.image(views[row]),
-        data.points[near],
-        data.colors[near],
-        [position[rows[near[rows]]] for rows in seen],
-        mask,
-        None if data.depth_maps is None else lambda row: data.depth_map(views[row]),
-    )
+    return replace(part.with_points(near), masks=mask)
 
 
 def share_settings(
@@ -182,11 +155,12 @@ def share_settings(
 
     So each photo is looked at as often as without blocks, and all cores together hold about `max_gaussians`.
     """
-    num_views = len(data.views) - len(settings.held_out(len(data.views)))
+    num_views = len(data.held_out(settings).trained)
     iterations = max(1, round(settings.iterations * len(views) / num_views))
     share = float(block.holds(data.points, border=True).mean())
     max_gaussians = max(1, round(settings.max_gaussians * share))
-    return replace(settings, iterations=iterations, max_gaussians=max_gaussians, test_every=0)
+    own = replace(settings, iterations=iterations, max_gaussians=max_gaussians)
+    return replace(own, test_every=0, test_sector=0.0)
 
 
 def merge(parts: list[Gaussians], blocks: list[Block]) -> Gaussians:
@@ -196,25 +170,6 @@ def merge(parts: list[Gaussians], blocks: list[Block]) -> Gaussians:
         for part, block in zip(parts, blocks, strict=True)
     ]
     return Gaussians(**{name: torch.cat([core[name] for core in cores]) for name in cores[0]})
-
-
-def _shown(view: View, points: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """(H / CELL, W / CELL) uint8: cells of a photo that show core or border, by majority of the nearest
-    sparse points.
-
-    points: (T, 3) sparse points that the view sees; near: (T,) bool, those in core or border
-    """
-    shape = -(-view.height // CELL), -(-view.width // CELL)
-    pixels, depths = project(view, points)
-    usable = in_image(view, pixels) & (depths > 0)
-    if not usable.any():
-        return np.zeros(shape, np.uint8)
-    across = (np.arange(shape[1]) + 0.5) * view.width / shape[1]
-    down = (np.arange(shape[0]) + 0.5) * view.height / shape[0]
-    cells = np.stack([middle.ravel() for middle in np.meshgrid(across, down)], 1)
-    count = min(NEAREST, int(usable.sum()))
-    nearest = cKDTree(pixels[usable]).query(cells, k=count)[1].reshape(-1, count)
-    return (2 * near[usable][nearest].sum(axis=1) > count).astype(np.uint8).reshape(shape)
 
 
 def _total(records: list[dict], num_gaussians: int) -> dict[str, object]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -12,6 +12,7 @@ import torch
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, local_origin, project, resample, undistorted
+from sc3d.geometry.held_out import HeldOut, held_out_views, times_seen
 from sc3d.scene.depth_map import DepthMap, depth_file, read_depth_map
 from sc3d.scene.scene import Scene
 from sc3d.scene.splats import read_scene_splats
@@ -85,9 +86,9 @@ class TrainingData:
         target = planes.permute(1, 2, 0).to(device)
         return view, target, None if mask is None else torch.from_numpy(mask).to(device)
 
-    def subset(self, indices: list[int]) -> TrainingData:
-        """The same points with some of the views, renumbered from 0."""
-        return TrainingData(
+    def subset(self, indices: list[int], seen_by: int = 0) -> TrainingData:
+        """Some of the views, renumbered from 0, and the points that at least so many of them see."""
+        part = TrainingData(
             [self.views[index] for index in indices],
             lambda row: self.image(indices[row]),
             self.points,
@@ -96,6 +97,23 @@ class TrainingData:
             lambda row: self._raw_mask(indices[row]),
             None if self.depth_maps is None else lambda row: self.depth_map(indices[row]),
         )
+        return part.with_points(times_seen(part.sightings, len(self.points)) >= seen_by) if seen_by else part
+
+    def with_points(self, chosen: np.ndarray) -> TrainingData:
+        """The same with the points of an (N,) bool alone."""
+        position = np.cumsum(chosen) - 1
+        tracks = [position[rows[chosen[rows]]] for rows in self.sightings]
+        return replace(self, points=self.points[chosen], colors=self.colors[chosen], tracks=tracks)
+
+    @property
+    def sightings(self) -> list[np.ndarray]:
+        """`seen` of every view."""
+        return [self.seen(index) for index in range(len(self.views))]
+
+    def held_out(self, settings: TrainSettings) -> HeldOut:
+        """Which views are trained on, and which are not."""
+        tracks = self.sightings if settings.test_sector else []
+        return held_out_views(self.views, tracks, self.points, settings.test_every, settings.test_sector)
 
     def seen(self, index: int) -> np.ndarray:
         """(T,) rows of the sparse points that a view sees; all in its image, where tracks are unknown."""

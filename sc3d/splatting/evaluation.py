@@ -9,6 +9,8 @@ import numpy as np
 import torch
 
 from sc3d.geometry.cameras import View
+from sc3d.geometry.shown import Witnesses
+from sc3d.scene.held_out import SAME_DEPTH, SECTOR, HeldOutPhoto
 from sc3d.settings.common import DepthMode
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses
@@ -80,21 +82,50 @@ def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
 
 
 @torch.no_grad()
-def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSettings) -> dict[str, float]:
-    """Mean "psnr" (dB) and "ssim" of the held-out views inside their masks; empty without any. Their exposure
-    is fitted to the photo if exposures are used.
-    """
-    scores = []
-    for index in settings.held_out(len(data.views)):
+def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSettings) -> list[HeldOutPhoto]:
+    """What the Gaussians make of every view that was not trained on, those of the sector last."""
+    split, tracks = data.held_out(settings), data.sightings
+    trained = [data.views[index] for index in split.trained]
+    witnesses = Witnesses(trained, [tracks[index] for index in split.trained], data.points)
+    rows = []
+    for index in [*split.every_nth, *split.sector]:
         view, target, mask = data.photo(index, device=gaussians.means.device)
         used = torch.ones_like(target[..., 0], dtype=torch.bool) if mask is None else mask
-        image = render(gaussians, view).color
-        if settings.exposure:
-            image = losses.apply_exposure(image, losses.fit_exposure(image[used], target[used]))
-        image = torch.where(used[..., None], image.clamp(0, 1), target).contiguous()
-        similarity = 1 - float(losses.image_loss(image, target, 1.0))
-        scores.append((psnr(image[used], target[used]), similarity))
-    return dict(zip(("psnr", "ssim"), np.mean(scores, axis=0).tolist(), strict=True)) if scores else {}
+        seen, depth = witnesses.pixels(view, tracks[index]), witnesses.depth(view, tracks[index])
+        stereo, rendering = data.depth_map(index), render(gaussians, view)
+        if stereo is not None:
+            seen, depth = seen & ~stereo.sky, stereo.confirmed(1)
+        inside = used & torch.from_numpy(seen).to(used.device)
+        expected = torch.where(inside, torch.from_numpy(depth).to(used.device), 0)
+        agrees = (surface_depth(rendering, view) - expected).abs() < SAME_DEPTH * expected
+        rows.append(
+            HeldOutPhoto(
+                view.name,
+                SECTOR if index in split.sector else f"every {settings.test_every}",
+                *_likeness(rendering.color, target, used, settings.exposure),
+                _share(inside, used) or 0.0,
+                *_likeness(rendering.color, target, inside, settings.exposure),
+                _share(agrees & (rendering.alpha >= 0.5), expected > 0),
+            )
+        )
+    return rows
+
+
+def _likeness(
+    image: torch.Tensor, target: torch.Tensor, used: torch.Tensor, exposure: bool
+) -> tuple[float | None, float | None]:
+    """PSNR (dB) and SSIM of the used pixels, (H, W) bool, with the exposure that fits these; None of none."""
+    if not used.any():
+        return None, None
+    if exposure:
+        image = losses.apply_exposure(image, losses.fit_exposure(image[used], target[used]))
+    image = torch.where(used[..., None], image.clamp(0, 1), target).contiguous()
+    difference = float(losses.image_loss(image, target, 1.0)) / float(used.float().mean())
+    return psnr(image[used], target[used]), 1 - difference
+
+
+def _share(part: torch.Tensor, whole: torch.Tensor) -> float | None:
+    return float(part.sum() / whole.sum()) if whole.any() else None
 
 
 @torch.no_grad()

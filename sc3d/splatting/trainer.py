@@ -14,6 +14,7 @@ from tqdm import tqdm
 from sc3d.errors import InputError
 from sc3d.geometry.view_selection import neighbor_views, scene_extent
 from sc3d.io.atomic import atomic_path
+from sc3d.scene.held_out import HeldOutPhoto
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses, strategy
 from sc3d.splatting.checkpoint import check_state, optimizer_state, restore_optimizer
@@ -45,14 +46,13 @@ EXPOSURE_RATE = 1e-3
 @dataclass
 class TrainResult:
     """gaussians: not part of an autograd graph; exposures: (V, 2) a, b per view, zero where held out
-    log: rows of iteration, loss, psnr, num_gaussians, seconds; metrics: psnr and ssim over the held-out views
-    (empty without any)
+    log: rows of iteration, loss, psnr, num_gaussians, seconds; held_out: one row per photo left out
     """
 
     gaussians: Gaussians
     exposures: np.ndarray
     log: list[dict[str, float]]
-    metrics: dict[str, float] = field(default_factory=dict)
+    held_out: list[HeldOutPhoto] = field(default_factory=list)
 
 
 def train(
@@ -91,15 +91,10 @@ class Trainer:
 
     def __init__(self, data: TrainingData, settings: TrainSettings) -> None:
         self.data, self.settings, self.device = data, settings, pick_device(settings.device)
-        held_out = settings.held_out(len(data.views))
-        self.train_views = [index for index in range(len(data.views)) if index not in held_out]
-        if len(self.train_views) < 2:
-            raise InputError(
-                f"{len(self.train_views)} photos to train on, and {len(held_out)} held out: at least 2 are needed"
-            )
+        self.train_views = data.held_out(settings).trained
         self.generator = torch.Generator().manual_seed(settings.seed)
-        used = data.subset(self.train_views)
-        points, centers = np.asarray(data.points, np.float64), np.stack([view.center for view in used.views])
+        used = data.subset(self.train_views, settings.seen_by)
+        points, centers = np.asarray(used.points, np.float64), np.stack([view.center for view in used.views])
         neighbors = neighbor_views(used.tracks, points, centers, settings.num_neighbors)
         self.neighbors = {
             index: [self.train_views[other] for other in others]

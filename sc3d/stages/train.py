@@ -14,6 +14,7 @@ from sc3d.io.photo_folder import find_photos
 from sc3d.io.provenance import digest
 from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.io.splats import origin_comment, write_splat_ply
+from sc3d.scene.held_out import mean_scores, write_held_out
 from sc3d.scene.scene import Scene, check_photos, require_views
 from sc3d.settings.train import Train
 from sc3d.splatting.blocks import BlockJob, train_blocks
@@ -25,6 +26,8 @@ from sc3d.view.training_sheet import write_training_sheet
 
 logger = logging.getLogger(__name__)
 
+MIN_POINTS = 10  # sparse points to start from
+
 
 def inputs(scene: Scene, settings: Train) -> list[Path]:
     return [scene.images, scene.sparse, *([scene.depth] if settings.fill and scene.depth.exists() else [])]
@@ -35,7 +38,7 @@ def outputs(scene: Scene, settings: Train) -> list[Path]:
 
 
 def besides(scene: Scene, settings: Train) -> list[Path]:
-    return [scene.path / "train.csv", scene.path / "train.jpg"]
+    return [scene.path / "train.csv", scene.path / "train.jpg", scene.path / "held_out.csv"]
 
 
 def run(scene: Scene, settings: Train) -> dict[str, object]:
@@ -45,11 +48,12 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
     require_views(scene)
     check_photos(scene, [view.name for view in scene.model.views])
     _tell_of_left_out(scene)
-    if len(scene.model.points) < 10:
+    if len(scene.model.points) < MIN_POINTS:
         raise InputError(
             f"{scene.sparse} has {len(scene.model.points)} sparse points, too few to start from: run `sc3d reconstruct` with more overlap"
         )
     data, origin = scene_data(scene, settings.training)
+    _tell_of_held_out(data, settings)
     unfinished = _unfinished(scene, settings)
     if in_blocks:
         result, summary = _train_blocks(scene, settings, data, unfinished)
@@ -58,6 +62,7 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
         result, summary = train(data, settings.training, checkpoint), {}
     write_splat_ply(scene.gaussians, result.gaussians.arrays(), [origin_comment(origin)])
     write_log(result.log, scene.path / "train.csv")
+    write_held_out(scene.path / "held_out.csv", result.held_out)
     write_training_sheet(scene.path / "train.jpg", result, data, settings.training)
     remove(unfinished)
     last = result.log[-1] if result.log else {}
@@ -66,7 +71,7 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
         "size": f"{data.views[0].width}x{data.views[0].height}",
         "gaussians": len(result.gaussians),
         "psnr": round(last.get("psnr", float("nan")), 2),
-        **{f"held_out_{name}": round(value, 3) for name, value in result.metrics.items()},
+        **{f"held_out_{name}": round(value, 3) for name, value in mean_scores(result.held_out).items()},
         **summary,
     }
 
@@ -78,6 +83,27 @@ def _tell_of_left_out(scene: Scene) -> None:
     if unknown:
         logger.info(left_out(unknown, len(names), "photos have no camera and are not used"))
     tell_of_transparent({name: scene.photo(name) for name in sorted(known)}, "teach nothing")
+
+
+def _tell_of_held_out(data: TrainingData, settings: Train) -> None:
+    """Say what training leaves out for a sector; InputError if hardly anything is left to start from."""
+    split = data.held_out(settings.training)
+    if not split.sector:
+        return
+    names = [data.views[index].name for index in split.sector]
+    logger.info(left_out(names, len(data.views), "photos are held out as a sector"))
+    used, total = len(data.subset(split.trained, settings.seen_by).points), len(data.points)
+    if used < MIN_POINTS:
+        raise InputError(
+            f"{used} of {total} sparse points are seen by two photos that are not held out, too few to start from: lower --test-sector, or take a model whose points have tracks"
+        )
+    logger.info(
+        "%d of %d sparse points are not used: fewer than 2 photos of the rest see them", total - used, total
+    )
+    if data.depth_maps is not None:
+        logger.warning(
+            "the depth maps in depth/ were made with the held-out photos too, so the sector's figures flatter: --no-fill trains without them"
+        )
 
 
 def write_log(rows: list[dict[str, float]], path: Path) -> None:

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from sc3d.geometry.held_out import HeldOut
 from sc3d.io.images import write_image
+from sc3d.scene.held_out import mean_scores
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.evaluation import Comparison, compare
@@ -29,8 +31,11 @@ def write_training_sheet(
     title = f"{settings.iterations:,} iterations, {len(result.gaussians):,} Gaussians"
     if result.log:
         title += f", PSNR {result.log[-1]['psnr']:.2f} dB over the last steps"
-    if result.metrics:
-        title += f"; held-out photos: PSNR {result.metrics['psnr']:.2f} dB, SSIM {result.metrics['ssim']:.3f}"
+    scores = mean_scores(result.held_out)
+    for prefix, name in (("", "held-out photos"), ("sector_", "held-out sector")):
+        if f"{prefix}psnr" in scores:
+            psnr, ssim = scores[f"{prefix}psnr"], scores[f"{prefix}ssim"]
+            title += f"; {name}: PSNR {psnr:.2f} dB, SSIM {ssim:.3f}"
     write_image(path, contact_sheet(training_rows(result.gaussians, data, settings, result.exposures), title))
 
 
@@ -42,21 +47,19 @@ def training_rows(
     exposures: (V, 2) a, b per view as found by training; held-out photos get what fits them best
     """
     rows = []
-    for index, held_out in chosen_views(len(data.views), settings):
+    for index, held_out in chosen_views(data.held_out(settings)):
         exposure = (0.0, 0.0) if not settings.exposure else None if held_out else exposures[index]
         found = compare(gaussians, data.views[index], data.image(index), data.mask(index), exposure)
         rows.append(replace(found, held_out=held_out))
     return rows
 
 
-def chosen_views(num_views: int, settings: TrainSettings) -> list[tuple[int, bool]]:
+def chosen_views(split: HeldOut) -> list[tuple[int, bool]]:
     """Index and whether it was held out, of the photos of a contact sheet: evenly spread, held-out ones
     first.
     """
-    held_out = settings.held_out(num_views)
-    trained = [index for index in range(num_views) if index not in held_out]
-    first = _spread(held_out, NUM_ROWS - min(_TRAINED_ROWS, len(trained)))
-    rest = _spread(trained, NUM_ROWS - len(first))
+    first = _spread(split.all, NUM_ROWS - min(_TRAINED_ROWS, len(split.trained)))
+    rest = _spread(split.trained, NUM_ROWS - len(first))
     return [*((index, True) for index in first), *((index, False) for index in rest)]
 
 

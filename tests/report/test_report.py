@@ -306,6 +306,23 @@ def test_training_sheet_is_shown(tmp_path):
         write_report(Scene(tmp_path), tmp_path / "report.html")
 
 
+def test_held_out_photos_have_a_row_for_each_kind(tmp_path):
+    summary = {"held_out_photos": 3, "held_out_psnr": 21.456, "held_out_seen": 0.98765}
+    summary |= {"held_out_sector_photos": 8, "held_out_sector_psnr": 17.0, "held_out_sector_seen_depth": 0.5}
+    record = {"stage": "train", "settings": {"test_every": 8, "test_sector": 0.2}, "summary": summary}
+    for chosen, expected in ((summary, 2), ({"held_out_photos": 3}, 1), ({"psnr": 20}, 0), ("broken", 0)):
+        write_json(tmp_path / "gaussians.ply.json", record | {"summary": chosen})
+        write_report(Scene(tmp_path), tmp_path / "report.html")
+        text = " ".join(Page((tmp_path / "report.html").read_text()).text)
+        assert ("one of every 8" in text) + ("a sector of 20%" in text) == expected
+        if expected == 2:
+            for name, row in (
+                ("one of every 8", ["3", "21.46", "–", "98.8%", "–", "–", "–"]),
+                ("a sector of 20%", ["8", "17.00", "–", "–", "–", "–", "50.0%"]),
+            ):
+                assert text.split(name)[1].split()[:7] == row
+
+
 def test_labels_without_truth_give_no_accuracy(toy, tmp_path):
     scene = Scene(tmp_path)
     for path in (toy.labelled, toy.classes):

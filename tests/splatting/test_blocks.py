@@ -2,7 +2,9 @@
 everything at once.
 """
 
+import csv
 import os
+import shutil
 import signal
 import threading
 import time
@@ -10,20 +12,22 @@ from pathlib import Path
 
 import numpy as np
 import psutil
+import pycolmap
 import pytest
 import torch
 
 from sc3d.cli import main
 from sc3d.errors import InputError
-from sc3d.geometry.blocks import split_blocks
+from sc3d.geometry.blocks import split_blocks, views_of
 from sc3d.geometry.cameras import rays
 from sc3d.io.json_files import read_json
 from sc3d.io.splats import read_splat_ply
 from sc3d.runner import sidecar
+from sc3d.scene.depth_map import DepthMap, depth_file, write_depth_map
 from sc3d.scene.scene import Scene
 from sc3d.settings.train import Train
 from sc3d.splatting import blocks
-from sc3d.splatting.blocks import restrict, share_settings, views_of
+from sc3d.splatting.blocks import restrict, share_settings
 from sc3d.splatting.dataset import scene_data
 from sc3d.splatting.trainer import Trainer
 
@@ -67,7 +71,7 @@ def test_masks_show_core_and_border_as_the_exact_depth_does(site):
     data, origin = scene_data(scene, Train())
     agreed, shown = [], []
     for block in split_blocks(data.points, 3):
-        views = views_of(data, block)
+        views = views_of(block, data.points, data.sightings)
         part = restrict(data, block, views)
         assert len(part.points) == block.holds(data.points, border=True).sum() and len(views) >= 2
         for row, (view, track) in enumerate(zip(part.views, part.tracks, strict=True)):
@@ -92,7 +96,7 @@ def test_pixels_outside_the_mask_leave_no_trace(site):
     """The loss of a block must not depend on what the photos show elsewhere."""
     data, _ = scene_data(Scene(site), Train())
     block = split_blocks(data.points, 2)[0]
-    views = views_of(data, block)
+    views = views_of(block, data.points, data.sightings)
     part = restrict(data, block, views)
     settings = share_settings(
         Train(iterations=40, max_gaussians=1500, surface_from=1.0, coarse_until=0.0, fill=False).training,
@@ -195,8 +199,70 @@ def test_an_interrupted_run_goes_on_where_it_was(site, blocked, tmp_path, monkey
     monkeypatch.setattr(
         blocks,
         "restrict",
-        lambda data, block, views, known=restrict: (seen.append(block), known(data, block, views))[1],
+        lambda data, block, views, seen_by, known=restrict: (
+            seen.append(block),
+            known(data, block, views, seen_by),
+        )[1],
     )
     folder = trained(site, tmp_path / "scene", "--blocks", "2")
     assert len(seen) == 2 and seen[1] == ("1.checkpoint", 20)  # block 0 was not trained again
     assert (folder / "gaussians.ply").read_bytes() == (blocked / "gaussians.ply").read_bytes()
+
+
+def hold_out(folder, *options):
+    few = ["--iterations", "8", "--max-gaussians", "500", "--max-size", "64", "--no-fill", "--overwrite"]
+    main(["train", str(folder), *few, *options])
+    return read_json(sidecar(folder / "gaussians.ply"))["summary"]
+
+
+def scene_of(site, folder):
+    for name in ("images", "sparse"):
+        shutil.copytree(site / name, folder / name)
+    return folder
+
+
+def test_a_sector_is_held_out_of_all_blocks_and_listed(site, tmp_path, caplog):
+    folder = scene_of(site, tmp_path)
+    options = ["--test-every", "4", "--test-sector", "0.25"]
+    listed = []
+    with caplog.at_level("INFO"):
+        for blocks in ([], ["--blocks", "2"]):
+            summary = hold_out(folder, *options, *blocks)
+            assert summary["held_out_photos"] == 1 and summary["held_out_sector_photos"] == 2
+            assert 0 < summary["held_out_sector_seen"] <= 1 and "held_out_sector_seen_psnr" in summary
+            with (folder / "held_out.csv").open(newline="") as file:
+                listed.append([(row["photo"], row["held_out"], row["seen"]) for row in csv.DictReader(file)])
+    assert listed[0] == listed[1] and [kind for _, kind, _ in listed[0]] == ["every 4", "sector", "sector"]
+    assert "2 of 8 photos are held out as a sector: " in caplog.text
+    assert "sparse points are not used: fewer than 2 photos" in caplog.text
+    assert not any(name.startswith("held_out") for name in hold_out(folder))
+    assert not (folder / "held_out.csv").exists()
+
+
+def test_depth_maps_that_were_made_with_the_sector_are_told(site, tmp_path, caplog):
+    folder = scene_of(site, tmp_path)
+    for photo in (folder / "images").iterdir():
+        write_depth_map(depth_file(folder / "depth", photo.name), DepthMap.nothing((107, 160)))
+    for options, told in (["--fill"], True), (["--no-fill"], False):
+        caplog.clear()
+        hold_out(folder, "--test-sector", "0.25", *options)
+        assert ("--no-fill trains without them" in caplog.text) == told
+
+
+def test_a_sector_of_a_model_without_tracks_is_refused_before_work(site, tmp_path, capsys):
+    """Nobody could say what the others see."""
+    folder = scene_of(site, tmp_path)
+    model = folder / "sparse" / "0"
+    pycolmap.Reconstruction(str(model)).write_text(str(model))
+    for file in model.glob("*.bin"):
+        file.unlink()
+    lines = [line for line in (model / "images.txt").read_text().splitlines() if not line.startswith("#")]
+    (model / "images.txt").write_text("".join(f"{line}\n\n" for line in lines[::2]))
+    points = [
+        line.split()[:8] for line in (model / "points3D.txt").read_text().splitlines() if line[0] != "#"
+    ]
+    (model / "points3D.txt").write_text("".join(" ".join(point) + "\n" for point in points))
+    with pytest.raises(SystemExit) as status:
+        hold_out(folder, "--test-sector", "0.25")
+    assert status.value.code == 2 and "lower --test-sector" in capsys.readouterr().err
+    assert not (folder / "gaussians.ply").exists()

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from sc3d.errors import InputError, MissingPackageError
+from sc3d.scene.held_out import mean_scores
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import device, trainer
 from sc3d.splatting.gpu import gsplat_backend
@@ -58,7 +59,7 @@ def test_training_stays_on_its_device(functions, monkeypatch):  # noqa: F811
     with PretendDevice():
         result = train(data, settings, progress=False)
     assert result.gaussians.means.device.type == "cpu" and len(result.gaussians) > 400
-    assert np.isfinite(result.metrics["psnr"]) and np.isfinite(result.exposures).all()
+    assert np.isfinite(mean_scores(result.held_out)["psnr"]) and np.isfinite(result.exposures).all()
 
 
 def test_device_is_picked_by_what_is_there(monkeypatch):

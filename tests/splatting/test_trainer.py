@@ -1,5 +1,6 @@
 """Training on scenes made of a few planes and spheres: quality, depth, determinism, resume, cap, odd inputs."""
 
+import csv
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +9,13 @@ import torch
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import look_at, pinhole_view
+from sc3d.geometry.held_out import times_seen
+from sc3d.geometry.shown import Witnesses
+from sc3d.scene.depth_map import DepthMap
+from sc3d.scene.held_out import mean_scores, write_held_out
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
-from sc3d.splatting.evaluation import depth_map
+from sc3d.splatting.evaluation import depth_map, held_out_scores
 from sc3d.splatting.trainer import train
 from sc3d.stages.train import write_log
 from tests.splatting.scenes import SIZE, photographed, plane, ring, sphere, valley
@@ -33,7 +38,7 @@ def test_training_recovers_color_and_depth(scene, plain, tolerance):
         iterations=300, sh_degree=0, max_gaussians=5000, plain=plain, test_every=8, num_patches=1024
     )
     result = train(data, settings, progress=False)
-    assert result.metrics["psnr"] > 22 and result.log[-1]["psnr"] > 22
+    assert mean_scores(result.held_out)["psnr"] > 22 and result.log[-1]["psnr"] > 22
     errors = []
     for view, truth in zip(data.views, depths, strict=True):
         depth, alpha, normals = depth_map(result.gaussians, view)
@@ -197,3 +202,96 @@ def test_log_is_a_table(scene, tmp_path):
     lines = (tmp_path / "train.csv").read_text().splitlines()
     assert lines[0] == "iteration,loss,psnr,num_gaussians,seconds" and len(lines) == 3
     assert lines[-1].startswith("60,")
+
+
+def with_tracks(data):
+    return replace(data, tracks=[np.unique(rows) for rows in data.sightings])
+
+
+def test_both_hold_outs_of_one_training_are_judged(scene, tmp_path):
+    data = with_tracks(scene[0])
+    settings = replace(SHORT, test_every=3, test_sector=0.25)
+    result, split = train(data, settings, progress=False), data.held_out(settings)
+    assert [row.held_out for row in result.held_out] == ["every 3"] * 2 + ["sector"] * 2
+    assert [row.photo for row in result.held_out] == [
+        data.views[index].name for index in split.every_nth + split.sector
+    ]
+    assert not result.exposures[split.all].any()
+    scores = mean_scores(result.held_out)
+    assert scores["photos"] == scores["sector_photos"] == 2
+    for row in result.held_out:
+        assert 0.5 < row.seen <= 1 and row.seen_psnr > 15 and 0 <= row.seen_depth <= 1
+    assert scores["sector_seen_depth"] == np.mean([row.seen_depth for row in result.held_out[2:]])
+    write_held_out(tmp_path / "held_out.csv", result.held_out)
+    with (tmp_path / "held_out.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["photo"] for row in rows] == [row.photo for row in result.held_out]
+    assert [float(row["seen_psnr"]) for row in rows] == [row.seen_psnr for row in result.held_out]
+    write_held_out(tmp_path / "held_out.csv", [])
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_the_held_out_photos_show_leaves_no_trace(scene):
+    """Neither the sector's photos nor the sparse points that only they have found may reach the Gaussians."""
+    data = with_tracks(scene[0])
+    settings = replace(SHORT, iterations=20, test_sector=0.25)
+    split = data.held_out(settings)
+    only = times_seen([data.tracks[index] for index in split.trained], len(data.points)) < 2
+    assert 0 < only.mean() < 0.9
+    images = [np.zeros_like(image) if row in split.sector else image for row, image in enumerate(data.images)]
+    points = np.where(only[:, None], data.points + [0.1, 0.2, 0.1], data.points)
+    # the sector is found from the cameras and points: nearly the same ones
+    other = replace(data, images=images, points=points)
+    assert other.held_out(settings) == split
+    first, second = (train(each, settings, progress=False).gaussians.parameters() for each in (data, other))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_scores_are_of_the_pixels_that_the_training_can_know(scene):
+    """Gaussians that are right wherever the training sees, and missing elsewhere, are right."""
+    data = with_tracks(scene[0])
+    settings = replace(SHORT, test_sector=0.25, exposure=False)
+    good = train(data, SHORT, progress=False).gaussians
+    index = data.held_out(settings).sector[0]
+    whole = {row.photo: row for row in held_out_scores(good, data, settings)}[data.views[index].name]
+    photo, found = data.image(index).copy(), known_pixels(data, settings, index)
+    assert 0.3 < found.mean() < 0.98 and whole.seen == pytest.approx(found.mean())
+    photo[~found] = 255 - photo[~found]
+    images = [photo if row == index else image for row, image in enumerate(data.images)]
+    spoiled = held_out_scores(good, replace(data, images=images), settings)[0]
+    assert spoiled.psnr < whole.psnr - 0.5
+    assert spoiled.seen_psnr == pytest.approx(whole.seen_psnr) and spoiled.seen_depth == whole.seen_depth
+    assert spoiled.seen_ssim == pytest.approx(whole.seen_ssim, abs=0.05)
+
+
+def test_depth_is_judged_by_confirmed_depth_of_stereo_and_its_sky_is_not_seen(scene):
+    depths = scene[1].astype(np.float32)
+    sky, confirmed = np.zeros(depths.shape[1:], bool), np.ones(depths.shape[1:], np.uint8)
+    sky[:20], confirmed[:, :30] = True, 0
+
+    def stereo(index):
+        return replace(DepthMap.nothing(sky.shape), depth=depths[index], num_views=confirmed, sky=sky)
+
+    data, settings = replace(with_tracks(scene[0]), depth_maps=stereo), replace(SHORT, test_sector=0.2)
+    good = train(scene[0], SHORT, progress=False).gaussians
+    for row, index in zip(held_out_scores(good, data, settings), data.held_out(settings).sector, strict=True):
+        found, seen = depth_map(good, data.views[index])[0], known_pixels(data, settings, index) & ~sky
+        right = np.abs(found - depths[index]) < 0.01 * depths[index]
+        assert row.seen == pytest.approx(seen.mean())
+        assert row.seen_depth == pytest.approx(right[seen & (confirmed > 0)].mean(), abs=1e-3)
+
+
+def known_pixels(data, settings, index):
+    trained = data.held_out(settings).trained
+    witnesses = Witnesses(
+        [data.views[row] for row in trained], [data.tracks[row] for row in trained], data.points
+    )
+    return witnesses.pixels(data.views[index], data.tracks[index])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"test_every": -2}, {"test_sector": -0.1}, {"test_sector": 1.0}, {"test_sector": float("nan")}]
+)
+def test_hold_outs_that_say_nothing_are_refused(wrong):
+    with pytest.raises(InputError, match="test_sector"):
+        TrainSettings(**wrong)

@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from sc3d.geometry.held_out import held_out_views
 from sc3d.io.images import read_image
+from sc3d.scene.held_out import HeldOutPhoto
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.evaluation import compare, picture
@@ -76,17 +78,17 @@ def test_sheet_holds_the_four_panels(gaussians):
 
 
 def test_chosen_photos_are_spread_and_held_out_ones_come_first():
-    assert chosen_views(18, TrainSettings()) == [(index, False) for index in (0, 3, 7, 10, 14, 17)]
-    assert chosen_views(3, TrainSettings()) == [(0, False), (1, False), (2, False)]
-    with_test = chosen_views(40, TrainSettings(test_every=8))
+    def split(count, every):
+        return held_out_views([None] * count, [], np.zeros((0, 3)), every, 0.0)
+
+    assert chosen_views(split(18, 0)) == [(index, False) for index in (0, 3, 7, 10, 14, 17)]
+    assert chosen_views(split(3, 0)) == [(0, False), (1, False), (2, False)]
+    with_test = chosen_views(split(40, 8))
     assert [index for index, held_out in with_test if held_out] == [7, 15, 31, 39] and [
         held_out for _, held_out in with_test
     ] == [True] * 4 + [False] * 2
     assert not {index for index, held_out in with_test if not held_out} & set(range(7, 40, 8))
-    assert (
-        chosen_views(8, TrainSettings(test_every=8))[0] == (7, True)
-        and len(chosen_views(8, TrainSettings(test_every=8))) == 6
-    )
+    assert chosen_views(split(8, 8))[0] == (7, True) and len(chosen_views(split(8, 8))) == 6
 
 
 def test_training_sheet_uses_the_exposures_found(gaussians, tmp_path):
@@ -99,7 +101,8 @@ def test_training_sheet_uses_the_exposures_found(gaussians, tmp_path):
     assert [row.held_out for row in rows] == [True, False, False, False]
     assert [row.psnr > 40 for row in rows] == [True, True, False, True]  # the held-out one is fitted
     log = [{"iteration": 30, "loss": 0.1, "psnr": 31.0, "num_gaussians": 5, "seconds": 1.0}]
-    result = TrainResult(gaussians, exposures, log, {"psnr": 25.0, "ssim": 0.8})
+    held_out = [HeldOutPhoto("a.jpg", "every 4", 25.0, 0.8, 1.0, 25.0, 0.8, None)]
+    result = TrainResult(gaussians, exposures, log, held_out)
     write_training_sheet(tmp_path / "train.jpg", result, data, settings)
     assert read_image(tmp_path / "train.jpg").shape[1] == 1600 and [
         path.name for path in tmp_path.iterdir()
