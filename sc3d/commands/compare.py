@@ -34,7 +34,9 @@ logger = logging.getLogger(__name__)
 
 
 def main(command: Compare) -> None:
-    """Write `height_change.tif`, `class_change.tif`, `changes.geojson` (`*_local` without a CRS) and `changes.png`."""
+    """Write `height_change.tif`, `class_change.tif`, `changes.geojson` (`*_local` without a CRS) and
+    `changes.png`.
+    """
     scenes = Scene(command.before), Scene(command.after)
     folder = command.output or scenes[1].export / "compare"
     settings = Export(epsg=_check(command, *scenes))
@@ -59,8 +61,8 @@ def main(command: Compare) -> None:
 
 
 def _check(command: Compare, before: Scene, after: Scene) -> int:
-    """EPSG code of the results, 0 = none; InputError for scenes or options that do not fit together, before any
-    work.
+    """EPSG code of the results, 0 = none; InputError for scenes or options that do not fit together, before
+    any work.
     """
     if min(command.min_height, command.min_area) <= 0 or command.pixel_size < 0:
         raise InputError("--min-height and --min-area must be above 0, --pixel-size must not be negative")
@@ -75,7 +77,8 @@ def _check(command: Compare, before: Scene, after: Scene) -> int:
     if placed[0] is not None or placed[1] is not None:
         lacking = before if placed[0] is None else after
         raise InputError(
-            f"{lacking.path} has no georeference and the other scene has one: run `sc3d georeference {lacking.path}`"
+            f"{lacking.path} has no georeference and the other scene has one: "
+            f"run `sc3d georeference {lacking.path}`"
         )
     logger.warning("neither scene is georeferenced: both are taken to be in one frame, in m")
     return command.epsg
@@ -96,12 +99,14 @@ def _tell_noise(noise: Noise, min_height: float) -> None:
     logger.info("%s: shift of height %+.3f m, noise %.3f m", where, noise.shift, noise.spread)
     if abs(noise.shift) > 0.5 * min_height:
         logger.warning(
-            "after lies %+.2f m beside before in height: georeference both with the same control points, or raise --min-height",
+            "after lies %+.2f m beside before in height: georeference both with the same control points, "
+            "or raise --min-height",
             noise.shift,
         )
     if 3 * noise.spread > min_height:
         logger.warning(
-            "heights differ by noise of %.2f m: changes below %.2f m are not to be trusted; raise --min-height",
+            "heights differ by noise of %.2f m: changes below %.2f m are not to be trusted; "
+            "raise --min-height",
             noise.spread,
             3 * noise.spread,
         )

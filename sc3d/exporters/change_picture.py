@@ -1,5 +1,5 @@
-"""A picture of what changed: classes before and after in relief, and the difference of heights, with the changes
-outlined and numbered.
+"""A picture of what changed: classes before and after in relief, and the difference of heights, with the
+changes outlined and numbered.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ LIGHT = np.array([-0.5, 0.5, 0.7071])
 
 
 def draw_changes(dates: Dates, changes: list[Change], names: tuple[str, str], unit: float) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: before, after, difference, and a legend below; names: of the scenes; unit: m per unit of
-    the CRS.
+    """(H, W, 3) uint8 RGB: before, after, difference, and a legend below; names: of the scenes; unit: m per
+    unit of the CRS.
     """
     from PIL import Image, ImageDraw
 

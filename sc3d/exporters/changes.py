@@ -53,8 +53,8 @@ class Dates:
 
 @dataclass(frozen=True)
 class Noise:
-    """How the heights of ground that both dates show differ. shift: median, after less before, m; spread: standard
-    deviation without outliers, m; on_ground: False if they share no ground and all cells counted
+    """How the heights of ground that both dates show differ. shift: median, after less before, m; spread:
+    standard deviation without outliers, m; on_ground: False if they share no ground and all cells counted
     """
 
     shift: float
@@ -66,8 +66,8 @@ class Noise:
 class Change:
     """A region that changed.
 
-    polygon: CRS; number: from 1, the largest first; kind: higher, lower or class; before, after: names of the classes that
-        most of it has; area: m2; rise: median, m; volume: after less before, m3
+    polygon: CRS; number: from 1, the largest first; kind: higher, lower or class; before, after: names of
+        the classes that most of it has; area: m2; rise: median, m; volume: after less before, m3
     """
 
     polygon: shapely.Polygon
@@ -107,7 +107,9 @@ def joint_table(before: ClassTable, after: ClassTable) -> tuple[ClassTable, np.n
 
 
 def common_grid(before: LabelledPoints, after: LabelledPoints, pixel: float) -> Raster:
-    """The grid over what both dates cover; pixel: m, 0 = that of the sparser cloud. InputError if that is nothing."""
+    """The grid over what both dates cover; pixel: m, 0 = that of the sparser cloud. InputError if that is
+    nothing.
+    """
     low, high = np.maximum(before.low, after.low), np.minimum(before.high, after.high)
     if (low[:2] >= high[:2]).any():
         places = [f"{(cloud.low + cloud.high)[:2] / 2}" for cloud in (before, after)]
@@ -138,8 +140,8 @@ def measure_noise(dates: Dates) -> Noise:
 
 
 def find_changes(dates: Dates, min_height: float, min_area: float, unit: float) -> list[Change]:
-    """Regions of at least min_area, m2, that are higher or lower by min_height, m, or elsewhere of another class;
-    the largest first. unit: m per unit of the CRS.
+    """Regions of at least min_area, m2, that are higher or lower by min_height, m, or elsewhere of another
+    class; the largest first. unit: m per unit of the CRS.
     """
     rise, pixel = np.nan_to_num(dates.rise), dates.grid.pixel
     size = 2 * round(max(REACH / pixel, 1.0)) + 1
@@ -174,8 +176,8 @@ def _elsewhere(dates: Dates, size: int) -> np.ndarray:
 
 
 def _whole(sure: np.ndarray, maybe: np.ndarray, pixel: float) -> np.ndarray:
-    """(H, W) bool: the cells that may have changed, without strips and specks, where they hang together with some
-    that surely have.
+    """(H, W) bool: the cells that may have changed, without strips and specks, where they hang together
+    with some that surely have.
     """
     wide = ndimage.binary_opening(maybe, disk(max(OPENING / pixel, 1.0)))
     return ndimage.binary_propagation(sure & wide, mask=wide)

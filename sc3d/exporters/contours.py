@@ -54,7 +54,9 @@ def interval_for(heights: np.ndarray, unit: float) -> float:
 
 
 def trace_contours(ground: GroundGrid, interval: float, unit: float) -> list[Contour]:
-    """The lines at multiples of the interval, from low to high; interval, unit: m per unit, units of the CRS."""
+    """The lines at multiples of the interval, from low to high; interval, unit: m per unit, units of the
+    CRS.
+    """
     heights = _smooth(ground.height, SMOOTHING / ground.grid.pixel) / unit
     low, high = np.nanmin(heights), np.nanmax(heights)
     levels = np.arange(np.ceil(low / interval), np.floor(high / interval) + 1).astype(np.int64)

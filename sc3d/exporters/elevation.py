@@ -1,5 +1,5 @@
-"""Terrain for maps: heights of the ground (DTM), of the surface (DSM), of what stands on the ground (nDSM), and
-contour lines.
+"""Terrain for maps: heights of the ground (DTM), of the surface (DSM), of what stands on the ground (nDSM),
+and contour lines.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
-    """What `settings.format` names of: `export/dtm.tif` and `dtm_distance.tif` (0 where ground was measured, else
-    how far that is), `dsm.tif`, `ndsm.tif` (float32, units of the CRS), `contours.gpkg`; on one grid.
+    """What `settings.format` names of: `export/dtm.tif` and `dtm_distance.tif` (0 where ground was
+    measured, else how far that is), `dsm.tif`, `ndsm.tif` (float32, units of the CRS), `contours.gpkg`; on
+    one grid.
     """
     kinds = _kinds(settings)
     if settings.pixel_size < 0 or settings.contour_interval < 0:

@@ -1,4 +1,6 @@
-"""Maps as GeoTIFF: tiled, compressed, with a CRS, and with overviews so that map programs draw them at once."""
+"""Maps as GeoTIFF: tiled, compressed, with a CRS, and with overviews so that map programs draw them at
+once.
+"""
 
 from __future__ import annotations
 
@@ -92,7 +94,9 @@ def write_lengths(
 def write_labels(
     path: Path, labels: np.ndarray, projection: MapProjection, grid: Raster, table: ClassTable
 ) -> None:
-    """One band of class ids with palette, and their names in GDAL's side file; labels: (H, W) uint8, 0 = none; grid: m."""
+    """One band of class ids with palette, and their names in GDAL's side file; labels: (H, W) uint8, 0 =
+    none; grid: m.
+    """
     with atomic_path(path) as temporary:
         scaled = scaled_grid(grid, projection.unit)
         with open_geotiff(temporary, projection, scaled, count=1, dtype="uint8", nodata=0) as dataset:

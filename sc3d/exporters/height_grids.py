@@ -1,5 +1,5 @@
-"""Heights of the ground and of the surface on a grid, from a labelled cloud that is read in parts: memory for the
-cells, not for the points.
+"""Heights of the ground and of the surface on a grid, from a labelled cloud that is read in parts: memory
+for the cells, not for the points.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ Parts = Callable[[], Iterator[tuple[np.ndarray, np.ndarray]]]
 
 @dataclass(frozen=True)
 class LabelledPoints:
-    """A labelled cloud to be read several times. parts: gives (N, 3) points, CRS, m, and (N,) uint8 labels of each
-    part; low, high: (3,) m; spacing: of the points on the plan, m
+    """A labelled cloud to be read several times. parts: gives (N, 3) points, CRS, m, and (N,) uint8 labels
+    of each part; low, high: (3,) m; spacing: of the points on the plan, m
     """
 
     parts: Parts
@@ -52,8 +52,8 @@ class LabelledPoints:
 
 @dataclass(frozen=True)
 class SurfaceGrid:
-    """What is on top. height: (H, W) float64 z, m, NaN = no points; label: (H, W) uint8 class of the highest point,
-    0 = none
+    """What is on top. height: (H, W) float64 z, m, NaN = no points; label: (H, W) uint8 class of the
+    highest point, 0 = none
     """
 
     grid: Raster
@@ -63,9 +63,9 @@ class SurfaceGrid:
 
 @dataclass(frozen=True)
 class GroundGrid:
-    """The bare ground. height: (H, W) float64 z, m, NaN outside the cloud; distance: (H, W) from the nearest cell
-    with points of the ground, m, 0 = measured, NaN outside; dropped: share of the points of ground classes that
-    lie too far above or below it
+    """The bare ground. height: (H, W) float64 z, m, NaN outside the cloud; distance: (H, W) from the
+    nearest cell with points of the ground, m, 0 = measured, NaN outside; dropped: share of the points of
+    ground classes that lie too far above or below it
     """
 
     grid: Raster
@@ -115,8 +115,8 @@ def surface_grid(cloud: LabelledPoints, grid: Raster) -> SurfaceGrid:
 
 
 def ground_grid(cloud: LabelledPoints, grid: Raster, table: ClassTable) -> GroundGrid:
-    """The ground from the points of ground-like classes, holes interpolated; InputError if no class or no point is
-    ground.
+    """The ground from the points of ground-like classes, holes interpolated; InputError if no class or no
+    point is ground.
     """
     ids = require_ground(table)
     rough, covered = _Means(grid), np.zeros(grid.height * grid.width, bool)

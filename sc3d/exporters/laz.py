@@ -69,8 +69,8 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
 
 
 def asprs_codes(table: ClassTable, ground_as_2: bool = False) -> np.ndarray:
-    """(256,) uint8 ASPRS code of each class id; unlabelled points are unassigned. ground_as_2: what is ground-like
-    becomes ground; InputError if nothing is.
+    """(256,) uint8 ASPRS code of each class id; unlabelled points are unassigned. ground_as_2: what is
+    ground-like becomes ground; InputError if nothing is.
     """
     codes = np.full(256, UNASSIGNED, np.uint8)
     for entry in table:

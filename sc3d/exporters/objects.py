@@ -50,8 +50,8 @@ class Kinds:
 class Site:
     """A labelled cloud and what is known of it on a grid; all lengths are meters.
 
-    points: (N, 3) CRS; ground: (H, W) z of the ground; above: (N,) bool, points as high above it as a building
-        or tree
+    points: (N, 3) CRS; ground: (H, W) z of the ground; above: (N,) bool, points as high above it as a
+        building or tree
     """
 
     projected: ProjectedCloud
@@ -144,7 +144,9 @@ def _quantiles(values: np.ndarray, regions: np.ndarray, share: float) -> np.ndar
 
 
 def _volumes(above: np.ndarray, regions: np.ndarray, grid: Raster) -> np.ndarray:
-    """(R,) float64 m3 between the heights above the ground (H, W), m, and the ground; below it counts nothing."""
+    """(R,) float64 m3 between the heights above the ground (H, W), m, and the ground; below it counts
+    nothing.
+    """
     heights = np.maximum(np.nan_to_num(above), 0.0)
     return (np.bincount(regions.ravel(), heights.ravel()) * grid.pixel**2)[1:]
 

@@ -37,7 +37,8 @@ def require_ground(table: ClassTable) -> list[int]:
     ids = ground_classes(table)
     if not ids:
         raise InputError(
-            'no class is ground by its ASPRS code (2 ground, 3 low vegetation beside trees, 9 water, 10 rail, 11 road): add "asprs" to the classes in classes.json'
+            "no class is ground by its ASPRS code (2 ground, 3 low vegetation beside trees, 9 water, 10 rail, "
+            '11 road): add "asprs" to the classes in classes.json'
         )
     return ids
 
@@ -75,8 +76,8 @@ def block_medians(blocks: np.ndarray, values: np.ndarray, count: int) -> np.ndar
 
 
 def low_objects(heights: np.ndarray, pixel: float) -> np.ndarray:
-    """(H, W) bool: cells that stand on the ground, as cars, hedges and roofs that were labelled as ground do: the
-    simple morphological filter of Pingel et al. (2013), which allows for the slope around.
+    """(H, W) bool: cells that stand on the ground, as cars, hedges and roofs that were labelled as ground
+    do: the simple morphological filter of Pingel et al. (2013), which allows for the slope around.
 
     heights: (H, W) m, NaN = none; pixel: side of the cells, m
     """
@@ -89,8 +90,8 @@ def low_objects(heights: np.ndarray, pixel: float) -> np.ndarray:
 
 
 def _steepest(opened: np.ndarray, radius: float, pixel: float) -> np.ndarray:
-    """(H, W) steepest slope of an opened surface (H, W), m per m, within reach of the flat tops that an opening by
-    `radius`, m, leaves.
+    """(H, W) steepest slope of an opened surface (H, W), m per m, within reach of the flat tops that an
+    opening by `radius`, m, leaves.
     """
     if min(opened.shape) < 2:
         return np.zeros(opened.shape)
@@ -101,14 +102,18 @@ def _steepest(opened: np.ndarray, radius: float, pixel: float) -> np.ndarray:
 
 
 def _opened(heights: np.ndarray, size: int) -> np.ndarray:
-    """(H, W) the opening by a square of `size` cells; NaN counts nowhere, and stays where all around is NaN."""
+    """(H, W) the opening by a square of `size` cells; NaN counts nowhere, and stays where all around is
+    NaN.
+    """
     low = ndimage.grey_erosion(np.where(np.isfinite(heights), heights, np.inf), (size, size), mode="nearest")
     high = ndimage.grey_dilation(np.where(np.isfinite(low), low, -np.inf), (size, size), mode="nearest")
     return np.where(np.isfinite(high), high, np.nan)
 
 
 def _stands_out(medians: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """(H, W) bool blocks higher above an opening of the ground than STEP; the opening flattens hills by less."""
+    """(H, W) bool blocks higher above an opening of the ground than STEP; the opening flattens hills by
+    less.
+    """
     size = round(WINDOW / CELL) | 1
     return known & (medians > _opened(np.where(known, medians, np.nan), size) + STEP)
 

@@ -39,7 +39,8 @@ class Feature:
     polygon: shapely polygon in the CRS; number: from 1, per layer; name, label: its class; area: m2 of the
         outline
     height: of its top above the ground, m; ground: z of the ground under it, m; confidence: mean of its
-        points, 0 to 1; num_points: of its class; volume: between its top, as seen from above, and the ground, m3
+        points, 0 to 1; num_points: of its class; volume: between its top, as seen from above, and the
+        ground, m3
     """
 
     polygon: shapely.Polygon

@@ -1,5 +1,7 @@
 """Terrain: ground, surface, heights above the ground and contour lines against exact terrain."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyogrio.raw
 import pyproj
@@ -198,3 +200,14 @@ def test_one_stage_writes_all_of_them(tmp_path):
         export.run(scene, Export(format=("contours",), contour_interval=0.0005))
     with pytest.raises(InputError, match="must not be negative"):
         export.run(scene, Export(format=("dtm",), pixel_size=-1.0))
+
+
+@pytest.mark.parametrize("size", [(0.0, 0.0), (9.0, 0.0), (0.3, 0.3), (9.0, 9.0)])
+def test_tiny_and_level_clouds_have_terrain_too(tmp_path, size):
+    places = np.random.default_rng(0).uniform(0, 1, (50, 2)) * size
+    scene = write_scene(tmp_path, labelled_cloud(np.c_[places, np.full(50, 3.25)], np.full(50, 3)))
+    figures = elevation.write(scene, replace(ALL, pixel_size=0.5))
+    assert figures["contours"] == 0 and figures["ground_points_left_out"] == "0.0%"
+    for name, height in (("dtm.tif", 3.25), ("dsm.tif", 3.25), ("ndsm.tif", 0.0)):
+        values, _, _ = read(scene.export / name)
+        assert np.isfinite(values).any() and np.nanmax(np.abs(values - height)) < 1e-4

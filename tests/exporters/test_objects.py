@@ -332,3 +332,13 @@ def test_numbers_follow_the_order_of_cells():
         renumbered(np.array([[0, 9, 9], [4, 4, 0], [9, 2, 2]])) == [[0, 1, 1], [2, 2, 0], [1, 3, 3]]
     ).all()
     assert (renumbered(np.array([[7, 7], [3, 7]])) == [[1, 1], [2, 1]]).all()
+
+
+def test_volume_above_the_ground_of_a_house_on_a_slope(tmp_path):
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-15, 15, (2, 60_000))
+    house, ground = (np.abs(x) < 5) & (np.abs(y) < 4), 0.1 * x
+    points = np.stack([x, y, np.where(house, 6.0, ground)], 1)
+    buildings, _ = exported(write_scene(tmp_path, labelled_cloud(points, np.where(house, 1, 3))))
+    # 80 m2, on average 6 m above the plane of the slope
+    assert buildings[0]["properties"]["volume_m3"] == pytest.approx(480, rel=0.05)
