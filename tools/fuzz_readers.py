@@ -18,7 +18,6 @@ import json
 import os
 import random
 import re
-import resource
 import shutil
 import signal
 import struct
@@ -36,6 +35,7 @@ sys.path.insert(0, str(ROOT))
 PART = 500  # cases
 SECONDS = 2.0
 MEMORY = 1 << 30
+SHARED = Path("/dev/shm") if sys.platform.startswith("linux") else None
 
 
 def main() -> None:
@@ -57,6 +57,8 @@ def main() -> None:
         name, number = arguments.only.rsplit(":", 1)
         print(one_case(Fixture(name), int(number)))
         return
+    if not sys.platform.startswith("linux"):
+        sys.exit("needs Linux, for limits of time and memory; --only READER:NUMBER repeats a case elsewhere")
     started, parts = time.time(), arguments.folder / "parts.jsonl"
     done = (
         {(row["reader"], row["first"]) for row in map(json.loads, parts.read_text().splitlines())}
@@ -98,6 +100,8 @@ def one_part(name: str, first: int, folder: Path) -> dict:
 
 
 def child_process(name: str, numbers: range, progress: str, folder: Path) -> None:
+    import resource
+
     sink = os.open(os.devnull, os.O_WRONLY)
     os.dup2(sink, 1), os.dup2(sink, 2)  # native libraries say a lot
     sys.stdout, sys.stderr = open(os.devnull, "w"), open(os.devnull, "w")
@@ -130,7 +134,7 @@ class Fixture:
         from tests.robustness.readers import READERS
 
         self.name, self.reader = name, READERS[name]
-        self.folder = Path(tempfile.mkdtemp(prefix=f"sc3d-fuzz-{os.getppid()}-", dir="/dev/shm")) / "files"
+        self.folder = Path(tempfile.mkdtemp(prefix=f"sc3d-fuzz-{os.getppid()}-", dir=SHARED)) / "files"
         self.reader.build(self.folder)
         self.contents = {target: (self.folder / target).read_bytes() for target in self.reader.targets}
 

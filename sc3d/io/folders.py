@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,6 +16,22 @@ PICTURES = ("train.jpg",)
 def resolved(path: Path) -> Path:
     """As `Path.resolve`, which fails before Python 3.13 for a link to itself."""
     return Path(os.path.realpath(path))
+
+
+def link_or_copy(source: Path, link: Path) -> None:
+    """Make `link` a link to a file or a folder, relative if `source` is (then seen from the link's folder); a copy
+    where links are not possible (Windows asks for a privilege).
+    """
+    target = link.parent / source
+    try:
+        os.symlink(source, link, target_is_directory=target.is_dir())
+    except FileExistsError:
+        raise
+    except (OSError, NotImplementedError):
+        if target.is_dir():
+            shutil.copytree(target, link)
+        else:
+            shutil.copyfile(target, link)
 
 
 def files_below(folder: Path) -> tuple[list[Path], list[Path]]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
-from sc3d.io.folders import files_below, resolved
+from sc3d.io.folders import files_below, link_or_copy, resolved
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
@@ -110,10 +108,7 @@ def link_photos(photos: Path, images: Path) -> None:
     if images.exists() and resolved(images) == resolved(photos):
         return
     with atomic_path(images) as temporary:
-        try:
-            os.symlink(resolved(photos), temporary, target_is_directory=True)
-        except (OSError, NotImplementedError):  # Windows asks for a privilege
-            shutil.copytree(photos, temporary)
+        link_or_copy(resolved(photos), temporary)
 
 
 def require_within(file: Path, folder: Path) -> None:

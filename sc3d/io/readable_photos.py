@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import logging
-import os
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from sc3d.errors import left_out
-from sc3d.io.folders import resolved
+from sc3d.io.folders import link_or_copy, resolved
 from sc3d.io.images import (
     has_alpha,
     image_size,
@@ -43,7 +41,7 @@ def readable_photos(images: Path, names: list[str], work: Path) -> tuple[Path, P
             write_image(png, read_image(images / name, images))
             png.rename(photos / name)  # COLMAP looks into files, not at their names
         else:
-            _link(images / name, photos / name)
+            link_or_copy(resolved(images / name), photos / name)
     masked = [name for name in names if has_alpha(images / name) and read_opaque(images / name) is not None]
     for name in names if masked else ():  # COLMAP skips photos without a mask where others have one
         opaque = read_opaque(images / name) if name in masked else None
@@ -65,10 +63,3 @@ def tell_of_transparent(photos: Mapping[str, Path], what: str) -> list[str]:
     if clear:
         logger.warning(left_out(clear, len(photos), f"photos are wholly transparent and {what}"))
     return clear
-
-
-def _link(photo: Path, target: Path) -> None:
-    try:
-        os.symlink(resolved(photo), target)
-    except (OSError, NotImplementedError):  # Windows asks for a privilege
-        shutil.copyfile(photo, target)

@@ -31,7 +31,8 @@ LIBRARIES = {
     "libvulkan.so.1": "libvulkan1 mesa-vulkan-drivers",
     "libz.so.1": "zlib1g",
 }
-ALWAYS = ("libGL.so.1", "libEGL.so.1", "libusb-1.0.so.0", "libvulkan.so.1")  # slim systems lack these
+# slim systems lack these; without libgomp numba's kernels fall back to a slower pool of threads
+ALWAYS = ("libGL.so.1", "libEGL.so.1", "libusb-1.0.so.0", "libvulkan.so.1", "libgomp.so.1")
 NO_CACHE = "cannot cache function"  # numba
 OUT_OF_MEMORY = "not enough memory"  # torch
 LESS_MEMORY = "end other programs, use a smaller --max-size where there is one, or give label, propagate and evaluate a lower --max-memory, so that they work by tiles"

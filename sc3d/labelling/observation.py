@@ -14,6 +14,7 @@ import numpy as np
 
 from sc3d.geometry.cameras import View
 from sc3d.geometry.raycast import RayTarget, first_surface
+from sc3d.labelling.threads import kernels_may_overlap
 from sc3d.settings.labels import Label
 
 DISTANCE_STEPS = 16  # of a pixel
@@ -65,6 +66,9 @@ def observations(
             mask, confidence if settings.use_confidence else None, ranges, settings.edge_width
         )
 
+    if not kernels_may_overlap():
+        yield from map(prepare, ordered)
+        return
     with ThreadPoolExecutor(
         1
     ) as worker:  # what runs on one core only overlaps with the votes of the view before

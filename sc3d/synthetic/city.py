@@ -13,6 +13,7 @@ import numpy as np
 import open3d as o3d
 
 from sc3d.geometry.cameras import View, pixel_centers, rays
+from sc3d.io.folders import link_or_copy
 from sc3d.io.images import write_image
 from sc3d.io.json_files import write_json
 from sc3d.io.progress import progress
@@ -152,7 +153,7 @@ def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
     views = fly_over((columns * EXTENT, rows * EXTENT), settings)
     write_cameras(scene.sparse, [view.shifted(-OFFSET) for view in views])
     accuracy = _write_masks(scene, city, views, settings.seed)
-    scene.cloud.symlink_to("truth.ply")
+    link_or_copy(Path("truth.ply"), scene.cloud)
     write_json(scene.classes, CLASSES)
     return {"points": num_points, "views": len(views), "triangles": mesh.triangles, "mask_accuracy": accuracy}
 

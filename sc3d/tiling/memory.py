@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 from pathlib import Path
@@ -29,7 +30,7 @@ def memory_of(resources: Resources) -> int:
             )
         total = int(float(found[1]) * UNITS[found[2].upper()])
     else:
-        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+        total = system_memory() // 2
     # this process is there beside its workers
     share = total // max(resources.workers + 1, 1) if not resources.cluster else total
     if share <= BASE + (100 << 20):
@@ -37,6 +38,28 @@ def memory_of(resources: Resources) -> int:
             f"--max-memory: {total >> 20} MiB are too little for {resources.workers + 1} processes of at least {(BASE >> 20) + 100} MiB"
         )
     return share
+
+
+class _MemoryStatus(ctypes.Structure):
+    """MEMORYSTATUSEX of the Windows API."""
+
+    _fields_ = [
+        ("length", ctypes.c_uint32),
+        ("load", ctypes.c_uint32),
+        *(
+            (name, ctypes.c_uint64)
+            for name in ("memory", "free", "file", "file_free", "space", "space_free", "more")
+        ),
+    ]
+
+
+def system_memory() -> int:
+    """Bytes of memory that the machine has."""
+    if hasattr(os, "sysconf"):
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    status = _MemoryStatus(length=ctypes.sizeof(_MemoryStatus))
+    ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status))  # type: ignore[attr-defined, unused-ignore]
+    return status.memory
 
 
 def fits(needed: int, resources: Resources) -> bool:

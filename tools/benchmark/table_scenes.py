@@ -17,6 +17,7 @@ from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import Surface, first_surface, nearest_points
 from sc3d.io.atomic import atomic_path
 from sc3d.io.clouds import read_cloud
+from sc3d.io.folders import link_or_copy
 from sc3d.io.images import write_image
 from sc3d.io.mask_images import read_index_image
 from sc3d.io.progress import Progress, progress
@@ -91,7 +92,7 @@ def with_masks(scene: Scene, folder: Path, settings: Synthesize) -> Scene:
     for name, target in LINKS.items():
         link = folder / name
         if not link.is_symlink():
-            link.symlink_to((scene.path / target).resolve())
+            link_or_copy((scene.path / target).resolve(), link)
     made = Scene(folder)
     if made.masks.is_dir() and made.confidence.is_dir():
         return made
