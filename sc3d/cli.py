@@ -4,26 +4,50 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import logging
 import os
 import re
 import signal
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, PositionalMetavarFromFieldName
 
 from sc3d.commands import COMMANDS, MODULES, STAGES
 from sc3d.commands.renamed import MOVED, current
 from sc3d.errors import InputError, Sc3dError
+from sc3d.io.messages import printable, start_logging, write_to_log_file
 from sc3d.io.requirements import explain
+from sc3d.settings.common import Messages
 
 # numba reads it in whatever folder a command is called, also in a scene of somebody else
 NUMBA_FILE = ".numba_config.yaml"
+SHELLS = ("bash", "zsh", "tcsh", "fish")
+GROUPED = "\n\nThe everyday options come first, then those of each stage under its name, in the order in which the stages run."
+COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
+WAYS = """From photos to a labelled cloud, the three usual ways:
+
+  masks made elsewhere (COCO, LabelMe, CVAT, PNG):
+    sc3d run PHOTOS SCENE --classes CLASSES.json --masks MASKS
+
+  no masks: a few strokes on some photos, drawn in the browser:
+    sc3d reconstruct PHOTOS SCENE
+    sc3d annotate SCENE                      (needs SCENE/classes.json, the names of the classes)
+    sc3d run PHOTOS SCENE --segment.backend strokes
+
+  a cloud and cameras of another program (ODM, Metashape, Pix4D, COLMAP, nerfstudio):
+    sc3d import PROJECT SCENE --cloud CLOUD
+    sc3d segment SCENE --masks MASKS
+    sc3d label SCENE
+    sc3d propagate SCENE
+
+Then look at SCENE/report.html (sc3d report SCENE), or: sc3d view SCENE --web
+
+"""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -32,9 +56,12 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = expanded(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         with ending_with_reader():
-            sys.stdout.write(usage())
+            sys.stdout.write(usage() if arguments else WAYS + usage())
         sys.exit(0 if arguments else 2)
     name = arguments[0]
+    if name in COMPLETION:
+        with ending_with_reader(), reporting_errors():
+            print_completion(arguments)
     if name in MOVED:
         sys.exit(
             _fail(f"`sc3d {name}` is a tool of the checkout now: {MOVED[name]} {' '.join(arguments[1:])}")
@@ -49,8 +76,9 @@ def main(arguments: list[str] | None = None) -> None:
         )
     start_logging()
     with ending_with_reader():
-        command = parse(name, current(arguments[1:]))
+        command, messages = parse(name, current(arguments[1:]))
     with reporting_errors():
+        start_logging(messages.quiet, messages.verbose, messages.log)
         _dispatch(name, command)
 
 
@@ -77,28 +105,6 @@ def open_closed_streams() -> None:
                 os.close(opened)
     sys.stdout = sys.stdout or open(os.devnull, "w")
     sys.stderr = sys.stderr or open(os.devnull, "w")
-
-
-def start_logging() -> None:
-    """Log to stderr, of other packages warnings only."""
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(PlainText("%(message)s"))
-    logging.basicConfig(handlers=[handler])
-    for package in ("sc3d", "tools"):
-        logging.getLogger(package).setLevel(logging.INFO)
-    logging.captureWarnings(True)
-
-
-class PlainText(logging.Formatter):
-    """Names of photos and classes may hold what a terminal takes for commands."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        return printable(super().format(record))
-
-
-def printable(text: str) -> str:
-    """Text without control characters, but for line feeds and tabs."""
-    return re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "?", text)
 
 
 @contextmanager
@@ -133,6 +139,7 @@ def reporting_errors() -> Iterator[None]:
     except (ImportError, AttributeError, RuntimeError) as error:
         reason = explain(error)
         if reason is None:
+            write_to_log_file(traceback.format_exc())
             raise
         sys.exit(_fail(reason, status=1))
     except KeyboardInterrupt:
@@ -153,10 +160,46 @@ def usage() -> str:
     return "\n".join(lines) + "\n"
 
 
-def parse(name: str, arguments: list[str]) -> Any:
-    """Arguments to the settings record of a command; exits with status 2 on a usage error."""
+def parse(name: str, arguments: list[str]) -> tuple[Any, Messages]:
+    """Arguments to the settings record of a command, and what is told; exits with status 2 on a usage error."""
+    command = with_messages(name)
+    parsed: Any = tyro.cli(
+        command,
+        args=arguments,
+        prog=f"sc3d {name}",
+        description=_describe(command) + (GROUPED if name == "run" else ""),
+        config=(PositionalMetavarFromFieldName,),
+    )
+    return parsed.command, parsed.messages
+
+
+def print_completion(arguments: list[str]) -> None:
+    """tyro's script for the completion of all commands: --tyro-print-completion SHELL, or
+    --tyro-write-completion SHELL FILE; ends the process.
+    """
+    if len(arguments) != 2 + COMPLETION.index(arguments[0]) or arguments[1] not in SHELLS:
+        sys.exit(
+            _fail(
+                f"{arguments[0]} takes a shell ({', '.join(SHELLS)}){' and a file' * (arguments[0] == COMPLETION[1])}"
+            )
+        )
+    commands: dict[str, Any] = {name: with_messages(name) for name in sorted(STAGES | COMMANDS)}
+    tyro.extras.subcommand_cli_from_dict(commands, prog="sc3d", args=arguments)
+
+
+def with_messages(name: str) -> type:
+    """The record of a command, and beside it the options that all commands have."""
     record = COMMANDS.get(name) or scene_command(STAGES[name])
-    return tyro.cli(record, args=arguments, prog=f"sc3d {name}", description=_describe(record))
+    command = dataclasses.make_dataclass(
+        "WithMessages",
+        [
+            ("command", Annotated[record, tyro.conf.arg(name="")]),
+            ("messages", Annotated[FlagCreatePairsOff[Messages], tyro.conf.arg(name="")], Messages()),
+        ],
+        frozen=True,
+    )
+    command.__doc__ = record.__doc__
+    return command
 
 
 def scene_command(record: type) -> type:
@@ -193,6 +236,8 @@ def _dispatch(name: str, command: Any) -> None:
 
 
 def _fail(message: str, status: int = 2) -> int:
+    line = f"sc3d: {printable(' '.join(message.split()))}"
+    write_to_log_file(line)
     with suppress(BrokenPipeError):
-        sys.stderr.write(f"sc3d: {printable(' '.join(message.split()))}\n")
+        sys.stderr.write(f"{line}\n")
     return status

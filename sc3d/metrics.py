@@ -12,12 +12,12 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 from sc3d.errors import InputError, left_out
 from sc3d.geometry.cameras import View
 from sc3d.geometry.raycast import FirstSurface
 from sc3d.io.json_files import write_json
+from sc3d.io.progress import progress
 from sc3d.scene.class_table import OTHER, ClassTable
 from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
 from sc3d.scene.labels import Labels
@@ -332,7 +332,7 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
     views = [view for view in scene.model.views if view.name in truth_files]
     _tell_of_left_out(scene, [view.name for view in views], mask_files)
     per_photo, reliabilities, with_other, empty = {}, [], [], list[np.ndarray]()
-    for view in tqdm(views, desc="evaluating", unit="photo", disable=None):
+    for view in progress(views, "evaluating", "photo"):
         truth = scene.read_truth(truth_files[view.name], view.name, settings.zero_margin)
         rows, first = surface.rows(view, truth.shape[::-1], truth > 0)
         empty.append(_count_empty(truth, first.range, table))

@@ -34,6 +34,7 @@ from sc3d.io.atomic import (
     temporary_name,
 )
 from sc3d.io.json_files import read_json, write_json
+from sc3d.io.progress import under_way
 from sc3d.io.provenance import Input, PhotoFrames, digest, peak_memory_mb, reset_peak_memory, versions
 from sc3d.scene.scene import Scene
 from sc3d.settings.common import Resources, Workers
@@ -49,18 +50,46 @@ def execute(name: str, scene: Scene, settings: object, overwrite: bool = False) 
     Up to date: every output and its sidecar exist, made by the same settings from inputs of the same content,
     wherever the scene and they lie and however they are spelled.
     """
+    with under_way(name):
+        return _execute(name, scene, settings, overwrite)
+
+
+def up_to_date(name: str, scene: Scene, settings: object) -> bool:
+    """Whether `execute` would find the outputs of a stage finished, as the scene is now."""
     stage = importlib.import_module(f"sc3d.stages.{name}")
-    record: dict[str, Any] = {
+    outputs = stage.outputs(scene, settings)
+    if not all(output.exists() and sidecar(output).exists() for output in outputs):
+        return False  # without reading the inputs, which may not be there
+    return _finished(_record(name, scene, settings), outputs, scene, settings) is not None
+
+
+def files(name: str, scene: Scene, settings: object) -> tuple[list[Path], list[Path]]:
+    """Files and folders that a stage reads and writes."""
+    stage = importlib.import_module(f"sc3d.stages.{name}")
+    read = [item for item in stage.inputs(scene, settings) if isinstance(item, Path)]
+    return read, stage.outputs(scene, settings)
+
+
+def _record(name: str, scene: Scene, settings: object) -> dict[str, Any]:
+    """What decides whether the outputs of a stage are up to date."""
+    stage = importlib.import_module(f"sc3d.stages.{name}")
+    return {
         "stage": name,
         "settings": _decisive(settings, scene),
         "inputs": {_named(item, scene): digest(item) for item in stage.inputs(scene, settings)},
     }
+
+
+def _execute(name: str, scene: Scene, settings: object, overwrite: bool) -> dict[str, object]:
+    stage = importlib.import_module(f"sc3d.stages.{name}")
+    record = _record(name, scene, settings)
     outputs = stage.outputs(scene, settings)
     previous = _finished(record, outputs, scene, settings)
     if previous is not None and not overwrite:
         logger.info("%s: up to date (--overwrite runs it again)", name)
         return previous["summary"]
     besides = stage.besides(scene, settings) if hasattr(stage, "besides") else []
+    logger.debug("%s: settings %s, inputs %s", name, record["settings"], record["inputs"])
     _prepare(scene, outputs, besides, getattr(settings, "output", None))
     started = time.perf_counter()
     reset_peak_memory()

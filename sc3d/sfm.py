@@ -5,19 +5,17 @@ from __future__ import annotations
 import logging
 import sqlite3
 import tempfile
-import threading
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, suppress
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-from tqdm import tqdm
 
 from sc3d.errors import InputError, Sc3dError, left_out
 from sc3d.georeferencing.gps import Flight, read_flight
 from sc3d.io.atomic import require_room, telling_of_full_disk, temporary_name
 from sc3d.io.colmap import registered_images, write_model
+from sc3d.io.progress import Progress, polled
 from sc3d.io.readable_photos import readable_photos, transparent_photos
 from sc3d.settings.reconstruction import Mapping
 
@@ -33,7 +31,7 @@ def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) 
     images: folder; names: photos relative to it
     """
     pycolmap.set_random_seed(settings.seed)
-    pycolmap.logging.minloglevel = 2
+    pycolmap.logging.minloglevel = 0 if logger.isEnabledFor(logging.DEBUG) else 2
     if settings.camera_model not in pycolmap.CameraModelId.__members__ or settings.camera_model == "INVALID":
         raise InputError(
             f"unknown camera model {settings.camera_model!r}: one of {', '.join(list(pycolmap.CameraModelId.__members__)[1:])}"
@@ -75,7 +73,7 @@ def _extract(
     # else ids follow the threads that are done first
     pycolmap.import_images(database, images, pycolmap.CameraMode.AUTO, names, reader)
     reader.mask_path = masks or ""
-    with _progress(database, "keypoints", len(names), "features", "photo"):
+    with _polled(database, "keypoints", len(names), "features", "photo"):
         pycolmap.extract_features(
             database, readable, names, pycolmap.CameraMode.AUTO, reader, options, pycolmap.Device.cpu
         )
@@ -125,7 +123,7 @@ def _match(database: Path, num_photos: int, settings: Mapping) -> None:
     num_pairs = num_photos * (num_photos - 1) // 2 if settings.matching == "exhaustive" else None
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = settings.seed  # for each pair, whichever thread it falls to
-    with _progress(database, "two_view_geometries", num_pairs, "matching", "pair"):
+    with _polled(database, "two_view_geometries", num_pairs, "matching", "pair"):
         match[settings.matching](database, verification_options=verification, device=pycolmap.Device.cpu)
 
 
@@ -139,10 +137,8 @@ def _map(
     options.use_prior_position = has_gps
     options.use_robust_loss_on_prior_position = has_gps
     options.min_model_size = min(10, num_photos)
-    with tqdm(total=num_photos, desc="cameras", unit="photo", disable=None) as bar:
-        models = pycolmap.incremental_mapping(
-            database, images, work, options, next_image_callback=lambda: bar.update(1)
-        )
+    with Progress(num_photos, "cameras", "photo") as bar:
+        models = pycolmap.incremental_mapping(database, images, work, options, next_image_callback=bar.update)
     if not models:
         raise Sc3dError(
             "no two photos could be matched: they need at least 60 % overlap and texture; try a larger --max-size"
@@ -190,26 +186,17 @@ def _best_match(matches: list[tuple[int, str]]) -> str:
     return f"{count} with {other}" + (f", fewer with {len(matches) - 1} more" if len(matches) > 1 else "")
 
 
-@contextmanager
-def _progress(database: Path, table: str, total: int | None, description: str, unit: str) -> Iterator[None]:
-    """Show how many rows a pycolmap call has written; it reports no progress itself."""
-    done = threading.Event()
+def _polled(
+    database: Path, table: str, total: int | None, description: str, unit: str
+) -> AbstractContextManager[None]:
+    """A context that shows how many rows a pycolmap call has written; it reports no progress itself."""
 
-    def poll() -> None:
-        with tqdm(total=total, desc=description, unit=unit, disable=None) as bar:
-            while not bar.disable and not done.wait(0.5):
-                with (
-                    suppress(sqlite3.Error),
-                    closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=0.1)) as connection,
-                ):
-                    bar.update(connection.execute(f"select count(*) from {table}").fetchone()[0] - bar.n)
-            if total is not None:
-                bar.update(total - bar.n)
+    def count() -> int | None:
+        with (
+            suppress(sqlite3.Error),
+            closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=0.1)) as connection,
+        ):
+            return connection.execute(f"select count(*) from {table}").fetchone()[0]
+        return None
 
-    thread = threading.Thread(target=poll, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
+    return polled(Progress(total, description, unit), count)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -14,7 +15,7 @@ import pytest
 from PIL import Image
 
 import sc3d.stages.label  # noqa: F401 - loaded before a test gives up its rights
-from sc3d.cli import main, parse, usage
+from sc3d.cli import WAYS, main, parse, usage
 from sc3d.commands import COMMANDS, STAGES
 from sc3d.commands.renamed import current
 from tests.builders import write_bare_scene
@@ -59,13 +60,14 @@ def test_run_makes_masks_first_where_depth_takes_sky_from_them(scene, monkeypatc
     stages: list[str] = []
     table = [{"id": 1, "name": "road", "color": [1, 1, 1]}, {"id": 3, "name": name, "color": [9, 9, 9]}]
     (scene / "classes.json").write_text(json.dumps(table))
-    for step in ("check", "prepare", "reconstruct"):
+    for step in ("check", "prepare", "tell_plan"):
         monkeypatch.setattr(run, step, lambda *arguments: None)
     monkeypatch.setattr(run, "execute", lambda stage, *arguments: stages.append(stage))
     main(["run", "photos", str(scene), *options])
     others = [stage for stage in stages if stage != "segment"]
-    assert others == ["depth", "train", "extract", "label", "propagate", "report"]
-    assert stages[0] == first and stages.index("segment") in (0, 3)
+    surface = ["depth", "train", "extract", "label", "propagate", "report"]
+    assert others == ["map_photos", "reconstruct", *surface]
+    assert stages[2] == first and stages.index("segment") in (2, 5)
 
 
 @pytest.mark.parametrize(
@@ -295,9 +297,9 @@ def test_options_as_they_were_spelled_before_are_taken_with_a_warning(before, no
 
 
 def test_old_spellings_reach_the_records(tmp_path):
-    assert parse("extract", current([str(tmp_path), "--from", "centres"])).settings.method == "centers"
-    assert parse("train", current([str(tmp_path), "--num-neighbours", "5"])).settings.num_neighbors == 5
-    assert parse("run", current(["a", "b", "--label.incidence"])).label.mechanisms.incidence
+    assert parse("extract", current([str(tmp_path), "--from", "centres"]))[0].settings.method == "centers"
+    assert parse("train", current([str(tmp_path), "--num-neighbours", "5"]))[0].settings.num_neighbors == 5
+    assert parse("run", current(["a", "b", "--label.incidence"]))[0].label.mechanisms.incidence
 
 
 @pytest.mark.parametrize(
@@ -306,9 +308,9 @@ def test_old_spellings_reach_the_records(tmp_path):
 def test_coverage_is_told_what_it_is_now(tmp_path, caplog, share, fill):
     for arguments in (["--coverage", share], [f"--coverage={share}"]):
         caplog.clear()
-        assert parse("extract", current([str(tmp_path), *arguments])).settings.fill == fill
+        assert parse("extract", current([str(tmp_path), *arguments]))[0].settings.fill == fill
         assert f"--coverage {share} is --fill {fill} now" in caplog.text
-    assert parse("run", current(["a", "b", "--extract.coverage", share])).extract.fill == fill
+    assert parse("run", current(["a", "b", "--extract.coverage", share]))[0].extract.fill == fill
 
 
 def test_commands_that_became_tools_say_where_they_are(capsys):
@@ -316,3 +318,45 @@ def test_commands_that_became_tools_say_where_they_are(capsys):
         capsys, "benchmark", "speed", "--repeats", "2"
     )
     assert "tools/make_manual.py" in fails(capsys, "manual", "folder")
+
+
+def test_without_arguments_the_three_usual_ways_are_shown_and_are_commands(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main([])
+    shown = capsys.readouterr().out
+    assert stopped.value.code == 2 and shown == WAYS + usage()
+    assert len(re.findall(r"^  \S.*:$", WAYS, re.M)) == 3
+    ways = re.findall(r"^    sc3d (\w+) (.*?)(?:   +.*)?$", WAYS, re.M)
+    assert len(ways) == 8
+    for name, arguments in ways:
+        parse(name, arguments.split())  # exits if it does not fit
+
+
+def test_help_of_run_has_the_everyday_options_first_then_stage_by_stage(capsys):
+    with pytest.raises(SystemExit):
+        main(["run", "--help"])
+    shown = capsys.readouterr().out
+    groups = re.findall(r"^\W+([\w.]+) (?:options|arguments) \W+$", shown, re.M)
+    stages = ["reconstruct", "depth", "train", "extract", "segment", "label", "label.mechanisms", "propagate"]
+    assert groups == ["positional", *stages] and "[OPTIONS] PHOTOS SCENE" in shown
+    everyday = shown[: shown.index("reconstruct options")]
+    assert set(re.findall(r"^\W*?(--[a-z][a-z-]*)", everyday, re.M)) == {
+        *("--masks", "--confidence", "--classes", "--truth", "--overwrite", "--quiet", "--verbose", "--log")
+    }
+
+
+def test_shell_completion_knows_commands_and_options(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--tyro-write-completion", "bash", str(tmp_path / "sc3d.sh")])
+    assert not stopped.value.code
+    script = (tmp_path / "sc3d.sh").read_text()
+    assert all(word in script for word in [*STAGES, *COMMANDS, "--label.consensus", "--quiet"])
+    assert subprocess.run(["bash", "-n", str(tmp_path / "sc3d.sh")], check=False).returncode == 0
+    assert "takes a shell (bash, zsh, tcsh, fish)" in fails(capsys, "--tyro-print-completion", "csh")
+
+
+def test_a_log_gets_the_messages_and_the_error(scene, tmp_path, capsys):
+    log = tmp_path / "file.log"
+    message = fails(capsys, "propagate", scene, "--quiet", "--log", log)
+    assert log.read_text().endswith(f" {message}\n")
+    assert "cannot write" in fails(capsys, "propagate", scene, "--log", tmp_path / "nowhere" / "file.log")

@@ -19,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from sc3d.commands import COMMANDS, STAGES
 from sc3d.io.json_files import write_text
+from sc3d.settings.common import Messages
 from tools.docstring_pages import module_page, public, summary
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -176,7 +177,8 @@ def write_geometry_pages(folder: Path) -> list[Path]:
 def _tables(found: list[Option], scene: bool) -> list[str]:
     """The everyday options, then every group under its sentence."""
     overwrite = Option("--overwrite", "", "False", "Run again even if the outputs are up to date.")
-    everyday = [option for option in found if not option.group] + ([overwrite] if scene else [])
+    messages = [replace(option, flag=option.flag.split(",")[0]) for option in options(Messages)]
+    everyday = [option for option in found if not option.group] + ([overwrite] if scene else []) + messages
     parts = [_table(everyday)]
     for group in dict.fromkeys(option.group for option in found if option.group):
         parts += [group, _table([option for option in found if option.group == group])]

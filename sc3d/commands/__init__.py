@@ -23,6 +23,7 @@ COMMANDS: dict[str, type] = {
     "reconstruct": reconstruction.ReconstructCommand,
     "import": reconstruction.ImportCommand,
     "run": outputs.Run,
+    "compare": outputs.Compare,
     "view": outputs.ViewCommand,
     "annotate": labels.Annotate,
     "doctor": outputs.Doctor,

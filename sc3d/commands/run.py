@@ -7,19 +7,26 @@ import shutil
 import time
 from dataclasses import replace
 
+from sc3d.commands.plan import Stage, pending, plan, results
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
+from sc3d.io.progress import under_way
 from sc3d.runner import execute
 from sc3d.scene.class_table import read_classes
 from sc3d.scene.scene import Scene, match_masks, photo_sizes
 from sc3d.settings.labels import Evaluate, Segment
 from sc3d.settings.outputs import Report, Run
-from sc3d.stages.reconstruct import prepare, reconstruct
+from sc3d.stages.reconstruct import prepare, steps
 
 logger = logging.getLogger(__name__)
 
 
 def main(command: Run) -> None:
+    with under_way("run"):
+        run(command)
+
+
+def run(command: Run) -> None:
     started = time.perf_counter()
     scene = Scene(command.scene)
     segment = replace(
@@ -32,13 +39,30 @@ def main(command: Run) -> None:
     if command.classes is not None:
         with atomic_path(scene.classes) as temporary:
             shutil.copyfile(command.classes, temporary)
-    surface: list[tuple[str, object]] = [
+    stages = list_stages(command, scene, segment)
+    tell_plan(command, scene, stages)
+    for number, (name, settings) in enumerate(stages, 1):
+        with under_way(f"stage {number} of {len(stages)}"):
+            execute(name, scene, settings, command.overwrite)
+    logger.info("run: %.0f s; look at %s\n%s", time.perf_counter() - started, scene.report, results(scene))
+
+
+def tell_plan(command: Run, scene: Scene, stages: list[Stage]) -> None:
+    """Which stages will run, and for how long about."""
+    runs = pending(scene, stages, command.overwrite)
+    logger.info(plan(stages, runs, list(photo_sizes(command.photos).values())))
+
+
+def list_stages(command: Run, scene: Scene, segment: Segment) -> list[Stage]:
+    """The stages in the order in which they run."""
+    surface: list[Stage] = [
         ("depth", command.depth),
         ("train", command.train),
         ("extract", command.extract),
     ]
-    masks: list[tuple[str, object]] = [("segment", replace(segment, refine=False))]
-    stages = [
+    masks: list[Stage] = [("segment", replace(segment, refine=False))]
+    stages: list[Stage] = [
+        *steps(command.reconstruct),
         *(masks + surface if _masks_first(scene, command) else surface + masks),
         *([("segment", Segment(refine=True))] if segment.refine else []),
         ("label", command.label),
@@ -46,10 +70,7 @@ def main(command: Run) -> None:
     ]
     if command.truth is not None:
         stages.append(("evaluate", Evaluate(truth=command.truth)))
-    reconstruct(scene, command.reconstruct, command.overwrite)
-    for name, settings in [*stages, ("report", Report())]:
-        execute(name, scene, settings, command.overwrite)
-    logger.info("run: %.0f s; look at %s", time.perf_counter() - started, scene.report)
+    return [*stages, ("report", Report())]
 
 
 def _masks_first(scene: Scene, command: Run) -> bool:

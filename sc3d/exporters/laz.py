@@ -12,6 +12,7 @@ import numpy as np
 import sc3d
 from sc3d.errors import InputError
 from sc3d.exporters.projected_cloud import ProjectedCloud, chosen_classes, projected_chunks
+from sc3d.exporters.terrain import require_ground
 from sc3d.io.atomic import atomic_path
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
@@ -20,7 +21,7 @@ from sc3d.settings.outputs import Export
 POINTS_AT_ONCE = 1_000_000  # points written at a time
 SCALE = 0.001  # of the stored whole numbers, units of the CRS
 OFFSET_STEP = 1000.0  # offsets are multiples of this, so that neighboring files share theirs
-UNASSIGNED = 1  # ASPRS code of points without a label
+UNASSIGNED, BARE_GROUND = 1, 2  # ASPRS codes: points without a label; ground
 COLORS, PLAIN = 7, 6  # point formats
 DIMENSIONS = (
     ("confidence", np.float32, "0 to 1"),
@@ -38,7 +39,10 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/labelled.laz`: point format 7 (6 without colors); positions to 1 mm in the CRS, or in the
     scene's frame without one.
     """
-    ids, codes = sorted(chosen_classes(scene, settings)), asprs_codes(scene.class_table())
+    ids, codes = (
+        sorted(chosen_classes(scene, settings)),
+        asprs_codes(scene.class_table(), settings.ground_as_2),
+    )
     low, high, counts = np.full(3, np.inf), np.full(3, -np.inf), np.zeros(256, np.int64)
     projected: ProjectedCloud | None = None
     for projected in projected_chunks(scene, settings):
@@ -64,11 +68,15 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     return {"points": int(counts.sum()), **projection.figures(), "points_by_asprs_code": used}
 
 
-def asprs_codes(table: ClassTable) -> np.ndarray:
-    """(256,) uint8 ASPRS code of each class id; unlabelled points are unassigned."""
+def asprs_codes(table: ClassTable, ground_as_2: bool = False) -> np.ndarray:
+    """(256,) uint8 ASPRS code of each class id; unlabelled points are unassigned. ground_as_2: what is
+    ground-like becomes ground; InputError if nothing is.
+    """
     codes = np.full(256, UNASSIGNED, np.uint8)
     for entry in table:
         codes[entry.id] = entry.asprs
+    if ground_as_2:
+        codes[require_ground(table)] = BARE_GROUND
     return codes
 
 

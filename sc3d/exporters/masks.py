@@ -7,12 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 from sc3d.errors import left_out
 from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
 from sc3d.io.images import read_orientation, write_image
+from sc3d.io.progress import progress
 from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
@@ -39,7 +39,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     with atomic_path(masks) as mask_folder, atomic_path(confidences) as confidence_folder:
         mask_folder.mkdir()
         confidence_folder.mkdir()
-        for view in tqdm(views, desc="rendering masks", unit="photo", disable=None):
+        for view in progress(views, "rendering masks", "photo"):
             mask, confidence = render_mask(surface, labels.confidence, view, settings.max_size)
             orientation = read_orientation(scene.photo(view.name))
             write_image(scene.photo_names.path(mask_folder, view.name), mask, orientation)

@@ -15,7 +15,7 @@ from sc3d.exporters.packages import load
 from sc3d.exporters.polygonize import orthogonalized, polygonize, simplified
 from sc3d.exporters.projected_cloud import ProjectedCloud, find_projection, read_projected_cloud
 from sc3d.exporters.regions import cells_by_number
-from sc3d.exporters.terrain import ground_height
+from sc3d.exporters.terrain import ground_classes, ground_height, tree_codes
 from sc3d.exporters.trees import MIN_CROWN, canopy_height, split_crowns
 from sc3d.exporters.vector_files import Feature, has_geopackage, write_geojson, write_geopackage
 from sc3d.geometry.raster import Raster, spacing_of_all
@@ -31,9 +31,7 @@ else:
 LAYERS = ("buildings", "trees")
 CELL = 1.5  # side of the cells, in point spacings
 MIN_CELL = 0.05  # m
-BUILDING, LOW, MEDIUM, HIGH = 6, 3, 4, 5  # ASPRS codes: building; low, medium and high vegetation
-GROUND = (2, LOW, 9, 10, 11)  # ground, low vegetation, water, rail, road
-NOISE = (7, 18)
+BUILDING, NOISE = 6, (7, 18)  # ASPRS codes
 TREE_TOP = 0.99  # quantile of the crown that is its height: a single point is no tree top
 
 logger = logging.getLogger(__name__)
@@ -52,8 +50,8 @@ class Kinds:
 class Site:
     """A labelled cloud and what is known of it on a grid; all lengths are meters.
 
-    points: (N, 3) CRS; ground: (H, W) z of the ground; above: (N,) bool, points as high above it as a building
-        or tree
+    points: (N, 3) CRS; ground: (H, W) z of the ground; above: (N,) bool, points as high above it as a
+        building or tree
     """
 
     projected: ProjectedCloud
@@ -112,7 +110,8 @@ def _find_buildings(site: Site, settings: Export) -> list[Feature]:
     }
     ground = _quantiles(site.ground, buildings, 0.5)
     heights = roof_tops(buildings, roofs, grid.pixel) - ground
-    return _features(site, buildings, is_building, outlines, (heights, ground))
+    volumes = _volumes(roofs - site.ground, buildings, grid)
+    return _features(site, buildings, is_building, outlines, (heights, ground, volumes))
 
 
 def _find_trees(site: Site, settings: Export) -> list[Feature]:
@@ -126,7 +125,8 @@ def _find_trees(site: Site, settings: Export) -> list[Feature]:
         for number, traced in polygonize(crowns, grid).items()
     }
     heights, ground = _quantiles(canopy, crowns, TREE_TOP), _quantiles(site.ground, crowns, 0.5)
-    return _features(site, crowns, is_tree, outlines, (heights, ground))
+    volumes = _volumes(canopy, crowns, grid)
+    return _features(site, crowns, is_tree, outlines, (heights, ground, volumes))
 
 
 def _tell_of_left_out(kind: str, chosen: np.ndarray, regions: np.ndarray, site: Site, why: str) -> None:
@@ -143,6 +143,14 @@ def _quantiles(values: np.ndarray, regions: np.ndarray, share: float) -> np.ndar
     return np.array([np.quantile(values.ravel()[region], share) for region in cells])
 
 
+def _volumes(above: np.ndarray, regions: np.ndarray, grid: Raster) -> np.ndarray:
+    """(R,) float64 m3 between the heights above the ground (H, W), m, and the ground; below it counts
+    nothing.
+    """
+    heights = np.maximum(np.nan_to_num(above), 0.0)
+    return (np.bincount(regions.ravel(), heights.ravel()) * grid.pixel**2)[1:]
+
+
 def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
     """Buildings are ASPRS code 6, trees 4 and 5 (3 if no class has those); the ground is 2, 3, 9, 10 or 11,
     or else whatever is none of these.
@@ -150,8 +158,8 @@ def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
     labels: (N,) uint8 class ids
     """
     codes = {entry.id: entry.asprs for entry in table}
-    tree_codes = {MEDIUM, HIGH} if {MEDIUM, HIGH} & set(codes.values()) else {LOW}
-    if BUILDING not in codes.values() and not tree_codes & set(codes.values()):
+    trees = tree_codes(table)
+    if BUILDING not in codes.values() and not trees & set(codes.values()):
         raise InputError(
             'no class has the ASPRS code of buildings (6) or vegetation (3 to 5): add "asprs" to the classes in classes.json'
         )
@@ -159,8 +167,8 @@ def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
     def having(wanted: set[int]) -> np.ndarray:
         return np.isin(labels, [label for label, code in codes.items() if code in wanted])
 
-    building, tree = having({BUILDING}), having(tree_codes)
-    ground = having(set(GROUND) - tree_codes)
+    building, tree = having({BUILDING}), having(trees)
+    ground = np.isin(labels, ground_classes(table))
     if not ground.any():
         ground = (labels > 0) & ~building & ~tree & ~having(set(NOISE))
     if not ground.any():
@@ -175,10 +183,10 @@ def _features(
     regions: np.ndarray,
     chosen: np.ndarray,
     outlines: dict[int, shapely.Polygon],
-    heights: tuple[np.ndarray, np.ndarray],
+    sizes: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> list[Feature]:
     """Features of the regions (H, W) numbered from 1; chosen: (N,) bool points of their kind; outlines: m;
-    heights: (R,) of the top above the ground and z of the ground, m.
+    sizes: (R,) of the top above the ground and z of the ground, m, and volume, m3.
     """
     cloud, unit = site.projected, site.projected.projection.unit
     members = np.where(chosen & site.above, regions.ravel()[site.grid.flat_cells(site.points)], 0)
@@ -186,10 +194,10 @@ def _features(
     for number, rows in enumerate(cells_by_number(members, int(regions.max())), start=1):
         outline, label = outlines[number], int(np.argmax(np.bincount(cloud.labels.label[rows], minlength=1)))
         polygon = outline if unit == 1 else shapely.transform(outline, lambda corners: corners / unit)
-        height, ground = (float(values[number - 1]) for values in heights)
+        height, ground, volume = (float(values[number - 1]) for values in sizes)
         confidence = float(cloud.labels.confidence[rows].astype(np.float64).mean()) if len(rows) else 0.0
         name = site.table.name(label)
         features.append(
-            Feature(polygon, number, name, label, outline.area, height, ground, confidence, len(rows))
+            Feature(polygon, number, name, label, outline.area, height, ground, confidence, len(rows), volume)
         )
     return features

@@ -5,12 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
-from xml.sax.saxutils import escape
 
 import numpy as np
 import open3d as o3d
-from tqdm import tqdm
 
+from sc3d.exporters.geotiff import (
+    NO_HEIGHT,
+    TILE,
+    add_overviews,
+    category_names,
+    enums,
+    open_geotiff,
+    set_palette,
+)
 from sc3d.exporters.packages import load
 from sc3d.exporters.projected_cloud import ProjectedCloud, read_projected_cloud
 from sc3d.geometry.neighbors import NeighborIndex
@@ -18,17 +25,14 @@ from sc3d.geometry.raster import Raster, close_gaps, highest_points, spacing_of_
 from sc3d.geometry.raycast import Surface
 from sc3d.io.atomic import atomic_path
 from sc3d.io.clouds import read_mesh
+from sc3d.io.progress import progress
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import REACH
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
 
-rasterio = load("rasterio")
-enums, transforms = load("rasterio.enums"), load("rasterio.transform")
+windows = load("rasterio.windows")
 
-TILE = 256  # px; strips of this many rows are worked on at a time
-NO_HEIGHT = -9999.0
-OVERVIEW = 512  # overviews halve the longest side until it is below this, px
 COLOR, CLASSES, HEIGHT = "orthophoto.tif", "classes.tif", "height.tif"
 NAMES = "classes.tif.aux.xml"  # where GDAL keeps names of categories
 GAP = 2  # cells: holes of a bare cloud up to about twice this wide are filled
@@ -63,7 +67,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
             (class_file, enums.Resampling.mode),
             (height_file, enums.Resampling.average),
         ):
-            _add_overviews(file, resampling)
+            add_overviews(file, resampling)
     with atomic_path(names) as temporary:
         temporary.write_text(category_names(table), encoding="utf-8")
     size = f"{grid.width} x {grid.height} px of {pixel:g} {'m' if unit == 1 else 'units'}"
@@ -146,24 +150,17 @@ def round_to_digit(length: float) -> float:
     return float(f"{length:.0e}")
 
 
-def category_names(table: ClassTable) -> str:
-    """GDAL's side file: the name of each class id, in the order of the ids, for the legend."""
-    names = "".join(
-        f"<Category>{escape(table.name(label)) if label in {entry.id for entry in table} | {0} else ''}</Category>"
-        for label in range(table.num_ids)
-    )
-    return f'<PAMDataset><PAMRasterBand band="1"><CategoryNames>{names}</CategoryNames></PAMRasterBand></PAMDataset>\n'
-
-
 def _fill(
     view: OrthographicView, projected: ProjectedCloud, table: ClassTable, files: tuple[Path, Path, Path]
 ) -> float:
     """Write all pixels, strip by strip; returns the share of the cells that have a height."""
     grid, covered = view.grid, 0
     with (
-        _open(files[0], projected, grid, count=4, dtype="uint8", predictor=2) as color,
-        _open(files[1], projected, grid, count=1, dtype="uint8", nodata=0) as classes,
-        _open(files[2], projected, grid, count=1, dtype="float32", predictor=3, nodata=NO_HEIGHT) as height,
+        open_geotiff(files[0], projected.projection, grid, count=4, dtype="uint8", predictor=2) as color,
+        open_geotiff(files[1], projected.projection, grid, count=1, dtype="uint8", nodata=0) as classes,
+        open_geotiff(
+            files[2], projected.projection, grid, count=1, dtype="float32", predictor=3, nodata=NO_HEIGHT
+        ) as height,
     ):
         color.colorinterp = [
             enums.ColorInterp.red,
@@ -171,16 +168,13 @@ def _fill(
             enums.ColorInterp.blue,
             enums.ColorInterp.alpha,
         ]
-        classes.write_colormap(
-            1,
-            {label: (*map(int, table.palette[label]), 255 if label else 0) for label in range(table.num_ids)},
-        )
+        set_palette(classes, table)
         for dataset, name in ((classes, "class"), (height, "height of the surface")):
             dataset.set_band_description(1, name)
-        for first_row in tqdm(range(0, grid.height, TILE), desc="rendering maps", unit="strip", disable=None):
+        for first_row in progress(range(0, grid.height, TILE), "rendering maps", "strip"):
             num_rows = min(TILE, grid.height - first_row)
             heights, rows = view.render_rows(first_row, num_rows)
-            window = rasterio.windows.Window(0, first_row, grid.width, num_rows)
+            window = windows.Window(0, first_row, grid.width, num_rows)
             color.write(_colors(projected, rows), window=window)
             classes.write(
                 np.where(rows >= 0, projected.labels.label[rows], 0).astype(np.uint8), 1, window=window
@@ -200,33 +194,3 @@ def _colors(projected: ProjectedCloud, rows: np.ndarray) -> np.ndarray:
     image[3] = 255
     image[:, rows < 0] = 0
     return image
-
-
-def _open(file: Path, projected: ProjectedCloud, grid: Raster, **profile: object):
-    """Rasterio's writer."""
-    transform = transforms.from_origin(grid.left, grid.top, grid.pixel, grid.pixel)
-    crs = projected.projection.crs
-    return rasterio.open(
-        file,
-        "w",
-        driver="GTiff",
-        width=grid.width,
-        height=grid.height,
-        transform=transform,
-        crs=crs.to_wkt() if crs else None,
-        tiled=True,
-        blockxsize=TILE,
-        blockysize=TILE,
-        compress="deflate",
-        bigtiff="if_safer",
-        **profile,
-    )
-
-
-def _add_overviews(file: Path, resampling: object) -> None:
-    """Smaller copies inside the file, so that map programs draw it at once."""
-    with rasterio.open(file, "r+") as dataset:
-        longest = max(dataset.width, dataset.height)
-        factors = [2**level for level in range(1, 16) if longest / 2 ** (level - 1) > OVERVIEW]
-        if factors:
-            dataset.build_overviews(factors, resampling)

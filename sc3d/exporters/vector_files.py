@@ -7,9 +7,10 @@ from __future__ import annotations
 import importlib.util
 import json
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -26,7 +27,7 @@ DEGREES, METERS = 9, 3  # decimals of coordinates: 0.1 mm and 1 mm
 # fmt: off
 FIELDS: dict[str, type] = {  # what the map shows of a feature
     "id": np.int32, "class": object, "label": np.int32, "area_m2": np.float64, "height_m": np.float64,
-    "ground_m": np.float64, "confidence": np.float64, "points": np.int32,
+    "ground_m": np.float64, "confidence": np.float64, "points": np.int32, "volume_m3": np.float64,
 }
 # fmt: on
 
@@ -38,7 +39,8 @@ class Feature:
     polygon: shapely polygon in the CRS; number: from 1, per layer; name, label: its class; area: m2 of the
         outline
     height: of its top above the ground, m; ground: z of the ground under it, m; confidence: mean of its
-        points, 0 to 1; num_points: of its class
+        points, 0 to 1; num_points: of its class; volume: between its top, as seen from above, and the
+        ground, m3
     """
 
     polygon: shapely.Polygon
@@ -50,12 +52,13 @@ class Feature:
     ground: float
     confidence: float
     num_points: int
+    volume: float
 
     def properties(self) -> dict[str, object]:
         """What the map shows, by name of the field."""
         lengths = round(self.area, 2), round(self.height, 2), round(self.ground, 2)
         values = self.number, self.name, self.label, *lengths, round(self.confidence, 3), self.num_points
-        return dict(zip(FIELDS, values))
+        return dict(zip(FIELDS, (*values, round(self.volume, 1))))
 
 
 def has_geopackage() -> bool:
@@ -63,7 +66,19 @@ def has_geopackage() -> bool:
     return importlib.util.find_spec("pyogrio") is not None
 
 
-def write_geojson(path: Path, features: list[Feature], projection: MapProjection) -> None:
+class MapFeature(Protocol):
+    """What a GeoJSON file can hold: a polygon in the CRS with a number, and what the map shows of it."""
+
+    @property
+    def polygon(self) -> shapely.Polygon: ...
+
+    @property
+    def number(self) -> int: ...
+
+    def properties(self) -> dict[str, object]: ...
+
+
+def write_geojson(path: Path, features: Sequence[MapFeature], projection: MapProjection) -> None:
     """RFC 7946: longitude and latitude, WGS 84, outer rings counter-clockwise; without a CRS the scene's
     meters, which a member of the file says.
     """
@@ -99,7 +114,7 @@ def write_geopackage(path: Path, layers: dict[str, list[Feature]], projection: M
             raw.write(str(temporary), geometry, columns, list(FIELDS), layer=name, **options)
 
 
-def _rings(feature: Feature, projection: MapProjection) -> list[list[list[float]]]:
+def _rings(feature: MapFeature, projection: MapProjection) -> list[list[list[float]]]:
     polygon = shapely.geometry.polygon.orient(feature.polygon)
     rings = [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
     if projection.crs is None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import open3d as o3d
-from tqdm import tqdm
 
 from sc3d.errors import Sc3dError
 from sc3d.extraction.evidence import DepthViews, EvidenceStore
 from sc3d.geometry.raycast import Surface, first_surface, see_points
 from sc3d.geometry.tsdf import Part
+from sc3d.io.progress import progress
 
 POINTS = 1 << 20  # looked at a time: bounds memory, not results
 
@@ -53,7 +53,7 @@ def count_views(
     points, normals: (N, 3) in the views' world; surface: what hides points
     """
     counts = np.zeros(len(points), np.int32)
-    for row, view in enumerate(tqdm(data.views, desc="cropping", unit="view", disable=None)):
+    for row, view in enumerate(progress(data.views, "cropping", "view")):
         first, shows, opaque = first_surface(surface, view), ~store.read(row, "sky"), data.opaque(row)
         if opaque is not None:
             shows &= opaque

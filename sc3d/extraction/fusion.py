@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import open3d as o3d
-from tqdm import tqdm
 
 from sc3d.errors import Sc3dError
 from sc3d.extraction.crop import cropped
@@ -18,6 +17,7 @@ from sc3d.extraction.free_space import MARGIN, count_opposed, farthest_free
 from sc3d.geometry.cameras import View
 from sc3d.geometry.raycast import Surface, first_surface
 from sc3d.geometry.tsdf import DepthFusion, Part, cloud_in_order, drop_small_parts, near_mesh, pixel_squares
+from sc3d.io.progress import Progress, progress
 from sc3d.scene.depth_map import hardly_confirmed
 from sc3d.settings.reconstruction import Fill
 from sc3d.stereo.completion import nearest_by_color
@@ -74,12 +74,14 @@ def fuse_views(
     shares = {"continued": 0.0, "occluders": 0.0}
     steps = {"continued": _continued, "occluders": _occluding}
     for name in list(steps)[: FILLS.index(fill)]:
-        for turn in range(min(ROUNDS, len(data.views))):
-            surface = _surface(_joined(parts)[0])
-            for row in range(turn, len(data.views), ROUNDS):
-                part, share = _added(data, store, surface, row, steps[name], voxel_size)
-                parts.append(part)
-                shares[name] += share / len(data.views)
+        with Progress(len(data.views), name, "view") as bar:
+            for turn in range(min(ROUNDS, len(data.views))):
+                surface = _surface(_joined(parts)[0])
+                for row in range(turn, len(data.views), ROUNDS):
+                    part, share = _added(data, store, surface, row, steps[name], voxel_size)
+                    parts.append(part)
+                    shares[name] += share / len(data.views)
+                    bar.update()
     (mesh, cloud), left_out = _joined(parts), 0.0
     if crop:
         (mesh, cloud), left_out = cropped((mesh, cloud), _surface(mesh), data, store, voxel_size, crop)
@@ -91,7 +93,7 @@ def fuse_views(
 def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[Part, float]:
     """The surface of all confirmed depth in range, and its share of all pixels."""
     fusion, shares = DepthFusion(voxel_size), list[float]()
-    for row, view in enumerate(tqdm(data.views, desc="fusing", unit="view", disable=None)):
+    for row, view in enumerate(progress(data.views, "fusing", "view")):
         known = store.read(row, "confirmed")
         known[known >= data.depth_range[1]] = 0
         added = fusion.integrate(view, known, data.image(row), data.depth_range[1])
@@ -125,7 +127,7 @@ def _part(fusion: DepthFusion) -> Part:
 def _see(data: DepthViews, store: EvidenceStore, mesh: o3d.t.geometry.TriangleMesh) -> None:
     """Keep what every view knows behind a point: the mesh, or sky (inf), 0 = nothing; and the mesh's colors."""
     surface = _surface(mesh)
-    for row, view in enumerate(data.views):
+    for row, view in enumerate(progress(data.views, "looking", "view")):
         first = first_surface(surface, view)
         hit = np.isfinite(first.range)
         known = np.where(hit, first.range * first.ray_z, np.where(store.read(row, "sky"), np.inf, 0))
@@ -196,7 +198,8 @@ def _occluding(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray
     far = np.where(covered, (1 - MARGIN) * hit, np.where(inside, data.depth_range[1], 0)).astype(np.float32)
     depth = farthest_free(far, nearest, view, *others)
     depth = cv2.medianBlur(depth, 5)
-    depth = np.where(empty & (depth == 0), _spread(depth, data.image(row)), depth)
+    before_sky = np.where(inside, depth, 0)  # as leaves do that go on where nothing is known
+    depth = np.where(empty & (depth == 0), _spread(before_sky, data.image(row)), depth)
     return farthest_free(depth, nearest, view, *others, bounded=True), None
 
 

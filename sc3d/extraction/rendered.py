@@ -6,10 +6,10 @@ import logging
 
 import numba
 import numpy as np
-from tqdm import tqdm
 
 from sc3d.errors import Sc3dError, left_out
 from sc3d.extraction.evidence import DepthViews, EvidenceStore, ViewEvidence
+from sc3d.io.progress import progress
 from sc3d.settings.common import DepthMode
 from sc3d.splatting.consistency import consistent
 from sc3d.splatting.evaluation import facing_depth
@@ -30,14 +30,14 @@ def write_rendered(
     of a pixel on the surface, world units.
     """
     footprint = _render(gaussians, data, store, mode)
-    for row in range(len(data.views)):
+    for row in progress(range(len(data.views)), "confirming", "view"):
         store.write(row, _evidence(data, store, row, min_views))
     return footprint
 
 
 def _render(gaussians: Gaussians, data: DepthViews, store: EvidenceStore, mode: DepthMode) -> float:
     footprints, empty = [], list[str]()
-    for row, view in enumerate(tqdm(data.views, desc="depth", unit="view", disable=None)):
+    for row, view in enumerate(progress(data.views, "depth", "view")):
         (depth, normals), (nearest, farthest) = (
             facing_depth(gaussians, view, MAX_ANGLE, mode),
             data.depth_range,

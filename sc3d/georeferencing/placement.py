@@ -52,7 +52,7 @@ def place_model(
     images: folder of the photos, whose EXIF may have to say the focal length
     errors: InputError for control points that do not fit
     """
-    pycolmap.logging.minloglevel = 2
+    pycolmap.logging.minloglevel = 0 if logger.isEnabledFor(logging.DEBUG) else 2
     flight = agree(flight, _centers(model)) if flight else None
     free = settings.focal == "refine" or (settings.focal == "auto" and tells_focal(model))
     focal = {} if free else anchor_focal(model, images, flight)

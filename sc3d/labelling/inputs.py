@@ -5,8 +5,9 @@ both.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import open3d as o3d
@@ -32,7 +33,8 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class Masks:
     """The masks of a scene: files by view name, confidence maps where there are any, the views that have a mask,
-    and the classes; without: names of the photos that have a camera and no mask.
+    and the classes; without: names of the photos that have a camera and no mask; none: unlabelled pixels are
+    evidence of none of the classes.
     """
 
     files: dict[str, Path]
@@ -41,16 +43,19 @@ class Masks:
     scene: Scene
     table: ClassTable
     without: tuple[str, ...] = ()
+    none: bool = False
 
     @property
     def channels(self) -> Channels:
-        """Of the classes that points can be of."""
-        return self.table.channels
+        """Of the classes that points can be of, and of none of them where unlabelled pixels are evidence."""
+        return replace(self.table.channels, none=self.none)
 
     @classmethod
-    def load(cls, scene: Scene, confidence: Path | None) -> Masks:
+    def load(
+        cls, scene: Scene, confidence: Path | None, unlabelled: Literal["evidence", "ignore"] = "ignore"
+    ) -> Masks:
         """Masks of a scene, and confidence maps in a folder if it exists, all checked; InputError for what
-        does not fit.
+        does not fit. unlabelled: as `Label.unlabelled`
         """
         scene.require(
             scene.classes,
@@ -66,7 +71,8 @@ class Masks:
         views = scene.model.views
         masked = [view for view in views if view.name in files]
         without = tuple(view.name for view in views if view.name not in files)
-        return cls(files, confidences, masked, scene, table, without)
+        evidence = unlabelled == "evidence" and table.rest is None
+        return cls(files, confidences, masked, scene, table, without, evidence)
 
     def tell_of_left_out(self, low: np.ndarray, high: np.ndarray) -> None:
         """One line for each reason why photos do not vote, or not as others do. low, high: (3,) box of the
@@ -87,8 +93,8 @@ class Masks:
             logger.warning(left_out(sure, count, "photos have no confidence map; their masks count as sure"))
 
     def read(self, view: View) -> Mask:
-        """As `fuse` wants it: channels, not ids; what shows no surface says nothing of the one behind its
-        outline.
+        """As `fuse` wants it: channels, not ids. A pixel without a class, or of one that has no surface, says
+        nothing, or that there is none of the classes where it was looked at: where its confidence is not 0.
         """
         confidence = self.confidences.get(view.name)
         sure = None if confidence is None else self.scene.read_confidence(confidence, view.name)
@@ -96,6 +102,11 @@ class Masks:
         labels = self.scene.read_mask(file, view.name)
         if self.table.without_surface:
             labels = np.where(self.table.shows_no_surface(labels), np.uint8(0), labels)
+        if self.none or self.table.rest is not None:
+            looked = self.scene.opaque_pixels_of(labels.shape, view.name) if sure is None else sure > 0
+            if self.table.rest is not None:
+                labels = np.where(looked & (labels == 0), np.uint8(self.table.rest.id), labels)
+            return self.channels.with_none(self.channels.from_ids(labels, file), looked), sure
         return self.channels.from_ids(labels, file), sure
 
     def size(self, view: View) -> tuple[int, int]:

@@ -52,7 +52,7 @@ class LabelSummary:
         states = {
             name: f"{share:.1%}"
             for name, share in zip(STATE_NAMES, shares, strict=True)
-            if name != "propagated"
+            if name not in ("propagated", "corrected")
         }
         size = round(self.voxel_size, 5)
         turned = {"normals_turned": self.num_turned} if self.num_turned else {}
@@ -82,7 +82,9 @@ def summarize(
 def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     """Fuse the masks of a scene on its cloud (or `settings.cloud`) and write seeds and votes."""
     settings = settings.resolved
-    masks = Masks.load(scene, best_confidence(scene) if settings.use_confidence else None)
+    masks = Masks.load(
+        scene, best_confidence(scene) if settings.use_confidence else None, settings.unlabelled
+    )
     given = read_given_cloud(scene, settings.cloud)
     path, positions = given_cloud_path(scene, settings.cloud), given.point.positions.numpy()
     box = positions.min(axis=0), positions.max(axis=0)
@@ -98,7 +100,8 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     if settings.mechanisms.density:
         density = point_density(scene, points, settings.voxel_size)
     channels = masks.channels
-    fusion = fuse(Cloud(points, normals, density), masks.views, masks.read, surface, channels.count, settings)
+    cloud = Cloud(points, normals, density)
+    fusion = fuse(cloud, masks.views, masks.read, surface, channels.count, settings, channels.none)
     with atomic_path(scene.votes_of(settings.output)) as temporary:
         fusion.grid.save(temporary, channels.ids)
     labels = replace(fusion.labels, label=channels.to_ids(fusion.labels.label))

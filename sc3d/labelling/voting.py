@@ -96,7 +96,8 @@ class CameraParameters(NamedTuple):
 
 class VoteWeighting(NamedTuple):
     """How a sighting is weighed: which factors count (the others are 1), and the depth at which the range factor is 1;
-    `equal` = all weigh 1; `second` = strict sightings are also voted on apart.
+    `equal` = all weigh 1; `second` = strict sightings are also voted on apart; `none` = channel of the
+    votes for none of the classes, 0 = there is none.
     """
 
     voxel_size: float
@@ -106,15 +107,18 @@ class VoteWeighting(NamedTuple):
     range: bool
     equal: bool
     second: bool
+    none: int = 0
 
     @classmethod
-    def from_settings(cls, settings: Label, extent: CloudExtent, views: list[View]) -> VoteWeighting:
+    def from_settings(
+        cls, settings: Label, extent: CloudExtent, views: list[View], none: int = 0
+    ) -> VoteWeighting:
         """The range factor is 1 at the median distance between the cameras and the middle of the cloud."""
         distances = [np.linalg.norm(view.center - extent.median) for view in views]
         reference, factors = float(np.median(distances)) if views else 1.0, settings.mechanisms
         equal = settings.method in ("direct", "majority")
         switches = factors.depth_excess, factors.incidence, factors.range, equal, factors.reproject
-        return cls(settings.voxel_size, reference, *switches)
+        return cls(settings.voxel_size, reference, *switches, none)
 
 
 class ViewVotes(NamedTuple):
@@ -134,6 +138,7 @@ class VoteAccumulator:
     grid: the label field, to whose rows `cloud.rows` the votes are added
     strict: (K, num_channels) int32 votes without mask edges, grazing views and doubtful depth; (0, num_channels) if not wanted
     overlay: (N,) uint8 label of the last view that saw a point, sorted; log: the votes view by view
+    looked: (K,) int32 views that saw a cell, whether they name a class or none
     """
 
     cloud: SortedCloud
@@ -142,6 +147,7 @@ class VoteAccumulator:
     strict: np.ndarray
     overlay: np.ndarray
     log: VoteLog
+    looked: np.ndarray
 
     @classmethod
     def for_cloud(
@@ -152,7 +158,8 @@ class VoteAccumulator:
         grid = LabelGrid.from_voxels(voxels, num_channels)
         points, order = _sorted_cloud(cloud, voxels, grid)
         strict = np.zeros((len(points.rows) if second else 0, num_channels), np.int32)
-        return cls(points, order, grid, strict, np.zeros(len(order), np.uint8), VoteLog())
+        overlay, looked = np.zeros(len(order), np.uint8), np.zeros(len(points.rows), np.int32)
+        return cls(points, order, grid, strict, overlay, VoteLog(), looked)
 
     def add_view(self, view: View, observation: Observation, weighting: VoteWeighting) -> None:
         """Add one view: each cell gets the mean of its sightings."""
@@ -161,7 +168,8 @@ class VoteAccumulator:
         )
         camera = CameraParameters.from_view(view, self.cloud.points)
         votes = self.grid.votes
-        cast_votes(self.cloud, camera, observation, weighting, votes, self.strict, self.overlay, view_votes)
+        counts = votes, self.strict, self.overlay, self.looked
+        cast_votes(self.cloud, camera, observation, weighting, *counts, view_votes)
         self.log.append(*view_votes)
 
     @property
@@ -169,9 +177,18 @@ class VoteAccumulator:
         """(K, num_channels) int32 copy of the votes of all cells."""
         return self.grid.votes[self.cloud.rows]
 
-    def verify(self, winner: np.ndarray, reweigh: bool) -> np.ndarray:
-        """(K,) bool, which cells pass the two-way verification; see `verification.verify`. winner: (K,) uint8."""
-        return verify(self.log, winner, self.grid, self.cloud.rows, SCALE, reweigh)
+    def verify(self, winner: np.ndarray, reweigh: bool, none: int = 0) -> np.ndarray:
+        """(K,) bool, which cells pass the two-way verification; see `verification.verify`. winner: (K,)
+        uint8; none: as in `VoteWeighting`; these votes keep their share.
+        """
+        if not none:
+            return verify(self.log, winner, self.grid, self.cloud.rows, SCALE, reweigh)
+        votes, rows = self.grid.votes, self.cloud.rows
+        silent, before = votes[rows, none].astype(np.int64), votes[rows, 1:none].sum(axis=1, dtype=np.int64)
+        passed = verify(self.log, winner, self.grid, rows, SCALE, reweigh)
+        after = votes[rows, 1:none].sum(axis=1, dtype=np.int64)
+        votes[rows, none] = np.where(before > 0, silent * after // np.maximum(before, 1), silent)
+        return passed
 
     def to_points(self, values: np.ndarray) -> np.ndarray:
         """(N, ...) in the order of the given cloud, from (K, ...) per cell."""
@@ -324,15 +341,17 @@ def _visibility(cloud, camera, observation, weighting, cell, point):
 
 
 @numba.njit(parallel=True, cache=True, error_model="numpy")
-def cast_votes(cloud, camera, observation, weighting, votes, strict, overlay, view_votes):
-    """Add a view to votes (rows, num_channels) int32 of the grid, and to strict and overlay as in `VoteAccumulator`; fill view_votes."""
+def cast_votes(cloud, camera, observation, weighting, votes, strict, overlay, looked, view_votes):
+    """Add a view to votes (rows, num_channels) int32 of the grid, and to strict, overlay and looked as in
+    `VoteAccumulator`; fill view_votes.
+    """
     num_channels, labels, weights = votes.shape[1], view_votes.labels, view_votes.weights
     for block in numba.prange(len(cloud.blocks) - 1):
         if not _in_frustum(camera, cloud.centers[block], cloud.radii[block]):
             continue
         sums = np.zeros((2, num_channels), np.int64)  # row 1: strict sightings only
         for cell in range(cloud.blocks[block], cloud.blocks[block + 1]):
-            count = strict_count = 0
+            count = strict_count = silent = silent_count = 0
             for point in range(cloud.cells[cell], cloud.cells[cell + 1]):
                 row, column, weight, is_strict = _visibility(
                     cloud, camera, observation, weighting, cell, point
@@ -340,14 +359,22 @@ def cast_votes(cloud, camera, observation, weighting, votes, strict, overlay, vi
                 label = observation.labels[row, column] if row >= 0 else 0
                 if label == 0:
                     continue
-                overlay[point] = label
                 share = np.int64(cloud.density[point]) if cloud.density.shape[0] else 1
                 fixed = np.int64(weight * SCALE + 0.5) * share
+                if label == weighting.none:
+                    silent += fixed
+                    silent_count += share
+                    continue
+                overlay[point] = label
                 sums[0, label] += fixed
                 count += share
                 if is_strict:
                     sums[1, label] += fixed
                     strict_count += share
+            if silent_count:
+                votes[cloud.rows[cell], weighting.none] += silent // (silent_count + count)
+            if silent_count + count:
+                looked[cell] += 1
             if strict_count:
                 _add_mean(sums, 1, strict_count, strict, cell)
             if count:

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sc3d.scene.labels import SEED, UNLOCKED, Labels
+from sc3d.propagation.none_evidence import NoneRates
+from sc3d.scene.labels import CORRECTED, SEED, UNLOCKED, Labels
 
 # seeds to learn from: seen by so many views, this share of their votes
 AGREED_VIEWS, AGREED_SHARE = 3, 0.9
@@ -20,6 +21,8 @@ class LabelledPoints:
     points: (N, 3) world; seeds: labels of fusion, which are channels (`sc3d.scene.channels`); votes: (N, C + 1)
         float32 or None, column 0 is ignored; colors: (N, 3) uint8 or None
     up: (3,) of the cameras, None = not known
+    none: the last of the C labels, and the last column of the votes, stand for none of the classes; rates:
+    what is known of the votes for it
     """
 
     points: np.ndarray
@@ -27,6 +30,8 @@ class LabelledPoints:
     votes: np.ndarray | None
     colors: np.ndarray | None
     up: np.ndarray | None = None
+    none: bool = False
+    rates: NoneRates | None = None
 
     def ordered(self, order: np.ndarray) -> LabelledPoints:
         votes, colors = (None if part is None else part[order] for part in (self.votes, self.colors))
@@ -42,28 +47,43 @@ class LabelledPoints:
     @property
     def seed_labels(self) -> np.ndarray:
         """(N,) uint8 labels of the seeds, 0 elsewhere."""
-        return np.where(np.isin(self.seeds.state, (SEED, UNLOCKED)), self.seeds.label, 0).astype(np.uint8)
+        known = np.isin(self.seeds.state, (SEED, UNLOCKED, CORRECTED))
+        return np.where(known, self.seeds.label, 0).astype(np.uint8)
+
+    @property
+    def corrected(self) -> np.ndarray:
+        """(N,) bool points whose label a person has set; of these, label 0 means none of the classes."""
+        return self.seeds.state == CORRECTED
+
+    @property
+    def sightings(self) -> np.ndarray:
+        """(N,) views that saw each point; a person counts as many."""
+        return np.where(self.corrected, np.maximum(self.seeds.num_views, AGREED_VIEWS), self.seeds.num_views)
 
     @property
     def sure(self) -> np.ndarray:
         """(N,) bool seeds with hardly a vote against them."""
-        return (self.seeds.state == SEED) & (self.seed_labels > 0) & (self.seeds.confidence >= AGREED_SHARE)
+        agreed = np.isin(self.seeds.state, (SEED, CORRECTED)) & (self.seeds.confidence >= AGREED_SHARE)
+        return agreed & (self.seed_labels > 0)
 
     def agreement(self, core: np.ndarray | None = None) -> np.ndarray:
         """(AGREED_VIEWS, 256) int64: sure seeds of each class that at least 1, 2, ... views saw; core: (N,)
         bool points to count, None = all.
         """
         sure, start = self.sure if core is None else self.sure & core, self.seed_labels
+        sightings = self.sightings
+        if self.none:
+            sure = sure & (start < self.num_classes)
         return np.stack(
             [
-                np.bincount(start[sure & (self.seeds.num_views >= least)], minlength=256)
+                np.bincount(start[sure & (sightings >= least)], minlength=256)
                 for least in range(1, AGREED_VIEWS + 1)
             ]
         )
 
     def agreed_by(self, least: int) -> np.ndarray:
         """(N,) bool sure seeds that at least so many views saw."""
-        return self.sure & (self.seeds.num_views >= least)
+        return self.sure & (self.sightings >= least)
 
     @property
     def agreed(self) -> np.ndarray:

@@ -19,6 +19,7 @@ TRUST = 0.5  # weight of the votes beside the appearance, which sees what the vi
 SURE = 0.95  # later rounds learn from points of this probability
 # confidence: weight of the evidence and of the neighbors; full weights would be sure everywhere
 CAUTION, SUPPORT = 0.5, 0.1
+PRIOR = 0.2  # the same of what is known of none of the classes before any vote
 STEPS = 10
 
 
@@ -39,7 +40,7 @@ def minimize_energy(
         label = (found[1].argmax(axis=1) + 1).astype(np.uint8)
         statistics = appearance.model.statistics(label, sure_examples(found[1], known), known.num_classes)
         appearance, rounds = replace(appearance, statistics=statistics), rounds - 1
-    return decided(graph, *(found or vote_marginals(graph, known, offered, settings)))
+    return decided(graph, known, *(found or vote_marginals(graph, known, offered, settings)))
 
 
 def vote_marginals(
@@ -48,8 +49,9 @@ def vote_marginals(
     """Log-evidence and marginals (N, C) from the votes alone; offered: (C,) bool, a class without a single seed
     is not.
     """
-    likelihood = vote_likelihood(known.known_votes)
+    likelihood = evidence_of(known)
     likelihood[:, ~offered] = -np.inf
+    hold_corrected(likelihood, known)
     # else the votes would take one edge per step to reach points without any
     grown, _ = grow_regions(graph, known.seed_labels)
     marginals = softmax(likelihood)
@@ -62,22 +64,49 @@ def appearance_marginals(
     graph: Graph, known: LabelledPoints, offered: np.ndarray, rating: np.ndarray, settings: Propagate
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same from votes and appearance; rating: (N, C) of the appearance, overwritten."""
-    rating += np.float32(TRUST) * vote_likelihood(known.known_votes)
+    rating += np.float32(TRUST) * evidence_of(known)
     rating[:, ~offered] = -np.inf
+    hold_corrected(rating, known)
     return rating, mean_field(graph, rating, settings.smoothness)  # afresh: sure marginals would not move
+
+
+def hold_corrected(likelihood: np.ndarray, known: LabelledPoints) -> None:
+    """Make the log-likelihood (N, C), in place, certain of what people have corrected; what is none of
+    the classes is no evidence of any.
+    """
+    label = known.seeds.label.astype(np.int64)
+    likelihood[known.corrected & (label == 0)] = 0
+    rows = np.flatnonzero(known.corrected & (label > 0))
+    likelihood[rows] = -np.inf
+    likelihood[rows, label[rows] - 1] = 0
 
 
 def sure_examples(marginals: np.ndarray, known: LabelledPoints) -> np.ndarray:
     """(N,) bool points that a later round learns from."""
-    return (marginals.max(axis=1) > SURE) & (known.seeds.num_views > 0)
+    is_none = known.corrected & (known.seeds.label == 0)
+    return (marginals.max(axis=1) > SURE) & (known.sightings > 0) & ~is_none
 
 
-def decided(graph: Graph, evidence: np.ndarray, marginals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def decided(
+    graph: Graph, known: LabelledPoints, evidence: np.ndarray, marginals: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """(N,) uint8 labels and (N,) float32 confidences of marginals (N, C); evidence (N, C) is overwritten."""
     label = marginals.argmax(axis=1) + 1
     evidence *= np.float32(CAUTION)
+    if known.rates is not None:
+        evidence[:, -1] += np.float32(PRIOR * known.rates.prior_odds)
     cautious = mean_field(graph, evidence, SUPPORT, marginals, steps=1)
     return label.astype(np.uint8), cautious[np.arange(len(label)), label - 1]
+
+
+def evidence_of(known: LabelledPoints) -> np.ndarray:
+    """(N, C) float32 log-likelihood of all labels from the votes: of the classes among themselves, and of
+    none of them against the best.
+    """
+    if known.rates is None:
+        return vote_likelihood(known.known_votes)
+    none = known.rates.log_odds(known.known_votes)
+    return np.concatenate([vote_likelihood(known.known_votes[:, :-1]), none[:, None]], axis=1)
 
 
 def vote_likelihood(votes: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ method, in the paper's order. By tiles, with the same signature: `tiling.propaga
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -14,11 +15,13 @@ from sc3d.georeferencing.up_direction import scene_up
 from sc3d.io.clouds import write_geometry
 from sc3d.propagation.appearance import learn_appearance, plausible, uses_appearance
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
+from sc3d.propagation.none_evidence import NoneRates, count_votes
 from sc3d.propagation.potts import minimize_energy
 from sc3d.propagation.region_growing import grow_regions, reachable, vote_nearest
 from sc3d.scene.channels import Channels
+from sc3d.scene.corrections import Corrections
 from sc3d.scene.labelled_cloud import read_labelled, read_votes, with_labels
-from sc3d.scene.labels import LOCKED, PROPAGATED, SEED, UNLOCKED, Labels
+from sc3d.scene.labels import CORRECTED, LOCKED, PROPAGATED, SEED, UNLOCKED, Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
 
@@ -32,6 +35,8 @@ def propagate(
     geometry, knn: seeds keep their label (with verify_seeds: those that look like their class); map: needs votes
     """
     graph = graph or neighbor_graph(points, normals, settings)  # normals, curvature, similarity (eq. 5 to 7)
+    if points.none:  # how often views find nothing, where there is something
+        points = replace(points, rates=NoneRates.from_counts(count_votes(points.known_votes)))
     known = points.ordered(graph.order)
     appearance = learn_appearance(graph, known) if uses_appearance(settings) else None
     seeds = known.seed_labels
@@ -41,7 +46,9 @@ def propagate(
         )  # eq. 8, with the sign of Potts
         label = np.where(reachable(graph, seeds), label, 0).astype(np.uint8)
     else:
-        seeds = seeds if appearance is None else plausible(seeds, appearance.log_likelihood(seeds))
+        if appearance is not None:
+            kept = plausible(seeds, appearance.log_likelihood(seeds))
+            seeds = np.where(known.corrected, seeds, kept)
         label, confidence = spread(graph, known.points, seeds, settings)  # eq. 9
     if settings.fill:
         label, confidence = fill_from_nearest(known.points, label, confidence)
@@ -77,11 +84,14 @@ def fill_from_nearest(
 def with_states(
     given: Labels, seeds: np.ndarray, found: tuple[np.ndarray, np.ndarray], settings: Propagate
 ) -> Labels:
-    """The labels found, (N,) each with its confidence, and what they mean: kept seeds, propagated, or doubted seeds."""
-    label, confidence = found
+    """The labels found, (N,) each with its confidence, and what they mean: kept seeds, propagated, or
+    doubted seeds; what people have corrected is theirs.
+    """
+    corrected = given.state == CORRECTED
+    label, confidence = np.where(corrected, given.label, found[0]), np.where(corrected, 1, found[1])
     kept = (seeds > 0) & (label == seeds)
     doubted = np.where(np.isin(given.state, (SEED, UNLOCKED)) & (label == 0), LOCKED, given.state)
-    state = np.where(kept, given.state, np.where(label > 0, PROPAGATED, doubted))
+    state = np.where(kept | corrected, given.state, np.where(label > 0, PROPAGATED, doubted))
     confidence = np.where(kept & (settings.method != "map"), given.confidence, confidence)
     confidence = np.where(label == 0, 0, confidence).astype(np.float32)
     return Labels(label.astype(np.uint8), confidence, state.astype(np.uint8), given.num_views)
@@ -89,14 +99,15 @@ def with_states(
 
 @dataclass(frozen=True)
 class PropagateSummary:
-    """Of a finished cloud: points, those with a label, those that got it here, and the sum of the labelled points'
-    confidences.
+    """Of a finished cloud: points, those with a label, those that got it here, the sum of the labelled
+    points' confidences, and those that people corrected.
     """
 
     num_points: int
     labelled: int
     propagated: int
     confidence: float
+    corrected: int = 0
 
     def figures(self) -> dict[str, object]:
         """What the stage reports."""
@@ -105,7 +116,7 @@ class PropagateSummary:
             "labelled": f"{self.labelled / self.num_points:.1%}",
             "propagated": f"{self.propagated / self.num_points:.1%}",
             "mean_confidence": round(self.confidence / max(self.labelled, 1), 3),
-        }
+        } | ({"corrected": self.corrected} if self.corrected else {})
 
 
 def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
@@ -117,21 +128,34 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
         raise InputError(
             f"{path} has no votes, which --method map needs: run `sc3d label` again, or choose --method geometry"
         )
-    if not (seeds.label > 0).any():
+    positions = cloud.point.positions.numpy().astype(np.float64)
+    corrections = Corrections.of_scene(scene)
+    seeds, counts = corrections.apply(seeds, positions)
+    corrections.warn_of_missing(counts, path)
+    if not (seeds.label > 0).any():  # none of the classes alone is no start
         raise no_seeds(path)
     colors = cloud.point.colors.numpy() if "colors" in cloud.point else None
     channels = Channels.of_classes(np.unique(seeds.label).tolist()) if votes is None else votes.channels
-    seeds = replace(seeds, label=channels.from_ids(seeds.label, path))
-    values, positions = None if votes is None else votes.values, cloud.point.positions.numpy()
-    points = LabelledPoints(positions.astype(np.float64), seeds, values, colors, scene_up(scene))
+    seeds = seeds_in_channels(seeds, channels, path)
+    values = None if votes is None else votes.values
+    points = LabelledPoints(positions, seeds, values, colors, scene_up(scene), channels.none)
     normals = cloud.point.normals.numpy()
     labels = propagate(points, normals, settings)
     labels = replace(labels, label=channels.to_ids(labels.label))
     write_geometry(settings.output or scene.labelled, with_labels(cloud, normals, labels))
     labelled, sure = labels.label > 0, labels.confidence
-    propagated = int((labels.state == PROPAGATED).sum())
+    propagated = int((labelled & (labels.state == PROPAGATED)).sum())
     total = float(sure[labelled].sum(dtype=np.float64))
-    return PropagateSummary(len(labelled), int(labelled.sum()), propagated, total)
+    corrected = int((labels.state == CORRECTED).sum())
+    return PropagateSummary(len(labelled), int(labelled.sum()), propagated, total, corrected)
+
+
+def seeds_in_channels(seeds: Labels, channels: Channels, origin: Path | str) -> Labels:
+    """Labels of fusion, which are ids, as channels; seeds without a class are of none of them. origin: for
+    errors.
+    """
+    label = channels.from_ids(seeds.label, origin)
+    return replace(seeds, label=channels.with_none(label, np.isin(seeds.state, (SEED, UNLOCKED, CORRECTED))))
 
 
 def no_seeds(path: object) -> InputError:

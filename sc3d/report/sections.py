@@ -25,6 +25,7 @@ from sc3d.report.data import ReportData, class_areas, read_features
 from sc3d.report.images import cloud_pictures, comparison, ground_picture
 from sc3d.scene.class_table import OTHER
 from sc3d.scene.labelled_cloud import LabelledSurface
+from sc3d.scene.labels import CORRECTED
 from sc3d.view.colors import STATES, Coloring, color_points, confidence_colors, legend_entries
 
 _NUM_PHOTOS = 4
@@ -478,6 +479,7 @@ def certainty_section(data: ReportData) -> str:
     if states is not None and len(states):
         shares = np.bincount(states.astype(np.uint8), minlength=256)[: len(STATES)] / len(states)
         rows = [(state.name, state.color, float(share)) for state, share in zip(STATES, shares, strict=True)]
+        rows = [row for row in rows if row[2] or row[0] != STATES[CORRECTED].name]
         items = "".join(
             f'<li><i style="background:{css_color(color)}"></i>{escape(name)} <b>{share:.1%}</b></li>'
             for name, color, share in rows

@@ -15,19 +15,31 @@ class Channels:
     """Which class each channel stands for. ids: (C + 1,) uint8 rising, of which the first, 0, is no class.
 
     With the ids 1, 2, ..., C, as most tables have them, channels are ids.
+    none: one more channel, the last, for what views looked at and found none of the classes on; its id is
+    0, too
     """
 
     ids: np.ndarray
+    none: bool = False
 
     @classmethod
-    def of_classes(cls, ids: list[int]) -> Channels:
+    def of_classes(cls, ids: list[int], none: bool = False) -> Channels:
         """ids: of the classes, in any order."""
-        return cls(np.array([0, *sorted(set(ids) - {0})], np.uint8))
+        return cls(np.array([0, *sorted(set(ids) - {0})], np.uint8), none)
 
     @property
     def count(self) -> int:
-        """C + 1: the length of arrays indexed by channel."""
-        return len(self.ids)
+        """The length of arrays indexed by channel: C + 1, or C + 2 with `none`."""
+        return len(self.ids) + self.none
+
+    @property
+    def names(self) -> list[str]:
+        """Of all channels: the ids, and "none"."""
+        return [*map(str, self.ids.tolist()), *(["none"] if self.none else [])]
+
+    def with_none(self, labels: np.ndarray, found: np.ndarray) -> np.ndarray:
+        """Channels (any shape, uint8) with the last one where `found` (bool) says so and no class is."""
+        return np.where(found & (labels == 0), np.uint8(self.count - 1), labels) if self.none else labels
 
     @property
     def are_ids(self) -> bool:
@@ -51,4 +63,6 @@ class Channels:
 
     def to_ids(self, channels: np.ndarray) -> np.ndarray:
         """The opposite: ids (uint8) of channels of any shape."""
+        if self.none:
+            return np.append(self.ids, np.uint8(0))[channels]
         return channels if self.are_ids else self.ids[channels]

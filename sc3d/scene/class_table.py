@@ -24,7 +24,8 @@ OTHER, UNJUDGED = 254, 255
 @dataclass(frozen=True)
 class SemanticClass:
     """One class. id: 1 to 255 (0 is reserved: unlabelled); color: RGB uint8; prompts: texts for segmenters;
-    asprs: LAS class code; surface: False for what masks may show and no point can be, such as the sky.
+    asprs: LAS class code; surface: False for what masks may show and no point can be, such as the sky;
+    rest: mask pixels without a class are of this one.
     """
 
     id: int
@@ -33,6 +34,7 @@ class SemanticClass:
     prompts: tuple[str, ...] = ()
     asprs: int = 1
     surface: bool = True
+    rest: bool = False
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,11 @@ class ClassTable:
         return np.isin(labels, [entry.id for entry in self.without_surface])
 
     @property
+    def rest(self) -> SemanticClass | None:
+        """The class of mask pixels that have none."""
+        return next((entry for entry in self.classes if entry.rest), None)
+
+    @property
     def palette(self) -> np.ndarray:
         """(256, 3) uint8 RGB per id; unlabelled is dark gray, other of truth masks a lighter one."""
         palette = np.zeros((256, 3), np.uint8)
@@ -101,12 +108,14 @@ class ClassTable:
         return sorted({int(label) for label in present} - {0} - {entry.id for entry in self.classes})
 
     def as_json(self) -> list[dict]:
-        """The list that `classes.json` holds; `surface` where it is not what the name says."""
+        """The list that `classes.json` holds; `surface` where it is not what the name says, `rest` where it
+        is true.
+        """
         return [
             {
                 key: value
                 for key, value in asdict(entry).items()
-                if key != "surface" or value != _usual_surface(entry.name)
+                if {"surface": value != _usual_surface(entry.name), "rest": value}.get(key, True)
             }
             for entry in self.classes
         ]
@@ -136,6 +145,9 @@ def parse_classes(entries: object, origin: Path | str) -> ClassTable:
         raise InputError(
             f"{origin}: no class has a surface, so that no point can get a label: add one that has"
         )
+    rest = [entry for entry in classes if entry.rest]
+    if len(rest) > 1 or any(not entry.surface for entry in rest):
+        raise InputError(f"{origin}: one class at most can be the rest, and it needs a surface")
     return ClassTable(classes)
 
 
@@ -166,10 +178,11 @@ def _parse_class(entry: object, origin: Path | str) -> SemanticClass:
         )
     if not _is_int(asprs, 0, 255):
         raise InputError(f"{origin}: asprs code of class {label} must be a whole number from 0 to 255")
-    surface = entry.get("surface", _usual_surface(name))
-    if not isinstance(surface, bool):
-        raise InputError(f"{origin}: surface of class {label} must be true or false")
-    return SemanticClass(label, name.strip(), tuple(color), tuple(prompts), asprs, surface)
+    surface, rest = entry.get("surface", _usual_surface(name)), entry.get("rest", False)
+    for key, value in (("surface", surface), ("rest", rest)):
+        if not isinstance(value, bool):
+            raise InputError(f"{origin}: {key} of class {label} must be true or false")
+    return SemanticClass(label, name.strip(), tuple(color), tuple(prompts), asprs, surface, rest)
 
 
 def _usual_surface(name: str) -> bool:

@@ -110,8 +110,8 @@ def with_labels(
         del result.point[name]
     if votes is not None:
         attributes |= {
-            f"{VOTES}{label}": votes.values[:, channel, None].astype(np.float32)
-            for channel, label in enumerate(votes.channels.ids)
+            f"{VOTES}{name}": votes.values[:, channel, None].astype(np.float32)
+            for channel, name in enumerate(votes.channels.names)
         }
     for name, values in attributes.items():
         result.point[name] = o3d.core.Tensor(np.ascontiguousarray(values))
@@ -158,8 +158,8 @@ def _in_range(path: Path, name: str, values: np.ndarray, largest: int, dtype: ty
 
 @dataclass(frozen=True)
 class Votes:
-    """values: (N, C + 1) float32, in views of full weight, of which column 0 counts views; channels: the class of
-    each column.
+    """values: (N, channels) float32, in views of full weight, of which column 0 counts views; channels: the
+    class of each column.
     """
 
     values: np.ndarray
@@ -169,8 +169,9 @@ class Votes:
 def vote_channels(names: Iterable[str]) -> Channels | None:
     """The classes of which a cloud has votes, by the names of its attributes; None if there are none."""
     numbers = [name[len(VOTES) :] for name in names if name.startswith(VOTES)]
+    none = "none" in numbers
     ids = [int(number) for number in numbers if number.isdecimal() and len(number) < 4 and number.isascii()]
-    return None if 0 not in ids or len(ids) < 2 or max(ids) > 255 else Channels.of_classes(ids)
+    return None if 0 not in ids or len(ids) < 2 or max(ids) > 255 else Channels.of_classes(ids, none)
 
 
 def read_votes(cloud: o3d.t.geometry.PointCloud) -> Votes | None:
@@ -179,7 +180,7 @@ def read_votes(cloud: o3d.t.geometry.PointCloud) -> Votes | None:
     if channels is None:
         return None
     votes = np.concatenate(
-        [cloud.point[f"{VOTES}{label}"].numpy().astype(np.float32) for label in channels.ids], axis=1
+        [cloud.point[f"{VOTES}{name}"].numpy().astype(np.float32) for name in channels.names], axis=1
     )
     if not (np.isfinite(votes) & (votes >= 0)).all():
         raise InputError("the votes of the cloud are not finite numbers: run `sc3d label` again")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-UNSEEN, SEED, LOCKED, PROPAGATED, UNLOCKED = range(5)  # `state` of a point
-STATE_NAMES = ("unseen", "seed", "locked", "propagated", "unlocked")
+UNSEEN, SEED, LOCKED, PROPAGATED, UNLOCKED, CORRECTED = range(6)  # `state` of a point
+STATE_NAMES = ("unseen", "seed", "locked", "propagated", "unlocked", "corrected")
 
 
 @dataclass(frozen=True)

@@ -121,6 +121,10 @@ class Scene:
         return self.path / "labelled.ply"
 
     @property
+    def corrections(self) -> Path:
+        return self.path / "corrections.json"
+
+    @property
     def metrics(self) -> Path:
         return self.path / "metrics.json"
 
@@ -188,13 +192,19 @@ class Scene:
         return table, meanings_of_truth(table)
 
     def _onto_photo(self, pixels: np.ndarray, file: Path, name: str) -> np.ndarray:
-        mask, opaque = turned_onto(pixels, file, self.photo(name)), self._opaque(name)
+        mask = turned_onto(pixels, file, self.photo(name))
+        opaque = self.opaque_pixels_of(mask.shape, name)
+        return mask if opaque.all() else np.where(opaque, mask, 0).astype(np.uint8)
+
+    def opaque_pixels_of(self, shape: tuple[int, int], name: str) -> np.ndarray:
+        """(H, W) bool pixels of a mask of this shape, in the photo's frame as stored, where it is opaque."""
+        opaque = self._opaque(name)
         if opaque is None:
-            return mask
+            return np.ones(shape, bool)
         rows, columns = (
-            (np.arange(size) * whole) // size for size, whole in zip(mask.shape, opaque.shape, strict=True)
+            (np.arange(size) * whole) // size for size, whole in zip(shape, opaque.shape, strict=True)
         )
-        return np.where(opaque[np.ix_(rows, columns)], mask, 0).astype(np.uint8)
+        return opaque[np.ix_(rows, columns)]
 
     def mask_size(self, file: Path, name: str) -> tuple[int, int]:
         """(width, height) of what `read_mask` gives, from the header."""

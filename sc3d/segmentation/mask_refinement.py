@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from tqdm import tqdm
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, local_origin
@@ -17,6 +16,7 @@ from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.georeferencing.up_direction import scene_up
 from sc3d.io.atomic import atomic_path, discard
 from sc3d.io.images import read_orientation, write_image
+from sc3d.io.progress import progress
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.fusion import fuse
 from sc3d.labelling.inputs import Masks, default_voxel_size, read_given_cloud
@@ -135,7 +135,7 @@ def refine_scene(scene: Scene, settings: Segment) -> Refinement:
     if refinement.helps:
         with atomic_path(scene.confidence_refined) as folder:
             folder.mkdir()
-            for view in tqdm(masks.views, desc="writing confidence", unit="photo", disable=None):
+            for view in progress(masks.views, "writing confidence", "photo"):
                 file = scene.photo_names.path(folder, view.name)
                 write_image(
                     file, refinement.confidence(view, masks.read), read_orientation(scene.photo(view.name))
@@ -183,7 +183,7 @@ def _doubted(inputs: RefinementInputs, labels: Labels, view: View, read: ReadMas
 
 def _agreement(inputs: RefinementInputs, labels: Labels, views: list[View], read: ReadMask) -> float:
     parts = []
-    for view in tqdm(views, desc="photos left out", unit="photo", disable=None):
+    for view in progress(views, "photos left out", "photo"):
         mask = read(view)[0]
         parts.append(
             Confusion.from_labels(mask, inputs.render(labels, view, mask.shape[::-1])[0], inputs.num_channels)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 # mean and standard deviation of RGB that Grounding DINO, SAM 1 and SAM 2 were trained with
 IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 HALVES = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)  # the same of SAM 3
+NOTHING_FOUND = 128  # confidence of pixels that are looked at and of none of the classes: no model gives one
 # Only data: no pickles (*.bin, *.pt), no code (*.py).
 _FILES = ["*.json", "*.txt", "*.safetensors"]
 _FREE, _GATED = (
@@ -60,6 +61,8 @@ class PromptedSegmenter(ABC):
         check_settings(settings)
         self._settings = settings
         self._prompts = list_prompts(class_table)
+        sought = {prompt.class_id for prompt in self._prompts}
+        self._looks_for_all = all(entry.id in sought for entry in class_table if entry.surface)
         self._device = choose_device(settings)
 
     @abstractmethod
@@ -67,8 +70,13 @@ class PromptedSegmenter(ABC):
         """What the models find in an (H, W, 3) uint8 RGB image, in one look."""
 
     def segment(self, image: np.ndarray) -> Segmentation:
-        """Segment a photo, (H, W, 3) uint8 RGB, as a whole and in tiles."""
-        return segment_tiled(image, self.find, self._settings.tile, self._settings.overlap)
+        """Segment a photo, (H, W, 3) uint8 RGB, as a whole and in tiles. Pixels on which nothing is
+        found, while all classes are looked for, have a confidence as well.
+        """
+        found = segment_tiled(image, self.find, self._settings.tile, self._settings.overlap)
+        if self._looks_for_all:
+            found.confidence[found.labels == 0] = NOTHING_FOUND
+        return found
 
     def _find_model(self, name: str, classes: dict[str, str]) -> Path:
         """Folder of a model, whose type is one of `classes`."""

@@ -17,6 +17,7 @@ from sc3d.io.json_files import read_json, write_json
 from sc3d.io.mask_images import index_image_size
 from sc3d.io.orientation import inverse, turned
 from sc3d.io.photo_folder import find_photos, require_within
+from sc3d.io.progress import progress
 from sc3d.io.provenance import digest
 from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.scene.class_table import ClassTable
@@ -30,7 +31,7 @@ logger = logging.getLogger(__name__)
 
 class Segmentation(NamedTuple):
     """What a backend says of a photo: (H, W) uint8 class id, 0 = unlabelled; (H, W) uint8 confidence, 255 =
-    sure; objects, None if it finds none.
+    sure, of unlabelled pixels that they are of no class, 0 = not looked at; objects, None if it finds none.
     """
 
     labels: np.ndarray
@@ -142,14 +143,12 @@ def segment_photos(
     Raises InputError before the work starts if a photo cannot be opened, or an old mask does not fit its
     photo.
     """
-    from tqdm import tqdm
-
     images = images or Path(os.path.commonpath([photo.parent for photo in photos]))
     names = PhotoNames(photo_name(photo, images) for photo in photos)
     todo = _check_photos(images, names, folders.masks, overwrite)
     tell_of_transparent({name: images / name for name in names.names}, "have an empty mask")
     pending, num_pixels, num_instances = set(todo), np.zeros(256, np.int64), 0
-    for photo in tqdm(todo, desc="segment", unit="photo", disable=None):
+    for photo in progress(todo, "segment", "photo"):
         image = read_image(images / photo, images, shown=True)
         result = Segmentation(*segmenter.segment(image))
         for array in (result.labels, result.confidence):

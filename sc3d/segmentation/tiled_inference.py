@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sc3d.io.progress import progress
 from sc3d.segmentation.instances import (
     SAME_OBJECT,
     Areas,
@@ -68,13 +69,11 @@ def segment_tiled(
     tile: side of a tile, px; 0 = no tiles
     overlap: share of a tile that it has in common with the next, above 0
     """
-    from tqdm import tqdm
-
     shape = image.shape[:2]
     windows = list_tiles(shape[1], shape[0], tile, overlap)
     found = find(image)
     whole, areas, parts = drop_duplicates(found.instances), found.areas, []
-    for window in tqdm(windows, desc="tiles", unit="tile", leave=False, disable=None if windows else True):
+    for window in progress(windows, "tiles", "tile", bar=bool(windows), leave=False):
         found = find(np.ascontiguousarray(image[window.top : window.bottom, window.left : window.right]))
         parts.append([move(instance, window, shape) for instance in drop_duplicates(found.instances)])
         if areas is not None and found.areas is not None:

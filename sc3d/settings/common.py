@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 DepthMode = Literal["blended", "median"]
 """what Gaussians along a pixel's ray say of its depth: that of their planes' alpha-blended one, or where half
 of the light is gone
 """
+
+
+@dataclass(frozen=True)
+class Messages:
+    """What is told during the work; every command has these options."""
+
+    quiet: bool = False
+    """Only warnings and errors, no bars."""
+    verbose: bool = False
+    """Also what helps to find a fault."""
+    log: Path | None = None
+    """File to which all messages are added, with the time, whatever the terminal shows."""
 
 
 @dataclass(frozen=True)

@@ -124,6 +124,11 @@ class Label(Resources):
     """Weigh mask pixels by the confidence maps, where there are any."""
     edge_width: float = 3.0
     """Mask pixels closer than this to a label boundary count less, px; 0 = off."""
+    unlabelled: Literal["evidence", "ignore"] = "evidence"
+    """What a pixel without a class says. evidence: "none of the classes", so that a surface on which most
+    masks say nothing stays unlabelled (conflict-lock); ignore: nothing, so that it gets a class of its
+    neighbors.
+    """
     verify: Literal["no", "lock", "weigh"] = "weigh"
     """Hold the fused labels against each view's masks, place by place. lock: labels that rest on views which
     contradict them nearby are locked; weigh: such views count less as well.
@@ -138,9 +143,11 @@ class Label(Resources):
     def resolved(self) -> Label:
         """What counts: the paper's own choices where `method` is paper."""
         if self.method != "paper":
-            return self
+            return self if self.method == "conflict-lock" else replace(self, unlabelled="ignore")
         every = PaperMechanisms(*(True for _ in fields(PaperMechanisms)))
-        return replace(self, consensus=1.0, edge_width=3.0, verify="lock", mechanisms=every)
+        return replace(
+            self, consensus=1.0, edge_width=3.0, verify="lock", unlabelled="ignore", mechanisms=every
+        )
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,28 @@ class Export:
 
     format: tuple[
         Literal[
-            "masks", "laz", "clouds", "splats", "spz", "orthophoto", "objects", "transforms", "colmap-text"
+            "masks",
+            "laz",
+            "clouds",
+            "splats",
+            "spz",
+            "orthophoto",
+            "dtm",
+            "dsm",
+            "ndsm",
+            "contours",
+            "objects",
+            "transforms",
+            "colmap-text",
         ],
         ...,
     ] = ("laz",)
     """What to write. masks: the fused labels as each photo sees them; laz: LAZ 1.4 with ASPRS classes;
     clouds: one PLY per class; splats, spz: Gaussians with labels; orthophoto: GeoTIFFs of color, class and
-    height; objects: footprints of buildings and crowns of trees as GeoJSON; transforms: cameras and sparse
-    points as nerfstudio's transforms.json; colmap-text: the same as COLMAP's text files.
+    height; dtm, dsm, ndsm: GeoTIFFs of the height of the bare ground (holes interpolated, and marked in a file
+    beside it), of the surface, and of the surface above the ground; contours: lines of equal height of the
+    ground as GeoPackage; objects: footprints of buildings and crowns of trees as GeoJSON; transforms: cameras
+    and sparse points as nerfstudio's transforms.json; colmap-text: the same as COLMAP's text files.
     """
     classes: tuple[str, ...] = ()
     """Names of the classes to write; all otherwise (laz, clouds, splats, spz)."""
@@ -35,12 +49,18 @@ class Export:
     max_size: int = 0
     """Longest side of the masks, px; 0 = as the photo (masks)."""
     epsg: int = 0
-    """EPSG code of a projected CRS for the coordinates (laz, clouds, orthophoto, objects); 0 = that of the
+    """EPSG code of a projected CRS for the coordinates (laz, clouds, maps, objects); 0 = that of the
     scene. Without a georeference it says which CRS the scene's coordinates are in.
     """
     pixel_size: float = 0.0
     """Side of a pixel on the ground, m; 0 = the spacing of the points, twice that without a mesh, rounded to
-    one digit (orthophoto).
+    one digit (orthophoto); four times the spacing (dtm, dsm, ndsm, contours).
+    """
+    contour_interval: float = 0.0
+    """Height between contour lines, units of the CRS; 0 = one that gives up to 25 levels (contours)."""
+    ground_as_2: bool = False
+    """Write all ground-like classes (ASPRS codes 2, 9, 10, 11, and 3 beside trees) as ASPRS class 2, ground,
+    which terrain programs look for (laz).
     """
     min_height: float = 2.0
     """Lower buildings and plants are left out, m (objects)."""
@@ -50,6 +70,24 @@ class Export:
     """Draw buildings with right angles where that fits; --no-rectangular keeps the simplified outline
     (objects).
     """
+
+
+@dataclass(frozen=True)
+class Compare:
+    """What changed between two dates: heights and classes on a common grid, and a picture."""
+
+    before: Annotated[Positional[Path], arg(help="Scene folder of the earlier date.")]
+    after: Annotated[Positional[Path], arg(help="Scene folder of the later date.")]
+    output: Path | None = None
+    """Folder to write; AFTER/export/compare otherwise."""
+    min_height: float = 0.5
+    """Smaller differences of height are no change, m."""
+    min_area: float = 5.0
+    """Smaller regions are no change, m2."""
+    pixel_size: float = 0.0
+    """Side of a cell on the ground, m; 0 = four times the spacing of the points of the sparser cloud."""
+    epsg: int = 0
+    """EPSG code of a projected CRS for the results; 0 = that of the earlier scene."""
 
 
 @dataclass(frozen=True)

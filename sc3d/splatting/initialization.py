@@ -26,6 +26,7 @@ from sc3d.geometry.plane_sweep import (
     settled,
     sweep_planes,
 )
+from sc3d.io.progress import progress
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses
 from sc3d.splatting.dataset import TrainingData
@@ -97,7 +98,7 @@ def plane_sweep_points(
     grays = [_small_gray(data, index) for index in range(len(data.views))]
     volume = SweepVolume.from_points(np.asarray(data.points, np.float64), data.views)
     found, colors, sizes = [], [], []
-    for index, view in enumerate(data.views):
+    for index, view in enumerate(progress(data.views, "first Gaussians", "view")):
         reference = _reference(data, index, step)
         if reference is None:
             continue

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from sc3d.geometry.cameras import View
+from sc3d.io.progress import progress
 from sc3d.splatting import device
 from sc3d.splatting.cpu.label_lifting import add_evidence
 from sc3d.splatting.gaussians import SH_C0, Gaussians
@@ -37,7 +37,7 @@ def lift(gaussians: Gaussians, views: Iterable[View], read: ReadMask, num_channe
     raises ValueError for a view with distortion or a mask of another size than the view
     """
     evidence = np.zeros((len(gaussians), num_channels), np.int64)
-    for view in tqdm(views, desc="lifting labels", unit="photo", disable=None):
+    for view in progress(views, "lifting labels", "photo"):
         mask, confidence = read(view)
         if not view.camera.is_undistorted() or mask.shape != (view.height, view.width):
             raise ValueError(

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from sc3d.errors import InputError
 from sc3d.geometry.view_selection import neighbor_views, scene_extent
 from sc3d.io.atomic import atomic_path
+from sc3d.io.progress import Progress
 from sc3d.scene.held_out import HeldOutPhoto
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses, strategy
@@ -68,16 +68,14 @@ def train(
     trainer = Trainer(data, settings)
     if checkpoint is not None and checkpoint.is_file():
         trainer.resume(checkpoint)
-    hidden = None if progress else True
-    with tqdm(
-        total=settings.iterations, initial=trainer.iteration, disable=hidden, unit="it", desc="train"
-    ) as bar:
+    initial = trainer.iteration
+    with Progress(settings.iterations, "training", "step", initial=initial, bar=progress) as bar:
         while trainer.iteration < settings.iterations:
             row = trainer.step()
             bar.update()
             if row is not None:
-                loss, quality = f"{row['loss']:.4f}", f"{row['psnr']:.2f}"
-                bar.set_postfix(loss=loss, psnr=quality, gaussians=row["num_gaussians"])
+                loss, quality = f"loss {row['loss']:.4f}", f"PSNR {row['psnr']:.2f}"
+                bar.show(f"{loss}, {quality}, {row['num_gaussians']} Gaussians")
             saves = settings.checkpoint_every
             if checkpoint is not None and saves and trainer.iteration % saves == 0:
                 trainer.save(checkpoint)

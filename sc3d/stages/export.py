@@ -16,6 +16,10 @@ MODULES = {
     "splats": "splats",
     "spz": "spz",
     "orthophoto": "orthophoto",
+    "dtm": "elevation",
+    "dsm": "elevation",
+    "ndsm": "elevation",
+    "contours": "elevation",
     "objects": "objects",
     "transforms": "transforms",
     "colmap-text": "colmap_text",
@@ -36,11 +40,11 @@ def inputs(scene: Scene, settings: Export) -> list[Path]:
 
 
 def outputs(scene: Scene, settings: Export) -> list[Path]:
-    return [path for name in settings.format for path in _module(name).outputs(scene, settings)]
+    return [path for name in _names(settings) for path in _module(name).outputs(scene, settings)]
 
 
 def besides(scene: Scene, settings: Export) -> list[Path]:
-    modules = [_module(name) for name in settings.format]
+    modules = [_module(name) for name in _names(settings)]
     return [
         path for module in modules if hasattr(module, "besides") for path in module.besides(scene, settings)
     ]
@@ -50,9 +54,15 @@ def run(scene: Scene, settings: Export) -> dict[str, object]:
     if set(settings.format) - CAMERAS_ONLY:
         scene.require(scene.classes, hint="copy the class table of the labels there")
     figures: dict[str, object] = {}
-    for name in dict.fromkeys(settings.format):
+    for name in _names(settings):
         figures |= {f"{name}_{key}": value for key, value in _module(name).write(scene, settings).items()}
     return figures
+
+
+def _names(settings: Export) -> list[str]:
+    """The formats, of those that one module writes together the first."""
+    first = {MODULES[name]: name for name in reversed(settings.format)}
+    return [name for name in dict.fromkeys(settings.format) if first[MODULES[name]] == name]
 
 
 def _module(name: str):

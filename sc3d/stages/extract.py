@@ -18,6 +18,7 @@ from sc3d.geometry.cameras import View, in_image, local_origin, project, resampl
 from sc3d.geometry.view_selection import neighbor_views
 from sc3d.io.atomic import require_room, temporary_name
 from sc3d.io.clouds import write_geometry
+from sc3d.io.progress import progress
 from sc3d.scene.depth_map import DepthMap, depth_file, depth_map_size, read_depth_map
 from sc3d.scene.scene import Scene, SparseModel, check_photos, require_views
 from sc3d.settings.reconstruction import Extract
@@ -72,7 +73,7 @@ def _from_gaussians(scene: Scene, settings: Extract, store: EvidenceStore) -> tu
     _require_room(data)
     if scene.depth.exists():
         maps = _Maps(scene, data.views)
-        for row in range(len(data.views)):
+        for row in progress(range(len(data.views)), "reading depth", "view"):
             store.write(row, maps.evidence(row, settings.min_views))
     footprint = write_rendered(gaussians, data, store, settings.min_views, settings.depth_mode)
     voxel_size = settings.voxel_size or default_voxel_size(points, footprint)
@@ -94,7 +95,7 @@ def _from_depth(scene: Scene, settings: Extract, store: EvidenceStore) -> tuple[
     data = _views(scene, photo_views, origin, sizes, model.points)
     _require_room(data)
     maps, footprints = _Maps(scene, data.views), []
-    for row, view in enumerate(data.views):
+    for row, view in enumerate(progress(data.views, "reading depth", "view")):
         store.write(row, maps.evidence(row, settings.min_views))
         found = store.read(row, "confirmed")
         if (found > 0).any():

@@ -13,7 +13,9 @@ from sc3d.tiling.propagate import propagate_scene as propagate_scene_by_tiles
 
 
 def inputs(scene: Scene, settings: Propagate) -> list[Input]:
-    return [settings.seeds or scene.seeds, scene.sparse, PhotoFrames(scene.images)]  # which tell up
+    corrections = [scene.corrections, scene.classes] if scene.corrections.exists() else []
+    photos = PhotoFrames(scene.images)  # which, with the cameras, tell up
+    return [settings.seeds or scene.seeds, scene.sparse, photos, *corrections]
 
 
 def outputs(scene: Scene, settings: Propagate) -> list[Path]:

@@ -47,9 +47,14 @@ def main(command: ReconstructCommand) -> None:
 
 def reconstruct(scene: Scene, settings: Reconstruct, overwrite: bool) -> None:
     """Both steps, of which the first is repeated only if its own settings or the photos have changed."""
+    for name, step in steps(settings):
+        execute(name, scene, step, overwrite)
+
+
+def steps(settings: Reconstruct) -> list[tuple[str, Mapping]]:
+    """Names and settings of both steps."""
     mapping = Mapping(**{field.name: getattr(settings, field.name) for field in fields(Mapping)})
-    execute("map_photos", scene, mapping, overwrite)
-    execute("reconstruct", scene, settings, overwrite)
+    return [("map_photos", mapping), ("reconstruct", settings)]
 
 
 def prepare(photos: Path, scene: Scene, settings: Reconstruct) -> None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tqdm import tqdm
-
+from sc3d.io.progress import Progress
 from sc3d.scene.scene import Scene
 from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.generate import synthesize
@@ -30,10 +29,10 @@ def outputs(scene: Scene, settings: Synthesize) -> list[Path]:
 
 
 def run(scene: Scene, settings: Synthesize) -> dict[str, object]:
-    with tqdm(total=100, desc="synthesize", unit="%", disable=None) as bar:
+    with Progress(100, "making", "%") as bar:
 
         def show(share: float, text: str) -> None:
-            bar.update(round(100 * share) - bar.n)
-            bar.set_postfix_str(text)
+            bar.advance_to(round(100 * share))
+            bar.show(text)
 
         return synthesize(scene.path, settings, show)

@@ -157,8 +157,11 @@ def estimate_depths(job: StereoJob, tasks: Executor) -> list[tuple[float, float,
     """Write the depth map of every view; returns per view what `finish_view` does."""
     rows = range(len(job.views))
     tasks.run("photos", partial(write_gray, job), rows)
-    for number, each in enumerate(passes(job.longest)):
-        tasks.run(f"{each.size} px", partial(run_pass, job, number), rows)
+    several = passes(job.longest)
+    for number, each in enumerate(several):
+        tasks.run(
+            f"pass {number + 1} of {len(several)}, {each.size} px", partial(run_pass, job, number), rows
+        )
         for row in rows if number >= 2 else ():
             job.file(number - 2, row).unlink(missing_ok=True)
     points = tasks.run("confirming", partial(check_view, job), rows)

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
-from tqdm import tqdm
 
 from sc3d.geometry.cameras import View, pixel_centers, rays
 from sc3d.io.folders import link_or_copy
 from sc3d.io.images import write_image
 from sc3d.io.json_files import write_json
+from sc3d.io.progress import progress
 from sc3d.scene.class_table import OTHER
 from sc3d.scene.scene import Scene
 from sc3d.settings.synthesize import Synthesize, SynthesizeCity
@@ -147,9 +147,7 @@ def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
     with ExitStack() as files:
         cloud = files.enter_context(open_cloud(scene.path / "truth.ply", num_points))
         mesh = files.enter_context(open_mesh(scene.mesh))
-        for site in tqdm(
-            make_sites(settings), total=columns * rows, desc="building", unit="site", disable=None
-        ):
+        for site in progress(make_sites(settings), "building", "site", total=columns * rows):
             _write_site(site, settings, cloud, mesh)
             city.add(site)
     views = fly_over((columns * EXTENT, rows * EXTENT), settings)
@@ -177,7 +175,7 @@ def _write_masks(scene: Scene, city: City, views: list[View], seed: int) -> floa
     right.
     """
     right = labelled = 0
-    for number, view in enumerate(tqdm(views, desc="masks", unit="view", disable=None)):
+    for number, view in enumerate(progress(views, "masks", "view")):
         truth = city.truth(view)
         label = without_other(truth)
         mask, confidence = noisy_mask(label, Synthesize.mask_noise, np.random.default_rng([seed, 4, number]))

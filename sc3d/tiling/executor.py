@@ -12,9 +12,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-from tqdm import tqdm
-
 from sc3d.errors import InputError, Sc3dError
+from sc3d.io.progress import progress
 from sc3d.settings.common import Workers
 from sc3d.tiling.worker_pool import RETRIES, WorkerPool
 
@@ -37,7 +36,7 @@ class SerialExecutor:
     def run(
         self, name: str, function: Callable, items: Sequence, needs: dict[str, float] | None = None
     ) -> list:
-        return [function(item) for item in tqdm(items, desc=name, disable=None)]
+        return [function(item) for item in progress(items, name, "part")]
 
 
 class LocalExecutor:
@@ -77,7 +76,7 @@ class DaskExecutor:
             )
         futures = self._client.map(function, list(items), pure=False, retries=RETRIES, resources=needs)
         try:
-            for future in tqdm(as_completed(futures), desc=name, total=len(futures), disable=None):
+            for future in progress(as_completed(futures), name, "part", total=len(futures)):
                 future.result()
             return [future.result() for future in futures]
         except KilledWorker as error:

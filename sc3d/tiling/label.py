@@ -106,7 +106,7 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         )
     cloud = CloudFile.open(settings.cloud or scene.cloud)
     confidence = best_confidence(scene) if settings.use_confidence else None
-    masks, output = Masks.load(scene, confidence), settings.output or scene.seeds
+    masks, output = Masks.load(scene, confidence, settings.unlabelled), settings.output or scene.seeds
     decisive: list[Input] = [
         scene.sparse,
         scene.classes,
@@ -228,7 +228,7 @@ def label_tile(job: LabelJob, tile: int) -> None:
     scene, store = Scene(job.scene), job.store
     halo = store.with_halo(tile, job.margin)
     records = halo.gather(store.records)
-    points, masks = positions(records), Masks.load(scene, job.confidence)
+    points, masks = positions(records), Masks.load(scene, job.confidence, job.settings.unlabelled)
     normals = unit_normals(
         None if job.sides is Sides.ESTIMATE else columns(records, NORMALS),
         points,
@@ -249,6 +249,7 @@ def label_tile(job: LabelJob, tile: int) -> None:
         job.maps,
         masks.channels.count,
         job.settings,
+        masks.channels.none,
     )
     core = halo.core
     labels = fusion.labels
@@ -283,7 +284,7 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, channels: Channels) -> n
         ("confidence", "f4"),
         ("state", "u1"),
         ("num_views", "i4"),
-        *((f"{VOTES}{label}", "f4") for label in channels.ids),
+        *((f"{VOTES}{name}", "f4") for name in channels.names),
     ]
     names = {name for name, _ in added} | {"nx", "ny", "nz"}
     kept = [
@@ -306,8 +307,8 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, channels: Channels) -> n
                 result[name] = records[name]
             for column, name in enumerate(("nx", "ny", "nz")):
                 result[name] = values["normals"][:, column]
-            for channel, label in enumerate(channels.ids):
-                result[f"{VOTES}{label}"] = values["votes"][:, channel]
+            for channel, name in enumerate(channels.names):
+                result[f"{VOTES}{name}"] = values["votes"][:, channel]
             for name in ("label", "confidence", "state", "num_views"):
                 result[name] = values[name]
             counts[:] += np.bincount(values["state"], minlength=len(STATE_NAMES))

@@ -10,7 +10,7 @@ otherwise than in one piece.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from sc3d.errors import InputError
 from sc3d.georeferencing.up_direction import scene_up
 from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.ply import read_header, write_records
-from sc3d.io.provenance import PhotoFrames
+from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.propagation.appearance import (
     AppearanceModel,
     AppearanceStatistics,
@@ -34,12 +34,14 @@ from sc3d.propagation.appearance import (
     uses_appearance,
 )
 from sc3d.propagation.labelled_points import MIN_EXAMPLES, views_to_agree
+from sc3d.propagation.none_evidence import NoneRates, count_votes
 from sc3d.propagation.potts import STEPS, appearance_marginals, decided, sure_examples, vote_marginals
 from sc3d.propagation.propagate import PropagateSummary, fill_from_nearest, no_seeds, spread, with_states
 from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.terrain import WINDOWS, GroundModel, NormalStatistics
+from sc3d.scene.corrections import Corrections
 from sc3d.scene.labelled_cloud import VOTES, vote_channels
-from sc3d.scene.labels import PROPAGATED
+from sc3d.scene.labels import CORRECTED, PROPAGATED
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
 from sc3d.tiling.executor import Executor, open_executor
@@ -82,8 +84,10 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
             raise InputError(f"{cloud.path} has no attribute {name!r}: it was not written by `sc3d label`")
     if channels is None:
         raise InputError(f"{cloud.path} has votes of no class: it was not written by `sc3d label`")
+    corrections = Corrections.of_scene(scene)
+    decisive: list[Input] = [cloud.path, scene.sparse, PhotoFrames(scene.images), *corrections.files]
     folder, statistics = (
-        WorkFolder(output, "propagate", [cloud.path, scene.sparse, PhotoFrames(scene.images)], settings),
+        WorkFolder(output, "propagate", decisive, settings),
         CloudStatistics.from_cloud(cloud),
     )
     room = max_points(settings, bytes_per_point(channels.count))
@@ -91,7 +95,8 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
     margin = HOPS * EDGE * sample_spacing(store, statistics)[0]
     results, shared = Results(folder.subfolder("results"), store), folder.subfolder("shared")
-    job = PropagateJob(settings, statistics.extent, store, results, margin, channels, shared, scene_up(scene))
+    up = scene_up(scene)
+    job = PropagateJob(settings, statistics.extent, store, results, margin, channels, shared, up, corrections)
     with open_executor(settings) as executor:
         _solve(job, executor, cloud.path)
     summary = _write(output, cloud, job)
@@ -103,12 +108,15 @@ def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
     """All passes; leaves arrays `label`, `confidence` and `state` of every tile."""
     tiles = job.store.tiles
     summaries = executor.run("graph", partial(_graph_task, job), tiles)
+    job.corrections.warn_of_missing(np.sum([summary.touched for summary in summaries], axis=0), path)
     offered, least = (
         sum(summary.seeds for summary in summaries) > 0,
         views_to_agree(sum(summary.agreement for summary in summaries)),
     )
-    if not offered.any():
+    if not offered[: len(job.channels.ids) - 1].any():
         raise no_seeds(path)
+    if job.channels.none:
+        job = replace(job, rates=NoneRates.from_counts(sum(summary.found for summary in summaries)))
     statistics = (
         _learn(job, executor, NormalStatistics.merge([summary.lean for summary in summaries]), least)
         if uses_appearance(job.settings)
@@ -132,12 +140,14 @@ def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
 @dataclass(frozen=True)
 class TileSummary:
     """First look at a tile. seeds: (C,) int64 of each class; agreement: as `LabelledPoints.agreement`; lean: of its
-    surfaces
+    surfaces; touched: as counts of `Corrections.apply`; found: as `none_evidence.count_votes`
     """
 
     seeds: np.ndarray
     agreement: np.ndarray
     lean: NormalStatistics
+    touched: np.ndarray
+    found: np.ndarray
 
 
 def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
@@ -147,6 +157,8 @@ def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
         np.bincount(start[core], minlength=job.channels.count)[1:],
         part.known.agreement(core),
         NormalStatistics.from_normals(part.graph.normals[core], part.graph.spacings[core]),
+        job.results.read(tile, "touched"),
+        count_votes(part.known.known_votes[core]) if job.channels.none else np.zeros((0, 2), np.int64),
     )
 
 
@@ -238,7 +250,7 @@ def _turn_task(
             raise ValueError("a round needs examples of two classes")
         evidence, marginals = appearance_marginals(part.graph, known, offered, rating, job.settings)
         examples = sure_examples(marginals, known)
-        label, confidence = decided(part.graph, evidence, marginals)
+        label, confidence = decided(part.graph, known, evidence, marginals)
         names = (f"round{turn}_label", f"round{turn}_confidence", f"round{turn}_examples")
         job.results.write(
             tile,
@@ -259,9 +271,8 @@ def _once_task(
     """map without appearance, geometry or knn, within the margin."""
     part = TileGraph.load(job, tile)
     if job.settings.method == "map":
-        label, confidence = decided(
-            part.graph, *vote_marginals(part.graph, part.known, offered, job.settings)
-        )
+        found = vote_marginals(part.graph, part.known, offered, job.settings)
+        label, confidence = decided(part.graph, part.known, *found)
     else:
         start = _start(job, part, statistics)
         label, confidence = spread(part.graph, part.known.points, start, job.settings)
@@ -274,7 +285,11 @@ def _start(job: PropagateJob, part: TileGraph, statistics: AppearanceStatistics 
     return (
         start
         if statistics is None or job.settings.method == "map"
-        else plausible(start, part.appearance(job).log_likelihood(statistics, start))
+        else np.where(
+            part.known.corrected,
+            start,
+            plausible(start, part.appearance(job).log_likelihood(statistics, start)),
+        )
     )
 
 
@@ -349,7 +364,7 @@ def _state_task(
 
 def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
     kept = [(name, cloud.dtype[name].str[1:]) for name in cloud.names if not name.startswith(VOTES)]
-    counts, confidence = np.zeros(3, np.int64), [0.0]
+    counts, confidence = np.zeros(4, np.int64), [0.0]
 
     def chunks():
         found = job.results.in_order(["label", "confidence", "state"], cloud.rows_at_once)
@@ -358,10 +373,11 @@ def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
             for name, _ in kept:
                 result[name] = values[name] if name in values else records[name]
             labelled = values["label"] > 0
-            counts[:] += len(records), labelled.sum(), (values["state"] == PROPAGATED).sum()
+            states = (labelled & (values["state"] == PROPAGATED)).sum(), (values["state"] == CORRECTED).sum()
+            counts[:] += len(records), labelled.sum(), *states
             confidence[0] += float(values["confidence"][labelled].sum(dtype=np.float64))
             yield result
 
     write_records(path, chunks(), np.dtype(kept), cloud.num_points, ["sc3d"])
-    num_points, labelled, propagated = counts.tolist()
-    return PropagateSummary(num_points, labelled, propagated, confidence[0])
+    num_points, labelled, propagated, corrected = counts.tolist()
+    return PropagateSummary(num_points, labelled, propagated, confidence[0], corrected)

@@ -4,7 +4,7 @@ arrays of the tile's own points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +21,11 @@ from sc3d.propagation.appearance import (
     Histogram,
 )
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
+from sc3d.propagation.none_evidence import NoneRates
+from sc3d.propagation.propagate import seeds_in_channels
 from sc3d.propagation.terrain import NUM_FEATURES
 from sc3d.scene.channels import Channels
+from sc3d.scene.corrections import Corrections
 from sc3d.scene.labelled_cloud import VOTES
 from sc3d.scene.labels import Labels
 from sc3d.settings.labels import Propagate
@@ -35,8 +38,9 @@ KNOWN = ("points", "votes", *(field.name for field in fields(Labels)), "colors")
 
 @dataclass(frozen=True)
 class PropagateJob:
-    """What the task of a tile needs to know. margin: world units; channels: of the votes; shared:
-    folder for what all tiles read; up: (3,) of the cameras, None = not known
+    """What the task of a tile needs to know. margin: world units; channels: of the votes; shared: folder
+    for what all tiles read; up: (3,) of the cameras, None = not known; rates: of votes for none, once
+    counted
     """
 
     settings: Propagate
@@ -47,6 +51,8 @@ class PropagateJob:
     channels: Channels
     shared: Path
     up: np.ndarray | None = None
+    corrections: Corrections = Corrections()
+    rates: NoneRates | None = None
 
     @property
     def colored(self) -> bool:
@@ -71,7 +77,12 @@ class TileGraph:
             _build(job, tile, halo)
         graph, known = Graph(*_mapped(job, tile, GRAPH)), _mapped(job, tile, KNOWN)
         evidence = LabelledPoints(
-            known[0], Labels(*known[2:-1]), known[1], known[-1] if job.colored else None
+            known[0],
+            Labels(*known[2:-1]),
+            known[1],
+            known[-1] if job.colored else None,
+            none=job.channels.none,
+            rates=job.rates,
         )
         return cls(tile, halo, graph, evidence, halo.core[graph.order])
 
@@ -110,7 +121,7 @@ def cells_of(appearance: AppearanceModel) -> np.ndarray:
 
 
 def _build(job: PropagateJob, tile: int, halo: TileWithHalo) -> None:
-    evidence, normals = _evidence(job, halo)
+    evidence, normals, touched = _evidence(job, halo)
     colors, box = evidence.colors if job.settings.color else None, (job.extent.low, job.extent.high)
     graph = build_graph(
         evidence.points, normals, job.settings.num_neighbors, colors, tie_breakers(evidence, normals), box
@@ -122,6 +133,7 @@ def _build(job: PropagateJob, tile: int, halo: TileWithHalo) -> None:
         *(getattr(known.seeds, field.name) for field in fields(Labels)),
         known.colors if job.colored else np.empty(0),
     )
+    job.results.write(tile, touched=touched)
     for names, arrays in ((GRAPH, [getattr(graph, name) for name in GRAPH]), (KNOWN, values)):
         job.results.write(tile, **{f"part_{name}": array for name, array in zip(names, arrays, strict=True)})
 
@@ -130,9 +142,10 @@ def _mapped(job: PropagateJob, tile: int, names: tuple[str, ...]) -> list[np.nda
     return [np.asarray(job.results.read(tile, f"part_{name}", mapped=True)) for name in names]
 
 
-def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np.ndarray | None]:
-    """What is known of the window's points, by row, and their normals."""
+def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np.ndarray | None, np.ndarray]:
+    """What is known of the window's points, by row, their normals, and how many lie in each correction."""
     records = halo.gather(job.store.records)
+    points = positions(records)
     labels = Labels(
         *(
             records[name].astype(kind)
@@ -144,8 +157,8 @@ def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np
             )
         )
     )
-    labels = replace(labels, label=job.channels.from_ids(labels.label, "the cloud"))
-    votes = columns(records, [f"{VOTES}{label}" for label in job.channels.ids])
-    return LabelledPoints(
-        positions(records), labels, votes, columns(records, ("red", "green", "blue"))
-    ), columns(records, ("nx", "ny", "nz"))
+    labels, touched = job.corrections.apply(labels, points)
+    labels = seeds_in_channels(labels, job.channels, "the cloud")
+    votes = columns(records, [f"{VOTES}{name}" for name in job.channels.names])
+    known = LabelledPoints(points, labels, votes, columns(records, ("red", "green", "blue")))
+    return known, columns(records, ("nx", "ny", "nz")), touched

@@ -4,6 +4,7 @@ a port, every user of the machine could have code run.
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import signal
@@ -15,11 +16,11 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any, cast
 
-from tqdm import tqdm
-
 from sc3d.errors import Sc3dError
+from sc3d.io.progress import Progress, show_bars
 
 RETRIES = 3  # of a task whose worker is lost; more, and the task itself is what kills it
+Message = tuple[str, int, str]  # name of the logger, level, text
 SECONDS = 5.0  # that an ending worker may take
 
 
@@ -92,7 +93,7 @@ class WorkerPool:
         """
         todo, lost, results = deque(range(len(items))), Counter[int](), dict[int, Any]()
         try:
-            with tqdm(desc=name, total=len(items), disable=None) as bar:
+            with Progress(len(items), name, "part") as bar:
                 while len(results) < len(items):
                     self._hand_out(function, items, todo)
                     for worker in self._answering():
@@ -100,7 +101,9 @@ class WorkerPool:
                         assert index is not None
                         answer = self._answer(worker)
                         if answer is not None:
-                            results[index] = _value(name, *answer)
+                            done, value, messages = answer
+                            _log(messages)
+                            results[index] = _value(name, done, value)
                             bar.update()
                             continue
                         lost[index] += 1
@@ -132,14 +135,34 @@ class WorkerPool:
         busy = {worker.connection: worker for worker in self._workers if worker.index is not None}
         return [busy[cast(Connection, connection)] for connection in wait(list(busy))]
 
-    def _answer(self, worker: _Worker) -> tuple[bool, Any] | None:
-        """Whether the task was done, and its result or error; None if the process is gone."""
+    def _answer(self, worker: _Worker) -> tuple[bool, Any, list[Message]] | None:
+        """Whether the task was done, its result or error, and what was logged; None if the process is gone."""
         try:
             return worker.connection.recv()
         except (EOFError, OSError):
             self._workers.remove(worker)
             worker.end()
             return None
+
+
+class _Messages(logging.Handler):
+    """What a worker logs: the process that started it says it, in its way and to its files."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._found: list[Message] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._found.append((record.name, record.levelno, record.getMessage()))
+
+    def take(self) -> list[Message]:
+        found, self._found = self._found, []
+        return found
+
+
+def _log(messages: list[Message]) -> None:
+    for name, level, text in messages:
+        logging.getLogger(name).log(level, "%s", text)
 
 
 def _value(name: str, done: bool, value: Any) -> Any:
@@ -152,6 +175,10 @@ def _work(connection: Connection) -> None:
     """A worker's life: until the pipe ends, or the process that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl + C is for the process that started it
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    messages = _Messages()
+    logging.getLogger().addHandler(messages)
+    logging.captureWarnings(True)
+    show_bars(False)  # its parent has one
     function: Callable | None = None
     while True:
         try:
@@ -164,7 +191,7 @@ def _work(connection: Connection) -> None:
         except Exception as error:
             answer = False, _told(error)
         try:
-            connection.send(answer)
+            connection.send((*answer, messages.take()))
         except OSError:
             return
 

@@ -33,6 +33,7 @@ STATES = (  # by value of `state`; colors apart for the color-blind too (Okabe a
     State("locked", (213, 94, 0)),
     State("propagated", (86, 180, 233)),
     State("unlocked by reprojection", (204, 121, 167)),
+    State("corrected by hand", (240, 228, 66)),
 )
 
 CONTESTED = 0.5  # disagreement from which on the color stays the same: no class has a majority there

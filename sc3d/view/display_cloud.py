@@ -69,6 +69,16 @@ class DisplayCloud:
             class_table,
         )
 
+    def relabel(self, labelled: o3d.t.geometry.PointCloud) -> None:
+        """Take the labels of the same points; InputError if they are others."""
+        positions, others = (one.point.positions.cpu().numpy() for one in (self.cloud, labelled))
+        if positions.shape != others.shape or not np.array_equal(positions, others):
+            raise InputError("the labels are of other points than those shown: open the page again")
+        for name in ("label", "confidence", "state"):
+            self.cloud.point[name] = labelled.point[name]
+        self.label[:] = labelled.point["label"].cpu().numpy().ravel()[self.rows]
+        self._colors.clear()
+
     @property
     def colorings(self) -> tuple[Coloring, ...]:
         """What the cloud can be colored by."""

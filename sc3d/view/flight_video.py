@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
-from tqdm import tqdm
 
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View, pinhole_view
 from sc3d.io.atomic import atomic_path
+from sc3d.io.progress import progress
 from sc3d.splatting.evaluation import picture
 from sc3d.view.colors import Coloring
 from sc3d.view.display_splats import DisplaySplats
@@ -57,9 +57,7 @@ def write_flight(
     """
     gaussians = splats.gaussians if splats.label is None else splats.painted(by)
     ride = flight_path([view.shifted(splats.origin) for view in views], size)
-    frames = (
-        picture(gaussians, view, WHITE) for view in tqdm(ride, desc="flight", unit="frame", disable=None)
-    )
+    frames = (picture(gaussians, view, WHITE) for view in progress(ride, "flight", "frame"))
     write_video(path, frames, (ride[0].width, ride[0].height))
 
 

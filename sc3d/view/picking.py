@@ -138,7 +138,8 @@ class Inspector:
         votes = self._votes
         if votes is None:
             return {}
-        found = zip(votes.values[row].tolist(), votes.channels.ids.tolist(), strict=True)
+        counts = votes.values[row, : len(votes.channels.ids)]  # without those for none of the classes
+        found = zip(counts.tolist(), votes.channels.ids.tolist(), strict=True)
         cast = [(count, label) for count, label in found if label and count > 0]
         named = self.class_table.name if self.class_table is not None else "class {}".format
         return {named(label): count for count, label in sorted(cast, key=lambda entry: (-entry[0], entry[1]))}

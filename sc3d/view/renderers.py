@@ -27,6 +27,7 @@ import numpy as np
 
 from sc3d.errors import Sc3dError
 from sc3d.geometry.cameras import View, pinhole_view
+from sc3d.io.messages import messages_to
 from sc3d.io.python_process import run_python
 
 if TYPE_CHECKING:
@@ -233,7 +234,8 @@ def _quiet() -> Iterator[None]:
         try:
             os.dup2(chatter.fileno(), 1)
             os.dup2(chatter.fileno(), 2)
-            yield
+            with messages_to(saved[1]):
+                yield
         finally:
             for target, descriptor in zip((1, 2), saved, strict=True):
                 os.dup2(descriptor, target)

@@ -64,6 +64,7 @@ def chain(site) -> list:
         *("--train.max-size", 400),
         *("--train.max-gaussians", 40000),
         *("--extract.max-size", 400),
+        *("--log", site.parent / "file.log"),
     ]
 
 
@@ -71,6 +72,15 @@ def chain(site) -> list:
 def scene(site):
     run(*chain(site))
     return site.parent / "scene"
+
+
+def test_the_log_has_plan_stages_and_results_and_no_control_characters(scene):
+    log = (scene.parent / "file.log").read_text(encoding="utf-8")
+    assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", log)
+    places = [
+        log.index(told) for told in ("plan: 10 of 10 stages", "wrote", "look at", "labelled cloud", "--web")
+    ]
+    assert places == sorted(places)
 
 
 def test_cameras_are_metric_and_right(site, scene):

@@ -18,6 +18,7 @@ from sc3d.exporters.regions import cells_by_number, connected_cells, renumbered
 from sc3d.exporters.terrain import block_medians, ground_height
 from sc3d.exporters.trees import split_crowns, watershed
 from sc3d.geometry.raster import Raster
+from sc3d.scene.class_table import OTHER
 from sc3d.settings.outputs import Export
 from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.cloud import truth_cloud
@@ -34,7 +35,10 @@ UTM = {"epsg": 32615, "offset": [576000.0, 5188000.0, 200.0]}
 def site():
     """A small synthetic site and its true cloud."""
     world = build_world(Synthesize(extent=80.0, seed=3))
-    return world, truth_cloud(world, 250_000, np.random.default_rng(0))
+    cloud = truth_cloud(world, 250_000, np.random.default_rng(0))
+    label = cloud.point.label.numpy()
+    cloud.point.label = np.where(label == OTHER, 0, label)  # cars and walls: of no class in a labelled cloud
+    return world, cloud
 
 
 def exported(scene, settings=Export()) -> tuple[list[dict], list[dict]]:
@@ -328,3 +332,13 @@ def test_numbers_follow_the_order_of_cells():
         renumbered(np.array([[0, 9, 9], [4, 4, 0], [9, 2, 2]])) == [[0, 1, 1], [2, 2, 0], [1, 3, 3]]
     ).all()
     assert (renumbered(np.array([[7, 7], [3, 7]])) == [[1, 1], [2, 1]]).all()
+
+
+def test_volume_above_the_ground_of_a_house_on_a_slope(tmp_path):
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-15, 15, (2, 60_000))
+    house, ground = (np.abs(x) < 5) & (np.abs(y) < 4), 0.1 * x
+    points = np.stack([x, y, np.where(house, 6.0, ground)], 1)
+    buildings, _ = exported(write_scene(tmp_path, labelled_cloud(points, np.where(house, 1, 3))))
+    # 80 m2, on average 6 m above the plane of the slope
+    assert buildings[0]["properties"]["volume_m3"] == pytest.approx(480, rel=0.05)

@@ -298,6 +298,36 @@ def _read_strokes(folder: Path) -> object:
     return [strokes.paint(20, 15) for strokes in read_strokes(folder, folder / "photos", _many_classes())]
 
 
+CORRECTIONS = {
+    "version": 1,
+    "log": [
+        {
+            "id": "a",
+            "time": "2026-05-01T12:00:00Z",
+            "class": "road",
+            "balls": [{"radius": 0.5, "centers": [[0, 1, 2], [0.5, 1, 2]]}],
+            "cameras": {"a.jpg": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5]]},
+        },
+        {
+            "id": "b",
+            "time": "2026-05-01",
+            "class": None,
+            "polygon": [[0, 0], [1, 0], [1, 1]],
+            "z": [0, 3],
+        },
+        {"id": "c", "time": "2026-05-02", "undo": "b"},
+        {"id": "d", "time": "2026-05-02", "redo": "b"},
+    ],
+}
+
+
+def _read_corrections(folder: Path) -> object:
+    from sc3d.scene.corrections import read_log, standing
+
+    points = np.zeros((5, 3))
+    return [one.shape.contain(points) for one in standing(read_log(folder / "corrections.json"))]
+
+
 def _many_classes():
     from sc3d.scene.class_table import parse_classes
 
@@ -461,6 +491,11 @@ PROJECT_FILES = {
 }
 
 READERS: dict[str, Reader] = {
+    "corrections": Reader(
+        _one("corrections.json", lambda: json.dumps(CORRECTIONS).encode()),
+        _read_corrections,
+        ("corrections.json",),
+    ),
     "colmap-binary": Reader(
         lambda folder: _build_model(folder, False),
         _read_model,

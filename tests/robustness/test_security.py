@@ -27,11 +27,12 @@ import numpy as np
 import psutil
 import pytest
 
-from sc3d.cli import PlainText, main
+from sc3d.cli import main
 from sc3d.errors import InputError, Sc3dError
 from sc3d.io import atomic
 from sc3d.io.atomic import claim, remove
 from sc3d.io.local_page import LocalPage
+from sc3d.io.messages import PlainText
 from sc3d.settings.common import Workers
 from sc3d.tiling import worker_pool
 from sc3d.tiling.executor import open_executor

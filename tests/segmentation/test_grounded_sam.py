@@ -16,7 +16,7 @@ from sc3d.io.images import write_image
 from sc3d.io.mask_images import read_index_image
 from sc3d.scene.class_table import parse_classes
 from sc3d.segmentation.grounded_sam import Detections, GroundedSam
-from sc3d.segmentation.models import IMAGENET, enlarge, outline, to_pixels
+from sc3d.segmentation.models import IMAGENET, NOTHING_FOUND, enlarge, outline, to_pixels
 from sc3d.segmentation.rle import fill_runs, find_runs
 from sc3d.segmentation.segment import Folders, segment_photos
 from sc3d.segmentation.text_prompts import Prompt
@@ -58,10 +58,10 @@ def test_masks_and_instances_fit_each_other(models, tmp_path, segmenter):
         )
         assert label.shape == confidence.shape == (48 + 16 * index, 80)
         assert not TABLE.unknown(label) and label.any()
-        assert ((label == 0) == (confidence == 0)).all()
+        assert ((label == 0) <= (confidence == NOTHING_FOUND)).all() and (confidence > 0).all()
         found = json.loads((folders.instances / f"photo{index}.json").read_text())["annotations"]
         assert {int(value) for value in np.unique(label[label > 0])} <= {one["category_id"] for one in found}
-        assert confidence.max() == max(max(1, round(255 * one["score"])) for one in found)
+        assert confidence[label > 0].max() == max(max(1, round(255 * one["score"])) for one in found)
         assert all(one["prompt"] in ("building", "roof", "road", "parking lot", "tree") for one in found)
     before = {file: file.read_bytes() for file in tmp_path.rglob("photo*.*")}
     segment_photos(
@@ -74,7 +74,12 @@ def test_nothing_found_is_unlabelled(models):
     label, confidence, instances = GroundedSam(_tiny(models, "sam2", box_threshold=0.9999), TABLE).segment(
         np.zeros((20, 30, 3), np.uint8)
     )
-    assert label.shape == (20, 30) and not label.any() and not confidence.any() and instances == ()
+    assert (
+        label.shape == (20, 30)
+        and not label.any()
+        and (confidence == NOTHING_FOUND).all()
+        and instances == ()
+    )
 
 
 def test_detections_equal_those_of_the_models_own_processor(models):

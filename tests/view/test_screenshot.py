@@ -207,7 +207,9 @@ def test_colors():
     cloud = full_cloud()
     assert np.array_equal(color_points(cloud, "photo"), cloud.point.colors.numpy())
     assert np.array_equal(color_points(cloud, "label", CLASSES)[:3], CLASSES.palette[[0, 1, 4]])
-    assert np.array_equal(color_points(cloud, "state"), [state.color for state in STATES])
+    every = full_cloud(6)
+    every.point["state"] = o3d.core.Tensor(np.arange(6, dtype=np.uint8)[:, None])
+    assert np.array_equal(color_points(every, "state"), [state.color for state in STATES])
     confidence = color_points(cloud, "confidence").astype(int).sum(axis=1)
     assert (np.diff(confidence) > 0).all()  # brighter = surer
     for by in set(COLORINGS) - {"disagreement"}:  # which needs votes

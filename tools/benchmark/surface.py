@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
-from tqdm import tqdm
 
 from sc3d.geometry.cameras import View, local_origin, undistorted
 from sc3d.geometry.raycast import Surface, first_surface, see_points
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.mask_images import read_index_image
+from sc3d.io.progress import progress
 from sc3d.scene.depth_map import depth_file, read_depth_map
 from sc3d.scene.scene import Scene
 from sc3d.settings.common import DepthMode
@@ -104,7 +104,7 @@ def _depth_errors(
 ) -> dict[str, float | None]:
     errors, labels, shares = [], [], []
     num_sky, num_walled = 0, 0
-    for view in tqdm(views, desc="depth", unit="view", disable=None):
+    for view in progress(views, "depth", "view"):
         stem = view.name.rsplit(".", 1)[0]
         exact, label = (
             np.load(truth.path / "truth_depth" / f"{stem}.npy"),
@@ -146,7 +146,7 @@ def _completeness(
     cloud = read_cloud(truth.path / "truth.ply")
     points, normals = cloud.point.positions.numpy() - origin, cloud.point.normals.numpy()
     seen = np.zeros(len(points), np.int32)
-    for view in tqdm(views, desc="visible", unit="view", disable=None):
+    for view in progress(views, "visible", "view"):
         seen[see_points(view, points, normals, first_surface(true_mesh, view), 0.05).points] += 1
     near, label = _distances(mesh, points) <= distance, cloud.point.label.numpy().ravel()
     return {"": float(near[seen >= 2].mean())} | {

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, local_origin
@@ -21,6 +20,7 @@ from sc3d.io.clouds import read_cloud
 from sc3d.io.folders import link_or_copy
 from sc3d.io.images import write_image
 from sc3d.io.mask_images import read_index_image
+from sc3d.io.progress import Progress, progress
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.inputs import Masks, point_density
 from sc3d.metrics import Confusion, EvaluationPixels, depth_edge_band
@@ -72,8 +72,8 @@ def synthetic_scene(folder: Path, settings: Synthesize) -> Scene:
     scene = Scene(folder)
     # classes.json is written last
     if not all(path.exists() for path in (scene.classes, folder / "truth.ply", folder / "truth_mesh.ply")):
-        with tqdm(total=100, desc=f"synthesize {folder.name}", unit="%", disable=None) as bar:
-            synthesize(folder, settings, lambda share, _: bar.update(round(100 * share) - bar.n))
+        with Progress(100, f"synthesize {folder.name}", "%") as bar:
+            synthesize(folder, settings, lambda share, _: bar.advance_to(round(100 * share)))
     views = scene.model.views
     found = len(views), views[0].width, len(read_cloud(folder / "truth.ply").point.positions)
     wanted = settings.num_views, settings.width, settings.num_points
@@ -125,7 +125,7 @@ def load_place(scene: Scene, every: int) -> Place:
     photos = [view for view in views if view.name in truth_files]
     photos = photos[:: max(1, min(every, len(photos) // FEW))]
     parts = []
-    for view in tqdm(photos, desc=f"judged pixels of {scene.path.name}", unit="photo", disable=None):
+    for view in progress(photos, f"judged pixels of {scene.path.name}", "photo"):
         truth = scene.read_truth(truth_files[view.name], view.name)
         sized = view.resized(*truth.shape[::-1])
         first = first_surface(surface, sized)

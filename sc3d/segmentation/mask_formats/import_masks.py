@@ -14,6 +14,7 @@ from sc3d.io.atomic import atomic_path, discard
 from sc3d.io.folders import resolved
 from sc3d.io.images import read_orientation, write_image
 from sc3d.io.mask_images import index_image_size, is_indexed, turned_onto
+from sc3d.io.progress import progress
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.mask_values import read_confidence
 from sc3d.scene.photo_names import PhotoNames
@@ -171,8 +172,6 @@ def _copy(files: dict[str, Path], folder: Path, names: PhotoNames, photos: Path 
 
 
 def _draw(masks: dict[str, CheckedMask], folder: Path, names: PhotoNames, photos: Path | None) -> None:
-    from tqdm import tqdm
-
     folder.mkdir()
-    for name, mask in tqdm(masks.items(), desc="import", unit="photo", disable=None):
+    for name, mask in progress(masks.items(), "import", "photo"):
         write_image(names.path(folder, name), mask.read(), _orientation(photos, name))

@@ -131,27 +131,29 @@ class Strokes:
 
         image: (H, W, 3) uint8 RGB
         returns: (H, W) uint8 class id, 0 = background or unsure; (H, W) uint8 confidence, probability of the
-            class x 255, 0 where unlabelled
+            class or the background x 255, 0 where unsure or unlike all strokes
         """
         height, width = image.shape[:2]
         small, fine = shrink(image, self._settings.max_size), shrink(image, _MAX_SIDE)
         guide = fine.astype(np.float32) / 255
         best, total = np.zeros(guide.shape[:2], np.float32), np.zeros(guide.shape[:2], np.float32)
-        labels = np.zeros(guide.shape[:2], np.uint8)
+        labels, known = np.zeros(guide.shape[:2], np.uint8), np.zeros(guide.shape[:2], bool)
         lines = fit_lines(
             small.astype(np.float32) / 255,
             self._planes(pixel_features(small)),
             self._settings.radius,
             self._settings.smoothing,
         )
-        for label, line in zip([*self._label_of_code, 0], lines, strict=True):
+        unlike = len(self._label_of_code)
+        for code, (label, line) in enumerate(zip([*self._label_of_code, 0], lines, strict=True)):
             weight = self._sharpened(line.apply(guide))
-            labels[weight > best] = label
+            labels[weight > best], known[weight > best] = label, code < unlike
             total += weight
             np.maximum(best, weight, out=best)
         sure = best / total
-        labels[sure < self._settings.unsure] = 0
-        confidence = np.where(labels > 0, np.clip(np.rint(255 * sure), 1, 255), 0).astype(np.uint8)
+        unsure = sure < self._settings.unsure
+        labels[unsure] = 0
+        confidence = np.where(known & ~unsure, np.clip(np.rint(255 * sure), 1, 255), 0).astype(np.uint8)
         return Segmentation(
             *(
                 cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST)

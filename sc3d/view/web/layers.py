@@ -47,14 +47,8 @@ class CloudLayer:
     ) -> None:
         self._scene, self._display, self._by, self._relief, self._scale = server.scene, display, by, True, 1.0
         self._root = server.scene.add_frame(f"/{root}", show_axes=False)
-        self._classes = {
-            label: server.scene.add_frame(
-                f"/{root}/{node_name(display.class_table, label)}",
-                show_axes=False,
-                visible=label not in hidden,
-            )
-            for label in display.class_counts
-        }
+        self._classes: dict[int, viser.FrameHandle] = {}
+        self._add_classes(hidden)
         self._chunks: list[list[tuple[np.ndarray, viser.PointCloudHandle]]] = []
         self._lock = threading.RLock()  # sliders call from several threads
 
@@ -76,6 +70,16 @@ class CloudLayer:
             while len(self._chunks) < wanted:
                 self._chunks.append(self._add_chunk(len(self._chunks)))
             self.resize(self._scale)
+
+    def relabel(self, hidden: Collection[int]) -> None:
+        """Show the same number of points with the labels that the cloud has now; hidden: classes."""
+        with self._lock:
+            count = self.count
+            for _, handle in self._handles():
+                handle.remove()
+            self._chunks.clear()
+            self._add_classes(hidden)
+            self.show_points(count)
 
     def color_by(self, by: Coloring, relief: bool = True) -> None:
         """Show another attribute. relief: shaded, where the cloud has normals"""
@@ -99,6 +103,15 @@ class CloudLayer:
     def show(self, visible: bool) -> None:
         """Show or hide all of it."""
         self._root.visible = visible
+
+    def _add_classes(self, hidden: Collection[int]) -> None:
+        """Nodes of the classes that occur and have none yet."""
+        for label in self._display.class_counts:
+            if label not in self._classes:
+                name = f"{self._root.name}/{node_name(self._display.class_table, label)}"
+                self._classes[label] = self._scene.add_frame(
+                    name, show_axes=False, visible=label not in hidden
+                )
 
     def _handles(self) -> list[tuple[np.ndarray, viser.PointCloudHandle]]:
         return [entry for handles in self._chunks for entry in handles]

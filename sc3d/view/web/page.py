@@ -27,6 +27,7 @@ from sc3d.view.display_cloud import DisplayCloud
 from sc3d.view.display_splats import DisplaySplats
 from sc3d.view.picking import Inspector
 from sc3d.view.viewpoints import frustum_depth, overview, without_outliers
+from sc3d.view.web.correction_panel import CorrectionPanel
 from sc3d.view.web.guard import guarding
 from sc3d.view.web.layers import CameraLayer, CloudLayer, SplatLayer
 from sc3d.view.web.orbit_camera import OrbitCamera
@@ -99,7 +100,10 @@ def serving(view: WebView, host: str = LOCAL, port: int = 0) -> Iterator[str]:
         cameras = CameraLayer(server, views, frustum_depth(views, display.points) if views else 1.0)
         page = Page(server, view.scene, display, views, view.inspector, cloud, splats, cameras)
         home = _start(server, view, display, views)
-        PointPanel(page, ShowPanel(page, view.by, hidden, view.splats_first))
+        show = ShowPanel(page, view.by, hidden, view.splats_first)
+        PointPanel(page, show)
+        if display.class_table is not None and host in LOOPBACK:
+            CorrectionPanel(page, show)
         if views:
             photos = PhotoPanel(page, home)
             if view.photo is not None:

@@ -52,7 +52,8 @@ class ShowPanel:
 
     def __init__(self, page: Page, by: Coloring, hidden: set[int], splats_first: bool) -> None:
         self._page, self.hidden, gui = page, set(hidden), page.server.gui
-        with gui.add_folder("Show"):
+        self._boxes, self._folder = set[int](), gui.add_folder("Show")
+        with self._folder:
             if page.splats is not None:
                 layers = gui.add_dropdown(
                     "Layers", ("cloud", "splats", "both"), initial_value="splats" if splats_first else "cloud"
@@ -76,6 +77,13 @@ class ShowPanel:
                 cameras = gui.add_checkbox("cameras", True)
                 cameras.on_update(lambda _: page.cameras.show(cameras.value))
 
+    def relabel(self) -> None:
+        """Show the labels that the cloud has now."""
+        self._page.cloud.relabel(self.hidden)
+        with self._folder:
+            self._add_classes(self._page.server.gui)
+        self._color()
+
     def _add_sliders(self, gui: viser.GuiApi) -> None:
         layer, total, chunk = self._page.cloud, len(self._page.display.points), self._page.display.chunk
         if total > chunk:
@@ -95,10 +103,14 @@ class ShowPanel:
         if table is None:
             return
         counts = self._page.display.class_counts
-        for label in [
+        labels = [
             *(label for label in counts if label),
             *([0] if 0 in counts or self._page.splats is not None else []),
-        ]:
+        ]
+        for label in labels:
+            if label in self._boxes:
+                continue
+            self._boxes.add(label)
             box = gui.add_checkbox(
                 table.name(label), label not in self.hidden, hint=f"{counts.get(label, 0):,} points"
             )

@@ -1,0 +1,106 @@
+"""What `sc3d run` tells before it starts and at its end."""
+
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import pytest
+
+from sc3d.commands import plan as plans
+from sc3d.commands.plan import EXPECTED, megapixels, num_pairs, pending, plan, results
+from sc3d.commands.run import list_stages
+from sc3d.scene.scene import Scene
+from sc3d.settings.labels import Segment
+from sc3d.settings.outputs import Run
+from sc3d.settings.train import Train
+from tests.builders import write_bare_scene
+
+CHAIN = {  # what each reads and writes
+    "map_photos": (["photos"], ["mapped"]),
+    "depth": (["photos", "mapped"], ["depth"]),
+    "segment": (["masks made elsewhere"], ["masks"]),
+    "label": (["masks", "depth"], ["seeds"]),
+    "propagate": (["seeds"], ["labelled"]),
+}
+
+
+@pytest.fixture
+def chain(monkeypatch):
+    """Runs what is asked of a chain whose stages `stale` are out of date."""
+
+    def ask(stale, overwrite=False):
+        monkeypatch.setattr(
+            plans, "files", lambda name, *_: tuple([Path(path) for path in paths] for paths in CHAIN[name])
+        )
+        monkeypatch.setattr(plans, "up_to_date", lambda name, *_: name not in stale)
+        runs = pending(Scene(Path("scene")), [(name, None) for name in CHAIN], overwrite)
+        return {name for name, run in zip(CHAIN, runs, strict=True) if run}
+
+    return ask
+
+
+def test_what_runs_is_what_is_out_of_date_and_all_that_reads_it(chain):
+    assert chain([]) == set()
+    assert chain(["propagate"]) == {"propagate"}
+    assert chain(["segment"]) == {"segment", "label", "propagate"}
+    assert chain(["map_photos"]) == {"map_photos", "depth", "label", "propagate"}
+    assert chain([], overwrite=True) == set(CHAIN)
+
+
+@pytest.fixture
+def stages(tmp_path):
+    scene = Scene(write_bare_scene(tmp_path / "scene"))
+    command = Run(tmp_path, scene.path, truth=scene.masks)
+    return list_stages(command, scene, Segment(refine=True))
+
+
+def test_every_stage_has_an_expected_time_that_grows_with_the_photos(stages):
+    assert {name for name, _ in stages} == set(EXPECTED)
+    for name, settings in stages:
+        few, many = (EXPECTED[name](settings, [(800, 600)] * count) for count in (10, 40))
+        assert few is not None and many is not None and 0 < few <= many
+        assert few < many or name in ("train", "report")
+
+
+def test_pairs_are_counted_and_pixels_as_the_stages_make_them_smaller():
+    assert num_pairs(24, "exhaustive") == len(list(combinations(range(24), 2)))
+    assert num_pairs(100, "sequential") == 1000 and num_pairs(3, "sequential") == 6
+    assert megapixels([(4000, 3000)] * 2) == 24
+    assert megapixels([(4000, 3000), (600, 800)], 800) == pytest.approx((800 * 600 + 600 * 800) / 1e6)
+
+
+def test_training_takes_as_long_as_its_steps_and_is_not_known_on_a_gpu():
+    sizes = [(1600, 900)] * 18
+    one, two = (EXPECTED["train"](Train(iterations=count), sizes) for count in (1000, 2000))
+    assert one is not None and two == pytest.approx(2 * one)
+    assert one == pytest.approx(0.42 * 1000 * 0.36)
+    assert EXPECTED["train"](Train(device="cuda"), sizes) is None
+    halved = EXPECTED["train"](Train(iterations=1000, downscale=4.0), sizes)
+    assert halved == pytest.approx(one / 4)
+
+
+def test_the_plan_names_what_runs_and_adds_up_only_that(stages):
+    runs = [name in ("map_photos", "depth") for name, _ in stages]
+    told = plan(stages, runs, [(1600, 900)] * 18)
+    assert told.startswith(f"plan: 2 of {len(stages)} stages to run, on 18 photos of 1600x900:")
+    assert told.count("up to date") == len(stages) - 2
+    # 18 x 1.44 MP at 1.7 s and 153 pairs at 0.05 s; 18 x 0.36 MP at 9 s: 51.7 s and 58.3 s
+    lines = [line.split(None, 1) for line in told.splitlines()[1:]]
+    assert ["map_photos", "about 55 s"] in lines and ["depth", "about 60 s"] in lines
+    assert "in all       about 2 min; rough" in told
+
+
+def test_what_was_never_measured_has_no_time(stages):
+    stages = [
+        (name, replace(settings, backend="strokes") if name == "segment" else settings)
+        for name, settings in stages
+    ]
+    told = plan(stages, [name == "segment" for name, _ in stages], [(1600, 900)] * 18)
+    assert told.count("not known how long") == 2 and "and what is not known" in told
+
+
+def test_results_are_those_that_are_there(tmp_path):
+    scene = Scene(write_bare_scene(tmp_path / "scene"))
+    scene.report.write_text("page")
+    told = results(scene)
+    assert str(scene.report) in told and str(scene.masks) in told and str(scene.labelled) not in told
