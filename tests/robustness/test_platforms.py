@@ -24,6 +24,7 @@ import importlib, os, pkgutil, shutil, signal, sys, types
 import cv2, laspy, numba, open3d, PIL.Image, pyproj, rasterio.features, rasterio.transform, shapely, sklearn.ensemble, scipy.ndimage, scipy.optimize, scipy.sparse, scipy.spatial, torch, tyro, tqdm
 for name in ("resource", "fcntl", "pwd", "grp", "termios"):
     sys.modules[name] = None
+sys.modules["msvcrt"] = types.ModuleType("msvcrt")
 for name in ("statvfs", "sysconf", "geteuid", "getuid", "fork", "mkfifo", "getloadavg", "sched_getaffinity"):
     delattr(os, name)
 del signal.SIGPIPE, signal.SIGKILL
