@@ -28,7 +28,7 @@ from sc3d.labelling.inputs import (
 from sc3d.labelling.normal_sides import judge_sides, sample_step, with_sides
 from sc3d.scene.frame_check import Box, box_of, describe
 from sc3d.scene.labelled_cloud import Votes, point_arrays, read_surface, usable_normals, with_labels
-from sc3d.scene.labels import STATE_NAMES, UNSEEN
+from sc3d.scene.labels import SEED, STATE_NAMES, UNLOCKED, UNSEEN, Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
 
@@ -38,13 +38,15 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class LabelSummary:
     """Of a labelled cloud. counts: (states,) int64 points in each state; voxel_size: of the label field,
-    world units; num_turned: given normals that were turned around
+    world units; num_turned: given normals that were turned around; num_none: points whose masks name none of
+    the classes
     """
 
     counts: np.ndarray
     voxel_size: float
     num_views: int
     num_turned: int = 0
+    num_none: int = 0
 
     def figures(self) -> dict[str, object]:
         """What the stage reports."""
@@ -57,17 +59,24 @@ class LabelSummary:
         size = round(self.voxel_size, 5)
         turned = {"normals_turned": self.num_turned} if self.num_turned else {}
         points = int(self.counts.sum())
-        return {"points": points, "views": self.num_views, "voxel_size": size, **turned, **states}
+        none = {"of_no_class": f"{self.num_none / points:.1%}"} if self.num_none else {}
+        return {"points": points, "views": self.num_views, "voxel_size": size, **turned, **states, **none}
 
 
 def summarize(
-    counts: np.ndarray, voxel_size: float, views: list[View], path: Path, box: Box, num_turned: int
+    counts: np.ndarray,
+    num_none: int,
+    voxel_size: float,
+    views: list[View],
+    path: Path,
+    box: Box,
+    num_turned: int,
 ) -> LabelSummary:
-    """The summary of a cloud; a warning with numbers if no point of it was seen.
+    """The summary of a cloud; a warning with numbers if no point of it was seen with a class.
 
-    box: around the cloud, world; num_turned: normals that were turned
+    num_none: points of none of the classes; box: around the cloud, world; num_turned: normals that were turned
     """
-    if not counts[np.arange(len(counts)) != UNSEEN].any():
+    if counts[np.arange(len(counts)) != UNSEEN].sum() == num_none:
         logger.warning(
             "no photo sees any of the %d points of %s with a label: the points are at %s, the %d cameras with masks at %s",
             counts.sum(),
@@ -76,7 +85,12 @@ def summarize(
             len(views),
             describe(box_of(np.array([view.center for view in views]))),
         )
-    return LabelSummary(counts, voxel_size, len(views), num_turned)
+    return LabelSummary(counts, voxel_size, len(views), num_turned, num_none)
+
+
+def none_of_classes(labels: Labels) -> int:
+    """How many points are known to be of none of the classes. labels: ids"""
+    return int((np.isin(labels.state, (SEED, UNLOCKED)) & (labels.label == 0)).sum())
 
 
 def label_scene(scene: Scene, settings: Label) -> LabelSummary:
@@ -108,7 +122,7 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     seeds = with_labels(given, normals, labels, Votes(fusion.votes, channels))
     write_geometry(settings.output or scene.seeds, seeds)
     counts = np.bincount(labels.state, minlength=len(STATE_NAMES))
-    return summarize(counts, settings.voxel_size, masks.views, path, box, num_turned)
+    return summarize(counts, none_of_classes(labels), settings.voxel_size, masks.views, path, box, num_turned)
 
 
 def _on_the_right_side(

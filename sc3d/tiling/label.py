@@ -28,7 +28,7 @@ from sc3d.labelling.inputs import (
     require_in_view,
     voxel_size_for,
 )
-from sc3d.labelling.label import LabelSummary, summarize
+from sc3d.labelling.label import LabelSummary, none_of_classes, summarize
 from sc3d.labelling.normal_sides import Sides, judge_sides, sample_step, with_sides
 from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import (
@@ -38,7 +38,7 @@ from sc3d.scene.labelled_cloud import (
     unit_normals,
     usable_normals,
 )
-from sc3d.scene.labels import STATE_NAMES
+from sc3d.scene.labels import STATE_NAMES, Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
 from sc3d.tiling.executor import Executor, open_executor
@@ -137,10 +137,10 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         executor.run("voting", partial(label_tile, job), store.tiles)
     header = file_header(settings.voxel_size, masks.channels.ids)
     write_field(job.results, store.tiles, header, scene.votes_of(settings.output))
-    counts = _write(output, cloud, job, masks.channels)
+    counts, num_none = _write(output, cloud, job, masks.channels)
     num_turned = sum(int(results.read(tile, "turned")[0]) for tile in store.tiles)
     folder.remove()
-    return summarize(counts, settings.voxel_size, masks.views, cloud.path, box, num_turned)
+    return summarize(counts, num_none, settings.voxel_size, masks.views, cloud.path, box, num_turned)
 
 
 def _ranges(
@@ -277,8 +277,8 @@ def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.nd
     return mine, grid.grid.attribute(grid.ATTRIBUTE).numpy()[grid.slots(mine)]
 
 
-def _write(path: Path, cloud: CloudFile, job: LabelJob, channels: Channels) -> np.ndarray:
-    """The cloud with the labels of its tiles; returns the number of points in each state."""
+def _write(path: Path, cloud: CloudFile, job: LabelJob, channels: Channels) -> tuple[np.ndarray, int]:
+    """The cloud with the labels of its tiles; returns the number of points in each state, and of no class."""
     added = [
         ("label", "u1"),
         ("confidence", "f4"),
@@ -293,7 +293,7 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, channels: Channels) -> n
         if name not in names and not name.startswith(VOTES)
     ]
     dtype = np.dtype([*kept, ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), *added])
-    counts = np.zeros(len(STATE_NAMES), np.int64)
+    counts, num_none = np.zeros(len(STATE_NAMES), np.int64), np.zeros(1, np.int64)
 
     def chunks():
         names, at_once = (
@@ -312,7 +312,8 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, channels: Channels) -> n
             for name in ("label", "confidence", "state", "num_views"):
                 result[name] = values[name]
             counts[:] += np.bincount(values["state"], minlength=len(STATE_NAMES))
+            num_none[:] += none_of_classes(Labels(*(values[name] for name in names[:4])))
             yield result
 
     write_records(path, chunks(), dtype, cloud.num_points, ["sc3d"])
-    return counts
+    return counts, int(num_none[0])

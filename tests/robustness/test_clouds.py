@@ -876,12 +876,13 @@ def test_a_cloud_that_no_photo_sees_is_refused_with_numbers(site, tmp_path, labe
         label_it(site, Label(cloud=path, voxel_size=0.5, surface="surfels"))
 
 
-def test_all_unseen_is_a_warning_with_numbers(site, tmp_path, caplog):
+@pytest.mark.parametrize("unlabelled, unseen", [("ignore", "100.0%"), ("evidence", "0.0%")])
+def test_all_unseen_is_a_warning_with_numbers(site, tmp_path, caplog, unlabelled, unseen):
     """In the photos, but where the masks have no label."""
     path = write_ply(tmp_path / "a.ply", (ground() - ORIGIN) * [0.05, 0.05, 1] + [4.3, 0, 0], {})
     with caplog.at_level(logging.WARNING):
-        _, figures = labelled(site, path, voxel_size=0.5)
-    assert figures["unseen"] == "100.0%"
+        _, figures = labelled(site, path, voxel_size=0.5, unlabelled=unlabelled)
+    assert figures["unseen"] == unseen and figures.get("of_no_class", "100.0%") == "100.0%"
     assert "no photo sees any of the 6400 points" in caplog.text and "the 5 cameras" in caplog.text
 
 

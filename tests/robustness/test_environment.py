@@ -562,7 +562,7 @@ def test_ids_with_gaps_cost_and_give_what_dense_ids_do(tmp_path, monkeypatch, in
         votes = read_votes(seeds)
         assert votes is not None and votes.channels.ids.tolist() == [0, 1, ids[3]]
         with np.load(scene.votes) as field:
-            assert field["value_000"].shape[-1] == 2 * 3
+            assert field["value_000"].shape[-1] == 2 * 4  # nothing seen, two classes, none of them
             assert ("class_ids" in field) == (ids[3] == 255)
             if ids[3] == 255:
                 assert field["class_ids"].tolist() == [0, 1, 255]

@@ -263,7 +263,7 @@ def _with_value(column: str, value: float) -> bytes:
         ("label", "nan"),
         ("confidence", 1.01),
         ("confidence", "nan"),
-        ("state", 5),
+        ("state", 6),
         ("num_views", -1),
         ("num_views", 1e12),
     ],

@@ -101,7 +101,8 @@ def figures(record: dict, name: str, scene: int = 0) -> dict:
 )
 def test_rows_equal_the_stages(folder, record, tmp_path, name, method, how):
     scene = folder / "seed0_noise1"
-    run_stage("label", scene, "--method", method, "--output", tmp_path / "seeds.ply")
+    seeds = tmp_path / "seeds.ply"
+    run_stage("label", scene, "--method", method, "--unlabelled", "ignore", "--output", seeds)
     run_stage(
         "propagate",
         scene,
