@@ -64,15 +64,15 @@ def trace_contours(ground: GroundGrid, interval: float, unit: float) -> list[Con
         raise InputError(
             f"--contour-interval {interval:g} gives {len(levels)} levels over {high - low:.0f}: choose a larger one"
         )
-    pieces = _segments(heights, levels, interval)
     found, short = [], 0
-    for level in levels:
-        merged = shapely.line_merge(shapely.multilinestrings(pieces[int(level)]))
+    for level, pieces in _segments(heights, levels, interval).items():
+        # a level that the ground only touches has none
+        merged = shapely.line_merge(shapely.multilinestrings(np.array(pieces).reshape(-1, 2, 2)))
         for line in shapely.get_parts(merged):
             if line.length * ground.grid.pixel < SHORT:
                 short += 1
                 continue
-            found.append(_contour(line, int(level), interval, ground, unit))
+            found.append(_contour(line, level, interval, ground, unit))
     if short:
         logger.info("contours: %d lines shorter than %g m left out", short, SHORT)
     return found

@@ -203,11 +203,12 @@ def test_one_stage_writes_all_of_them(tmp_path):
 
 
 @pytest.mark.parametrize("size", [(0.0, 0.0), (9.0, 0.0), (0.3, 0.3), (9.0, 9.0)])
-def test_tiny_and_level_clouds_have_terrain_too(tmp_path, size):
+@pytest.mark.parametrize("height", [3.25, 3.0])  # between contour lines, and at the height of one
+def test_tiny_and_level_clouds_have_terrain_too(tmp_path, size, height):
     places = np.random.default_rng(0).uniform(0, 1, (50, 2)) * size
-    scene = write_scene(tmp_path, labelled_cloud(np.c_[places, np.full(50, 3.25)], np.full(50, 3)))
+    scene = write_scene(tmp_path, labelled_cloud(np.c_[places, np.full(50, height)], np.full(50, 3)))
     figures = elevation.write(scene, replace(ALL, pixel_size=0.5))
     assert figures["contours"] == 0 and figures["ground_points_left_out"] == "0.0%"
-    for name, height in (("dtm.tif", 3.25), ("dsm.tif", 3.25), ("ndsm.tif", 0.0)):
+    for name, expected in (("dtm.tif", height), ("dsm.tif", height), ("ndsm.tif", 0.0)):
         values, _, _ = read(scene.export / name)
-        assert np.isfinite(values).any() and np.nanmax(np.abs(values - height)) < 1e-4
+        assert np.isfinite(values).any() and np.nanmax(np.abs(values - expected)) < 1e-4
