@@ -133,7 +133,7 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     seeds, counts = corrections.apply(seeds, positions)
     corrections.warn_of_missing(counts, path)
     if not (seeds.label > 0).any():  # none of the classes alone is no start
-        raise no_seeds(path)
+        raise no_seeds(path, corrections)
     colors = cloud.point.colors.numpy() if "colors" in cloud.point else None
     channels = Channels.of_classes(np.unique(seeds.label).tolist()) if votes is None else votes.channels
     seeds = seeds_in_channels(seeds, channels, path)
@@ -158,9 +158,10 @@ def seeds_in_channels(seeds: Labels, channels: Channels, origin: Path | str) -> 
     return replace(seeds, label=channels.with_none(label, np.isin(seeds.state, (SEED, UNLOCKED, CORRECTED))))
 
 
-def no_seeds(path: object) -> InputError:
-    """What to say of a cloud without a single label."""
+def no_seeds(path: object, corrections: Corrections) -> InputError:
+    """What to say of a cloud without a single label, once corrected."""
+    corrected = f", or take back what {corrections.origin} sets to none" if 0 in corrections.ids else ""
     return InputError(
         f"{path} has no labelled point to start from: check that masks and cloud belong together, or lower"
-        " --consensus in label"
+        f" --consensus in label{corrected}"
     )

@@ -84,7 +84,7 @@ def evaluate_scene(scene: Scene, settings: Evaluate) -> EvaluationSummary:
     """As `metrics.evaluate_scene`, tile by tile, here or on the workers that the settings ask for."""
     cloud, output = CloudFile.open(settings.labelled or scene.labelled), settings.output or scene.metrics
     labels, truth = read_labels(cloud), settings.truth or scene.truth
-    decisive = (scene.sparse, scene.mesh, truth, cloud.path, PhotoFrames(scene.images))
+    decisive = (scene.sparse, scene.classes, scene.mesh, truth, cloud.path, PhotoFrames(scene.images))
     folder = WorkFolder(output, "evaluate", decisive, settings)
     with open_executor(settings) as executor:
         surface = find_points(scene, settings, cloud, folder, executor)

@@ -114,7 +114,7 @@ def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
         views_to_agree(sum(summary.agreement for summary in summaries)),
     )
     if not offered[: len(job.channels.ids) - 1].any():
-        raise no_seeds(path)
+        raise no_seeds(path, job.corrections)
     if job.channels.none:
         job = replace(job, rates=NoneRates.from_counts(sum(summary.found for summary in summaries)))
     statistics = (

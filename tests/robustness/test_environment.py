@@ -30,11 +30,16 @@ from sc3d.io.clouds import read_cloud, write_geometry
 from sc3d.io.provenance import PhotoFrames, digest
 from sc3d.runner import execute, sidecar
 from sc3d.scene.channels import Channels
+from sc3d.scene.corrections import Balls, add_correction
 from sc3d.scene.labelled_cloud import read_votes, vote_channels
 from sc3d.scene.scene import Scene, SparseModel, require_views
 from sc3d.settings.labels import Evaluate, Label, Propagate, Segment
 from sc3d.settings.reconstruction import Import
+from sc3d.stages import evaluate as evaluate_stage
+from sc3d.stages import label as label_stage
+from sc3d.stages import propagate as propagate_stage
 from sc3d.stages.extract import _depth_range, _require_room
+from sc3d.tiling import evaluate as tiled_evaluate
 from sc3d.tiling import label as tiled_label
 from sc3d.tiling import propagate as tiled_propagate
 from sc3d.tiling.label_grid_file import write_field
@@ -195,6 +200,37 @@ def test_unfinished_tiles_go_with_the_content_of_their_inputs(tmp_path):
     cloud.write_bytes(b"2")
     os.utime(cloud, ns=(found.st_atime_ns, found.st_mtime_ns))
     assert WorkFolder(tmp_path / "seeds.ply", "label", [cloud], Label()).folder != made.folder
+
+
+@pytest.mark.parametrize(
+    ("stage", "tiled", "settings", "read_later"),
+    [
+        (label_stage, tiled_label, Label(), []),
+        (propagate_stage, tiled_propagate, Propagate(), []),
+        (evaluate_stage, tiled_evaluate, Evaluate(), ["masks"]),  # judged beside, when all tiles are done
+    ],
+)
+def test_unfinished_tiles_go_with_each_input_of_their_stage(
+    tmp_path, monkeypatch, stage, tiled, settings, read_later
+):
+    scene, found = builders.labelled_scene(tmp_path / "scene"), []
+    shutil.copyfile(scene.labelled, scene.seeds)
+    cloud = read_cloud(scene.seeds)
+    for name, kind in (("normals", np.float32), ("num_views", np.int32)):
+        cloud.point[name] = np.ones((len(cloud.point.positions), 3 if name == "normals" else 1), kind)
+    for file in (scene.seeds, scene.labelled):
+        write_geometry(file, cloud)
+    add_correction(scene, "grass", Balls(((builders.ORIGIN[None], 1.0),)))
+
+    def keep(output: Path, name: str, inputs: list, settings: object) -> None:
+        found.extend(inputs)
+        raise InterruptedError
+
+    monkeypatch.setattr(tiled, "WorkFolder", keep)
+    with pytest.raises(InterruptedError):
+        getattr(tiled, f"{stage.__name__.rpartition('.')[2]}_scene")(scene, settings)
+    later = {scene.path / name for name in read_later}
+    assert set(stage.inputs(scene, settings)) - later <= set(found)
 
 
 def turn(photo: Path) -> None:

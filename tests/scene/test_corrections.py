@@ -334,3 +334,11 @@ def test_corrections_that_touch_no_point_are_told(scene, caplog, monkeypatch, me
     stage.run(scene, Propagate(max_memory=memory))
     lines = [record.getMessage() for record in caplog.records if "touch no point" in record.getMessage()]
     assert len(lines) == 1 and lines[0].startswith("1 of 2 corrections in") and "road of 20" in lines[0]
+
+
+@pytest.mark.parametrize("memory", ["", "2G"])
+def test_none_everywhere_is_named_where_nothing_is_left_to_start_from(scene, monkeypatch, memory):
+    monkeypatch.setattr(tiled_propagate, "fits", lambda _, resources: resources.max_memory != "2G")
+    add_correction(scene, None, ball([0.0, 0.0, 0.0], 100.0))
+    with pytest.raises(InputError, match=r"no labelled point .* take back what .*corrections\.json sets"):
+        stage.run(scene, Propagate(max_memory=memory))
