@@ -205,21 +205,25 @@ def propagate_again(scene: Scene) -> None:
 
     Raises InputError with the reason if it fails.
     """
-    settings: dict[str, object] = {}
-    if sidecar(scene.labelled).exists():
-        record: Any = read_json(sidecar(scene.labelled))
-        known = record.get("settings", {}) if isinstance(record, dict) else {}
-        names = [field.name for field in fields(Propagate) if field.name not in ("seeds", "output")]
-        settings = {name: known[name] for name in names if isinstance(known.get(name), str | int | float)}
     code = (
         "from pathlib import Path\nfrom sc3d.cli import reporting_errors, start_logging\n"
         "from sc3d.runner import execute\nfrom sc3d.scene.scene import Scene\n"
-        "from sc3d.settings.labels import Propagate\nstart_logging()\n"
+        "from sc3d.view.web.correction_panel import made_with\nstart_logging()\n"
         f"scene = Scene(Path({str(scene.path.absolute())!r}))\n"
-        f"with reporting_errors():\n execute('propagate', scene, Propagate(**{settings!r}))"
+        "with reporting_errors():\n execute('propagate', scene, made_with(scene))"
     )
     ended = run_python(code, _DAY)
     if ended.returncode:
         raise InputError(
             ended.stderr.strip().splitlines()[-1:][0] if ended.stderr.strip() else "propagate failed"
         )
+
+
+def made_with(scene: Scene) -> Propagate:
+    """The settings of `labelled.ply`, as far as the record beside it has them."""
+    record: Any = read_json(sidecar(scene.labelled)) if sidecar(scene.labelled).exists() else {}
+    known = record.get("settings", {}) if isinstance(record, dict) else {}
+    names = [field.name for field in fields(Propagate) if field.name not in ("seeds", "output")]
+    settings = {name: known[name] for name in names if isinstance(known.get(name), str | int | float)}
+    seeds = known.get("seeds")
+    return Propagate(**settings, seeds=scene.path / seeds if isinstance(seeds, str) else None)

@@ -10,11 +10,13 @@ import pytest
 
 from sc3d.geometry.cameras import project
 from sc3d.io.clouds import read_cloud
-from sc3d.scene.corrections import Corrections, read_log
+from sc3d.runner import execute
+from sc3d.scene.corrections import Balls, Corrections, add_correction, read_log
 from sc3d.scene.labels import CORRECTED, UNSEEN
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
 from sc3d.stages import propagate
+from sc3d.view.web.correction_panel import made_with, propagate_again
 from tests.builders import CLASSES, ORIGIN, ground, inspector_of, labelled_scene
 from tests.view.web.test_page import Visit, browser, home_of, in_canvas, visit  # noqa: F401
 
@@ -147,3 +149,13 @@ def test_a_region_is_corrected_whole_and_two_tabs_keep_each_others(scene, browse
     with visit(browser, address) as again:
         again.page.get_by_text("corrections: 2").wait_for()
     assert len(read_log(scene.corrections)) == 2
+
+
+def test_labels_are_made_again_from_the_seeds_and_with_the_options_that_they_had(scene):
+    scene.seeds.rename(scene.path / "other.ply")
+    asked = Propagate(method="knn", color=False, num_neighbors=7, seeds=scene.path / "other.ply")
+    execute("propagate", scene, asked)
+    assert made_with(scene) == asked
+    add_correction(scene, "grass", Balls(((ORIGIN[None], 1.0),)))
+    propagate_again(scene)
+    assert (read_cloud(scene.labelled).point["state"].numpy() == CORRECTED).any()
