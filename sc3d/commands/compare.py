@@ -99,9 +99,10 @@ def _tell_noise(noise: Noise, min_height: float) -> None:
     logger.info("%s: shift of height %+.3f m, noise %.3f m", where, noise.shift, noise.spread)
     if abs(noise.shift) > 0.5 * min_height:
         logger.warning(
-            "after lies %+.2f m beside before in height: georeference both with the same control points, "
-            "or raise --min-height",
-            noise.shift,
+            "the later scene lies %.2f m %s than the earlier one: georeference both with the same control "
+            "points, or raise --min-height",
+            abs(noise.shift),
+            "higher" if noise.shift > 0 else "lower",
         )
     if 3 * noise.spread > min_height:
         logger.warning(

@@ -124,7 +124,7 @@ def test_a_shift_and_noise_are_told(tmp_path, caplog):
         ("noise", points + rng.normal(0, 0.4, points.shape) * [0, 0, 1]),
     ):
         compared(tmp_path / kind, (points, label), (moved, label))
-    assert "after lies +0.30 m beside before" in caplog.text and "raise --min-height" in caplog.text
+    assert "lies 0.30 m higher than the earlier one" in caplog.text and "raise --min-height" in caplog.text
 
 
 def test_order_of_dates_turns_the_sign(tmp_path):
