@@ -64,7 +64,8 @@ def _check(command: Compare, before: Scene, after: Scene) -> int:
     """EPSG code of the results, 0 = none; InputError for scenes or options that do not fit together, before
     any work.
     """
-    if min(command.min_height, command.min_area) <= 0 or command.pixel_size < 0:
+    sizes = (command.min_height, command.min_area, command.pixel_size)
+    if not (np.isfinite(sizes).all() and min(sizes[:2]) > 0 and command.pixel_size >= 0):
         raise InputError("--min-height and --min-area must be above 0, --pixel-size must not be negative")
     for scene in (before, after):
         scene.require(scene.classes, hint="copy the class table of the labels there")

@@ -154,6 +154,8 @@ def test_scenes_that_do_not_fit_are_refused(tmp_path):
         main(Compare(two, one))
     with pytest.raises(InputError, match="above 0"):
         main(Compare(one, two, min_area=0.0))
+    with pytest.raises(InputError, match="min-height"):
+        main(Compare(one, two, min_height=float("nan")))
 
 
 def test_classes_of_both_tables_are_the_same_by_name():
