@@ -64,7 +64,8 @@ def _check(command: Compare, before: Scene, after: Scene) -> int:
     """EPSG code of the results, 0 = none; InputError for scenes or options that do not fit together, before
     any work.
     """
-    if min(command.min_height, command.min_area) <= 0 or command.pixel_size < 0:
+    sizes = (command.min_height, command.min_area, command.pixel_size)
+    if not (np.isfinite(sizes).all() and min(sizes[:2]) > 0 and command.pixel_size >= 0):
         raise InputError("--min-height and --min-area must be above 0, --pixel-size must not be negative")
     for scene in (before, after):
         scene.require(scene.classes, hint="copy the class table of the labels there")
@@ -99,9 +100,10 @@ def _tell_noise(noise: Noise, min_height: float) -> None:
     logger.info("%s: shift of height %+.3f m, noise %.3f m", where, noise.shift, noise.spread)
     if abs(noise.shift) > 0.5 * min_height:
         logger.warning(
-            "after lies %+.2f m beside before in height: georeference both with the same control points, "
-            "or raise --min-height",
-            noise.shift,
+            "the later scene lies %.2f m %s than the earlier one: georeference both with the same control "
+            "points, or raise --min-height",
+            abs(noise.shift),
+            "higher" if noise.shift > 0 else "lower",
         )
     if 3 * noise.spread > min_height:
         logger.warning(

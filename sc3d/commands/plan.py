@@ -61,7 +61,7 @@ def _training(settings: Any, sizes: Sizes) -> float | None:
         width * height * (settings.size(side) / side) ** 2 / 1e6
         for (width, height), side in zip(sizes, longest, strict=True)
     ]
-    return 0.42 * settings.iterations * sum(pixels) / len(pixels)
+    return 0.42 * settings.for_photos(len(sizes)).iterations * sum(pixels) / len(pixels)
 
 
 def _segmenting(settings: Any, sizes: Sizes) -> float | None:

@@ -37,6 +37,7 @@ class Dates:
 
     @property
     def grid(self) -> Raster:
+        """That both dates share."""
         return self.before.grid
 
     @property
@@ -91,7 +92,10 @@ class Change:
 
 
 def joint_table(before: ClassTable, after: ClassTable) -> tuple[ClassTable, np.ndarray]:
-    """The classes of both tables, the same by name, and (256,) uint8 the joint id of each id after."""
+    """The classes of both tables, the same by name, and (256,) uint8 the joint id of each id of `after`.
+
+    Raises InputError for more than 255 classes.
+    """
     classes, ids = list(before), np.zeros(256, np.uint8)
     free = [number for number in range(1, 256) if number not in {entry.id for entry in before}]
     for entry in after:

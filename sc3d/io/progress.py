@@ -34,6 +34,7 @@ class Board:
         self._last, self._ended = 0.0, threading.Event()
 
     def add(self, task: Progress) -> None:
+        """Begin to tell of a task, inside of those that are there."""
         with self._lock:
             self._tasks.append(task)
             if len(self._tasks) > 1:
@@ -43,6 +44,7 @@ class Board:
             threading.Thread(target=self._watch, args=(self._ended,), daemon=True).start()
 
     def remove(self, task: Progress) -> None:
+        """The task has ended."""
         with self._lock:
             self._tasks.remove(task)
             if not self._tasks:

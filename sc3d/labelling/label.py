@@ -78,12 +78,13 @@ def summarize(
     """
     if counts[np.arange(len(counts)) != UNSEEN].sum() == num_none:
         logger.warning(
-            "no photo sees any of the %d points of %s with a label: the points are at %s, the %d cameras with masks at %s",
+            "no photo sees any of the %d points of %s with a label: the points are at %s, the %d cameras with masks at %s%s",
             counts.sum(),
             path,
             describe(box),
             len(views),
             describe(box_of(np.array([view.center for view in views]))),
+            f"; at {num_none} that are seen, masks name none of the classes" if num_none else "",
         )
     return LabelSummary(counts, voxel_size, len(views), num_turned, num_none)
 

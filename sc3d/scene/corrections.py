@@ -186,7 +186,7 @@ def _moves(found: tuple[Correction, ...], scene: Scene) -> tuple[Move | None, ..
     if worst > MAX_ERROR:
         logger.warning(
             "corrections were made with cameras that lie otherwise to one another now,"
-            " by %.1f%% of their distance: they may have slipped",
+            " by %.1f%% of their distance, so that they may have slipped: look at them in sc3d view --web",
             100 * worst,
         )
     return tuple(moves)

@@ -19,7 +19,7 @@ Reference = Mapping[str, np.ndarray]  # (3, 4) cam_from_world by the name of the
 
 
 def reference_of(views: Sequence[View]) -> dict[str, np.ndarray]:
-    """The first camera, and the one that is farthest from it."""
+    """The first camera by name, and the one that is farthest from it, with its pose; empty without views."""
     if not views:
         return {}
     first = min(views, key=lambda view: view.name)
@@ -31,6 +31,7 @@ def reference_of(views: Sequence[View]) -> dict[str, np.ndarray]:
 class Move:
     """From the present frame into that of a reference: x -> scale * rotation @ (x - now) + then.
 
+    rotation: (3, 3); now, then: (3,) center of the first camera in the present frame and in the reference's
     error: by how much the second camera misses its place then, as a share of the distance of the two
     """
 
@@ -41,7 +42,7 @@ class Move:
     error: float = 0.0
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) float64 points of the present frame."""
+        """Points (N, 3) float64 of the present frame in that of the reference."""
         return self.scale * (points - self.now) @ self.rotation.T + self.then
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from sc3d.errors import InputError
@@ -15,8 +15,8 @@ class TrainSettings:
     long one.
     """
 
-    iterations: int = 3000
-    """training steps, one photo each; 30 000 is the paper's, 1500 to 7000 suit a CPU"""
+    iterations: int = 0
+    """training steps, one photo each; 0 = 40 for each photo, at least 1000; 30 000 is the paper's"""
     max_gaussians: int = 200_000
     """never more Gaussians than this: bounds memory and time"""
     max_size: int = 800
@@ -95,19 +95,23 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         if (
-            self.iterations < 1
+            self.iterations < 0
             or self.max_gaussians < 1
             or self.max_size < 16
             or not 0 <= self.sh_degree <= 3
             or self.downscale < 0
         ):
             raise InputError(
-                "iterations and max_gaussians must be at least 1, max_size at least 16, sh_degree 0 to 3, downscale not negative"
+                "max_gaussians must be at least 1, max_size at least 16, sh_degree 0 to 3, iterations and downscale not negative"
             )
         if self.test_every < 0 or not 0 <= self.test_sector < 1:
             raise InputError(
                 f"test_every must not be negative, and test_sector a share of the photos from 0 to below 1, such as 0.2: they are {self.test_every} and {self.test_sector}"
             )
+
+    def for_photos(self, number: int) -> TrainSettings:
+        """With a number of iterations; number: of photos that are trained on."""
+        return self if self.iterations else replace(self, iterations=max(1000, 40 * number))
 
     def size(self, longest: int) -> int:
         """Longest side of the training image of a photo whose longest side is `longest`, px."""

@@ -156,7 +156,7 @@ def share_settings(
     So each photo is looked at as often as without blocks, and all cores together hold about `max_gaussians`.
     """
     num_views = len(data.held_out(settings).trained)
-    iterations = max(1, round(settings.iterations * len(views) / num_views))
+    iterations = max(1, round(settings.for_photos(num_views).iterations * len(views) / num_views))
     share = float(block.holds(data.points, border=True).mean())
     max_gaussians = max(1, round(settings.max_gaussians * share))
     own = replace(settings, iterations=iterations, max_gaussians=max_gaussians)

@@ -66,6 +66,7 @@ def train(
     Raises InputError for too few views or points and for images that do not fit their views.
     """
     trainer = Trainer(data, settings)
+    settings = trainer.settings
     if checkpoint is not None and checkpoint.is_file():
         trainer.resume(checkpoint)
     initial = trainer.iteration
@@ -88,8 +89,9 @@ class Trainer:
     """The state of a run. `step` is one iteration; `train` is the usual way in."""
 
     def __init__(self, data: TrainingData, settings: TrainSettings) -> None:
-        self.data, self.settings, self.device = data, settings, pick_device(settings.device)
-        self.train_views = data.held_out(settings).trained
+        self.data, self.train_views = data, data.held_out(settings).trained
+        settings = settings.for_photos(len(self.train_views))
+        self.settings, self.device = settings, pick_device(settings.device)
         self.generator = torch.Generator().manual_seed(settings.seed)
         used = data.subset(self.train_views, settings.seen_by)
         points, centers = np.asarray(used.points, np.float64), np.stack([view.center for view in used.views])

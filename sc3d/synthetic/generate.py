@@ -24,7 +24,7 @@ from sc3d.synthetic.cloud import find_tracks, truth_cloud
 from sc3d.synthetic.exif import geodetic, photo_exif
 from sc3d.synthetic.flight import fly
 from sc3d.synthetic.masks import noisy_mask
-from sc3d.synthetic.mesh import OTHER
+from sc3d.synthetic.mesh import NO_CLASS
 from sc3d.synthetic.photos import Photo, photograph
 from sc3d.synthetic.shading import display
 from sc3d.synthetic.street import build_street
@@ -71,8 +71,8 @@ def synthesize(
         mask, confidence = noisy_mask(
             photo.label, settings.mask_noise, np.random.default_rng([settings.seed, 4, number])
         )
-        right += int(((mask == photo.label) & (photo.label != OTHER)).sum())
-        labelled += int((photo.label != OTHER).sum())
+        right += int(((mask == photo.label) & (photo.label != NO_CLASS)).sum())
+        labelled += int((photo.label != NO_CLASS).sum())
         exif = photo_exif(number, positions[number] if settings.gps else None)
         _write_view(scene_path, Path(view.name), photo, (mask, confidence), exif)
         if world.street:

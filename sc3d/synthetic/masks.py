@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sc3d.scene import class_table
-from sc3d.synthetic.mesh import BUILDING, GRASS, OTHER, ROAD, TREE
+from sc3d.synthetic.mesh import BUILDING, GRASS, NO_CLASS, ROAD, TREE
 
 NUM_LABELS = 5
 MISSED, CONFUSED = 0.05, 0.12  # shares of segments at strength 1
@@ -47,7 +47,7 @@ def noisy_mask(label: np.ndarray, strength: float, rng: np.random.Generator) -> 
     shift = BLEED * strength * scale * field
     segments, whole = _warp(segments, shift), _warp(whole, shift)
     table = np.tile(np.arange(NUM_LABELS, dtype=np.uint8), (num_segments, 1))
-    table[missed] = OTHER
+    table[missed] = NO_CLASS
     for source, targets in CONFUSIONS.items():
         (first, share), (second, _) = targets
         table[confused, source] = np.where(choice[confused] < share, first, second)
@@ -58,7 +58,7 @@ def noisy_mask(label: np.ndarray, strength: float, rng: np.random.Generator) -> 
 
 def without_other(truth: np.ndarray) -> np.ndarray:
     """uint8 class of each pixel of a truth mask, 0 = none: what `noisy_mask` starts from."""
-    return np.where(truth == class_table.OTHER, OTHER, truth).astype(np.uint8)
+    return np.where(truth == class_table.OTHER, NO_CLASS, truth).astype(np.uint8)
 
 
 def _displacement(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
@@ -86,7 +86,7 @@ def _segments(label: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, 
     cells = np.kron(cells, np.ones((4, 4), np.int32))[:height, :width]
     whole = _fill_gaps(label, width / 800)
     # each class of a cell errs by itself
-    segments = cells * NUM_LABELS + np.where(whole == OTHER, GRASS, whole)
+    segments = cells * NUM_LABELS + np.where(whole == NO_CLASS, GRASS, whole)
     closed = cv2.morphologyEx(
         (whole == BUILDING).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)
     )
@@ -104,9 +104,9 @@ def _fill_gaps(label: np.ndarray, scale: float) -> np.ndarray:
     crowns = cv2.morphologyEx((label == TREE).astype(np.uint8), cv2.MORPH_CLOSE, ellipse)
     whole[(crowns > 0) & (label != BUILDING)] = TREE
     small = _small_objects(label, 3500 * scale**2)
-    if small.any() and (whole != OTHER).any():
+    if small.any() and (whole != NO_CLASS).any():
         nearest, ids = cv2.distanceTransformWithLabels(
-            (small | (whole == OTHER)).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+            (small | (whole == NO_CLASS)).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
         )
         seeds = np.zeros(ids.max() + 1, np.uint8)
         known = nearest == 0
@@ -117,7 +117,7 @@ def _fill_gaps(label: np.ndarray, scale: float) -> np.ndarray:
 
 def _small_objects(label: np.ndarray, max_area: float) -> np.ndarray:
     """(H, W) bool: pixels of unlabelled components below `max_area` px, such as cars."""
-    _, components, stats, _ = cv2.connectedComponentsWithStats((label == OTHER).astype(np.uint8))
+    _, components, stats, _ = cv2.connectedComponentsWithStats((label == NO_CLASS).astype(np.uint8))
     small = stats[:, cv2.CC_STAT_AREA] < max_area
     small[0] = False
     return small[components]
@@ -147,4 +147,4 @@ def _confidence(
         + 0.02 * grain
     )
     value = 1.0 - min(strength, 1.0) * (1.0 - np.clip(value, 0.05, 1.0))
-    return np.where(mask == OTHER, 0, np.round(255 * value)).astype(np.uint8)
+    return np.where(mask == NO_CLASS, 0, np.round(255 * value)).astype(np.uint8)

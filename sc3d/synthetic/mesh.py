@@ -7,7 +7,7 @@ import numpy as np
 GROUND, WALL, TILES, FLAT_ROOF, LEAF, BARK, PAINT, GLASS, PLAIN, BRICK = range(10)  # materials
 # of facades that are seen from near
 PLASTER, MASONRY, ASHLAR, PANE, WOOD = range(10, 15)
-OTHER, BUILDING, TREE, ROAD, GRASS = range(5)  # labels
+NO_CLASS, BUILDING, TREE, ROAD, GRASS = range(5)  # labels
 
 # columns of the per-triangle float table
 # texture frame (origin, u axis, v axis), normal, tint, size of the textured face

@@ -11,7 +11,7 @@ from sc3d.synthetic.mesh import (
     BUILDING,
     FLAT_ROOF,
     GLASS,
-    OTHER,
+    NO_CLASS,
     PAINT,
     PLAIN,
     TILES,
@@ -180,7 +180,7 @@ def add_car(builder: MeshBuilder, position: np.ndarray, yaw: float, rng: np.rand
     """A car at `position` (3,) on the ground: wheels, body, tapered cabin with a painted roof."""
     object_id = builder.new_object()
     pose = upright_pose(position, yaw)
-    paint, glass = (PAINT, OTHER, object_id), (GLASS, OTHER, object_id)
+    paint, glass = (PAINT, NO_CLASS, object_id), (GLASS, NO_CLASS, object_id)
     tint = linear(CAR_TINTS[rng.integers(len(CAR_TINTS))])
     length, width = rng.uniform(2.0, 2.35), rng.uniform(0.85, 0.95)
     for x in (-0.62 * length, 0.62 * length):
@@ -203,4 +203,4 @@ def add_fence(builder: MeshBuilder, ends: np.ndarray, tint: np.ndarray) -> None:
         yaw = np.arctan2(end[1] - start[1], end[0] - start[0])
         pose = upright_pose(np.minimum(start, [np.inf, np.inf, end[2]]), yaw)
         length = np.linalg.norm((end - start)[:2])
-        builder.box(pose, (0, -0.1, -0.5), (length + 0.1, 0.1, 0.9), (PLAIN, OTHER, object_id), tint)
+        builder.box(pose, (0, -0.1, -0.5), (length + 0.1, 0.1, 0.9), (PLAIN, NO_CLASS, object_id), tint)

@@ -13,7 +13,7 @@ from sc3d.synthetic.mesh import (
     GLASS,
     GROUND,
     LEAF,
-    OTHER,
+    NO_CLASS,
     PLAIN,
     PLASTER,
     ROAD,
@@ -132,7 +132,7 @@ def truth_labels(labels: np.ndarray, points: np.ndarray, triangles: np.ndarray, 
     and for what is no class on the site (half side `site`, m); 0, not judged, is left outside of the site.
     """
     outside = (triangles >= 0) & (np.abs(points[:, :2]).max(axis=1) > site)
-    return np.where((labels == OTHER) & ~outside, class_table.OTHER, labels).astype(np.uint8)
+    return np.where((labels == NO_CLASS) & ~outside, class_table.OTHER, labels).astype(np.uint8)
 
 
 @njit(cache=True, parallel=True)
@@ -155,7 +155,7 @@ def surface_labels(
             continue
         x, y = points[n, 0], points[n, 1]
         if max(abs(x), abs(y)) > site:
-            out[n] = OTHER
+            out[n] = NO_CLASS
         elif ints[t, 0] == GROUND and ground_kind(x, y, half, rasters, rects)[0] != LAWN:
             out[n] = ROAD
         else:

@@ -8,7 +8,7 @@ from sc3d.geometry.cameras import View
 from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.facades import add_block, add_town_house
 from sc3d.synthetic.ground import DRIVEWAY, HALF_PAVED, HALF_ROAD, Ground, add_ground, plan_street
-from sc3d.synthetic.mesh import GLASS, OTHER, PAINT, PLAIN, ROAD, MeshBuilder, linear, placed, upright_pose
+from sc3d.synthetic.mesh import GLASS, NO_CLASS, PAINT, PLAIN, ROAD, MeshBuilder, linear, placed, upright_pose
 from sc3d.synthetic.objects import CAR_TINTS, GABLE, Building, add_fence
 from sc3d.synthetic.plants import add_bough, add_bush, add_tree
 from sc3d.synthetic.walk import walk
@@ -159,7 +159,7 @@ def _add_car(builder: MeshBuilder, position: np.ndarray, yaw: float, rng: np.ran
     """A car with a rounded profile, wheels, windows and lights, at `position` (3,) on the ground."""
     object_id = builder.new_object()
     pose = upright_pose(position, yaw)
-    paint, glass = (PAINT, OTHER, object_id), (GLASS, OTHER, object_id)
+    paint, glass = (PAINT, NO_CLASS, object_id), (GLASS, NO_CLASS, object_id)
     tint = linear(CAR_TINTS[rng.integers(len(CAR_TINTS))])
     length, width, roof = rng.uniform(1.95, 2.25), rng.uniform(0.84, 0.9), rng.uniform(1.42, 1.56)
     outline = np.array(PROFILE) * [length, 1.0]
@@ -188,7 +188,7 @@ def _add_car(builder: MeshBuilder, position: np.ndarray, yaw: float, rng: np.ran
             )
     for x in (-length, length):
         plate = (x - 0.03, -0.26, 0.38), (x + 0.03, 0.26, 0.5)
-        add_block(builder, pose, *plate, (PLAIN, OTHER, object_id), linear((220, 220, 200)))
+        add_block(builder, pose, *plate, (PLAIN, NO_CLASS, object_id), linear((220, 220, 200)))
 
 
 def _add_wheels(builder: MeshBuilder, pose: np.ndarray, size: tuple[float, float], object_id: int) -> None:
@@ -198,7 +198,7 @@ def _add_wheels(builder: MeshBuilder, pose: np.ndarray, size: tuple[float, float
     for x in (-0.6 * length, 0.63 * length):
         for radius, beyond, tint in ((0.33, 0.02, 0.012), (0.2, 0.03, 0.35)):
             outline = [x, 0.33] + radius * circle[::-1]
-            _extrude(builder, pose, outline, width + beyond, (PAINT, OTHER, object_id), np.full(3, tint))
+            _extrude(builder, pose, outline, width + beyond, (PAINT, NO_CLASS, object_id), np.full(3, tint))
 
 
 def _extrude(
@@ -228,7 +228,7 @@ def _add_lamps(builder: MeshBuilder, ground: Ground, rng: np.random.Generator) -
         pose = upright_pose(
             _on_ground(ground, x + rng.uniform(-1, 1), side * 4.75), 0.0 if side < 0 else np.pi
         )
-        kind = (PLAIN, OTHER, object_id)
+        kind = (PLAIN, NO_CLASS, object_id)
         add_block(builder, pose, (-0.09, -0.09, -0.3), (0.09, 0.09, 0.9), kind, steel)
         add_block(builder, pose, (-0.05, -0.05, 0.9), (0.05, 0.05, 4.6), kind, steel)
         add_block(builder, pose, (-0.04, -0.05, 4.5), (0.04, 1.1, 4.58), kind, steel)

@@ -124,7 +124,7 @@ def test_a_shift_and_noise_are_told(tmp_path, caplog):
         ("noise", points + rng.normal(0, 0.4, points.shape) * [0, 0, 1]),
     ):
         compared(tmp_path / kind, (points, label), (moved, label))
-    assert "after lies +0.30 m beside before" in caplog.text and "raise --min-height" in caplog.text
+    assert "lies 0.30 m higher than the earlier one" in caplog.text and "raise --min-height" in caplog.text
 
 
 def test_order_of_dates_turns_the_sign(tmp_path):
@@ -154,6 +154,8 @@ def test_scenes_that_do_not_fit_are_refused(tmp_path):
         main(Compare(two, one))
     with pytest.raises(InputError, match="above 0"):
         main(Compare(one, two, min_area=0.0))
+    with pytest.raises(InputError, match="min-height"):
+        main(Compare(one, two, min_height=float("nan")))
 
 
 def test_classes_of_both_tables_are_the_same_by_name():

@@ -295,3 +295,11 @@ def known_pixels(data, settings, index):
 def test_hold_outs_that_say_nothing_are_refused(wrong):
     with pytest.raises(InputError, match="test_sector"):
         TrainSettings(**wrong)
+
+
+def test_the_number_of_steps_follows_that_of_the_photos():
+    assert TrainSettings().for_photos(18).iterations == 1000
+    assert TrainSettings().for_photos(100).iterations == 4000
+    assert TrainSettings(iterations=7).for_photos(100).iterations == 7
+    with pytest.raises(InputError, match="iterations"):
+        TrainSettings(iterations=-1)

@@ -16,7 +16,7 @@ from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.facades import RECESS, Opening, _add_opening, _add_wall, choose_style
 from sc3d.synthetic.generate import synthesize
 from sc3d.synthetic.ground import HALF_PAVED, plan_street
-from sc3d.synthetic.mesh import BUILDING, GRASS, OTHER, PLASTER, ROAD, TREE, MeshBuilder
+from sc3d.synthetic.mesh import BUILDING, GRASS, NO_CLASS, PLASTER, ROAD, TREE, MeshBuilder
 from sc3d.synthetic.photos import photograph
 from sc3d.synthetic.street import FRONT, build_street
 from sc3d.synthetic.walk import REACH, walk
@@ -94,7 +94,7 @@ def test_every_class_cars_sky_and_the_ground_at_the_feet_are_in_sight(street, ph
     assert (counts[[BUILDING, TREE, ROAD, GRASS]] > 0.1).all()
     depth = np.stack([photo.depth for photo in photos])
     label = np.stack([photo.label for photo in photos])
-    assert (depth == 0).mean() > 0.02 and (label[depth == 0] == OTHER).all()
+    assert (depth == 0).mean() > 0.02 and (label[depth == 0] == NO_CLASS).all()
     truth = np.stack([photo.truth for photo in photos])
     assert (truth[depth == 0] == class_table.OTHER).all() and (truth[depth > 0] == class_table.OTHER).any()
     on_ground = np.isin(label[:6], (ROAD, GRASS))

@@ -25,7 +25,7 @@ from sc3d.synthetic.flight import fly
 from sc3d.synthetic.generate import synthesize
 from sc3d.synthetic.ground import rect_distance
 from sc3d.synthetic.masks import noisy_mask
-from sc3d.synthetic.mesh import BUILDING, GRASS, OTHER, ROAD, TREE
+from sc3d.synthetic.mesh import BUILDING, GRASS, NO_CLASS, ROAD, TREE
 from sc3d.synthetic.objects import FLAT
 from sc3d.synthetic.photos import photograph
 from sc3d.synthetic.world import build_world
@@ -75,7 +75,7 @@ def test_the_flight_has_the_views_asked_for_and_several_angles(views):
 def test_every_class_is_in_sight(photos):
     counts = np.bincount(np.concatenate([photo.label.ravel() for photo in photos]), minlength=5)
     assert len(counts) == 5
-    assert (counts[[BUILDING, TREE, ROAD, GRASS]] > 0.03 * counts.sum()).all() and counts[OTHER] > 0
+    assert (counts[[BUILDING, TREE, ROAD, GRASS]] > 0.03 * counts.sum()).all() and counts[NO_CLASS] > 0
 
 
 @pytest.mark.parametrize("pair", [(0, 1), (1, 7), (6, 8)])
@@ -120,7 +120,7 @@ def test_road_labels_follow_the_center_lines(world, views, photos):
 def test_truth_ends_at_the_border_of_the_site(views, photos):
     for view, photo in zip(views, photos):
         outside = np.abs(surface_points(view, photo.depth)[:, :2]).max(1) > SETTINGS.extent / 2 + 0.01
-        assert (photo.label.ravel()[outside] == OTHER).all()
+        assert (photo.label.ravel()[outside] == NO_CLASS).all()
 
 
 def test_other_is_what_stands_on_the_site_and_is_no_class(world, views, photos):
@@ -135,7 +135,7 @@ def test_other_is_what_stands_on_the_site_and_is_no_class(world, views, photos):
         assert ((truth == 0) == outside)[~at_border].all()
     cars = np.concatenate([photo.truth[photo.depth > 0] for photo in photos]) == class_table.OTHER
     assert 0.001 < cars.mean() < 0.1
-    objects = world.ints[:, 1] == OTHER  # cars and garden walls
+    objects = world.ints[:, 1] == NO_CLASS  # cars and garden walls
     middles = world.corners.mean(axis=1)
     inside = np.abs(middles[:, :2]).max(axis=1) < SETTINGS.extent / 2
     told = world.truth(middles[objects], np.flatnonzero(objects))
@@ -173,7 +173,7 @@ def test_mask_noise_is_tuned_and_grows_with_strength(photos):
     accuracy = [
         [
             (noisy_mask(photo.label, strength, np.random.default_rng([1, i]))[0] == photo.label)[
-                photo.label != OTHER
+                photo.label != NO_CLASS
             ].mean()
             for i, photo in enumerate(photos)
         ]

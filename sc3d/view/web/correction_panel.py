@@ -103,6 +103,8 @@ class CorrectionPanel:
         if found is None:
             raise InputError("there is no point: click on one")
         if self._tool.value == BRUSH:
+            if self._radius.value <= 0:
+                raise InputError("the brush needs a radius above 0")
             self._add(Balls(((self._world[shown[found]][None], float(self._radius.value)),)))
         else:
             self._add_region(int(shown[found]))
@@ -214,9 +216,7 @@ def propagate_again(scene: Scene) -> None:
     )
     ended = run_python(code, _DAY)
     if ended.returncode:
-        raise InputError(
-            ended.stderr.strip().splitlines()[-1:][0] if ended.stderr.strip() else "propagate failed"
-        )
+        raise InputError((ended.stderr.strip() or "propagate failed").splitlines()[-1])
 
 
 def made_with(scene: Scene) -> Propagate:
