@@ -14,6 +14,7 @@ from sc3d.io.atomic import atomic_path
 from sc3d.io.images import read_orientation, write_image
 from sc3d.io.progress import progress
 from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
+from sc3d.scene.labels import CORRECTED, PROPAGATED, SEED, UNLOCKED
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
 from sc3d.view.contact_sheet import side_by_side
@@ -34,13 +35,14 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
     views = scene.model.views
     surface = LabelledSurface.build(cloud, views, scene.mesh)
+    none = (labels.label == 0) & np.isin(labels.state, (SEED, PROPAGATED, UNLOCKED, CORRECTED))
     covered = []
     masks, confidences, sheet = outputs(scene, settings)
     with atomic_path(masks) as mask_folder, atomic_path(confidences) as confidence_folder:
         mask_folder.mkdir()
         confidence_folder.mkdir()
         for view in progress(views, "rendering masks", "photo"):
-            mask, confidence = render_mask(surface, labels.confidence, view, settings.max_size)
+            mask, confidence = render_mask(surface, labels.confidence, view, settings.max_size, none)
             orientation = read_orientation(scene.photo(view.name))
             write_image(scene.photo_names.path(mask_folder, view.name), mask, orientation)
             write_image(scene.photo_names.path(confidence_folder, view.name), confidence, orientation)
@@ -79,15 +81,22 @@ def _comparison(scene: Scene, views: list[View]) -> np.ndarray:
 
 
 def render_mask(
-    surface: LabelledSurface, confidence: np.ndarray, view: View, max_size: int = 0
+    surface: LabelledSurface,
+    confidence: np.ndarray,
+    view: View,
+    max_size: int = 0,
+    none: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Labels and confidence of one photo.
 
     confidence: (N,) float32 of the cloud's points, 0 to 1; max_size: longest side, px, 0 = the photo's
-    returns: (H, W) uint8 ids, 0 = no label; (H, W) uint8, 255 = sure, at least 1 where there is a label
+    none: (N,) bool points known to be of none of the classes
+    returns: (H, W) uint8 ids, 0 = no label; (H, W) uint8, 255 = sure, at least 1 where there is a label or
+        none is known, else 0: nothing is known there
     """
     scale = min(1.0, max_size / max(view.width, view.height)) if max_size else 1.0
     rows, _ = surface.rows(view, (max(1, round(view.width * scale)), max(1, round(view.height * scale))))
     mask = np.where(rows >= 0, surface.label[rows], 0).astype(np.uint8)
     sure = np.clip(np.rint(confidence[rows] * 255), 1, 255)
-    return mask, np.where(mask > 0, sure, 0).astype(np.uint8)
+    known = mask > 0 if none is None else (mask > 0) | ((rows >= 0) & none[rows])
+    return mask, np.where(known, sure, 0).astype(np.uint8)
