@@ -14,7 +14,6 @@ from sc3d.io.atomic import atomic_path
 from sc3d.io.images import read_orientation, write_image
 from sc3d.io.progress import progress
 from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
-from sc3d.scene.labels import CORRECTED, PROPAGATED, SEED, UNLOCKED
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
 from sc3d.view.contact_sheet import side_by_side
@@ -35,14 +34,15 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
     views = scene.model.views
     surface = LabelledSurface.build(cloud, views, scene.mesh)
-    none = (labels.label == 0) & np.isin(labels.state, (SEED, PROPAGATED, UNLOCKED, CORRECTED))
     covered = []
     masks, confidences, sheet = outputs(scene, settings)
     with atomic_path(masks) as mask_folder, atomic_path(confidences) as confidence_folder:
         mask_folder.mkdir()
         confidence_folder.mkdir()
         for view in progress(views, "rendering masks", "photo"):
-            mask, confidence = render_mask(surface, labels.confidence, view, settings.max_size, none)
+            mask, confidence = render_mask(
+                surface, labels.confidence, view, settings.max_size, labels.of_no_class
+            )
             orientation = read_orientation(scene.photo(view.name))
             write_image(scene.photo_names.path(mask_folder, view.name), mask, orientation)
             write_image(scene.photo_names.path(confidence_folder, view.name), confidence, orientation)

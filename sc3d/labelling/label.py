@@ -28,7 +28,7 @@ from sc3d.labelling.inputs import (
 from sc3d.labelling.normal_sides import judge_sides, sample_step, with_sides
 from sc3d.scene.frame_check import Box, box_of, describe
 from sc3d.scene.labelled_cloud import Votes, point_arrays, read_surface, usable_normals, with_labels
-from sc3d.scene.labels import SEED, STATE_NAMES, UNLOCKED, UNSEEN, Labels
+from sc3d.scene.labels import STATE_NAMES, UNSEEN
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
 
@@ -89,11 +89,6 @@ def summarize(
     return LabelSummary(counts, voxel_size, len(views), num_turned, num_none)
 
 
-def none_of_classes(labels: Labels) -> int:
-    """How many points are known to be of none of the classes. labels: ids"""
-    return int((np.isin(labels.state, (SEED, UNLOCKED)) & (labels.label == 0)).sum())
-
-
 def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     """Fuse the masks of a scene on its cloud (or `settings.cloud`) and write seeds and votes."""
     settings = settings.resolved
@@ -123,7 +118,8 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     seeds = with_labels(given, normals, labels, Votes(fusion.votes, channels))
     write_geometry(settings.output or scene.seeds, seeds)
     counts = np.bincount(labels.state, minlength=len(STATE_NAMES))
-    return summarize(counts, none_of_classes(labels), settings.voxel_size, masks.views, path, box, num_turned)
+    num_none = int(labels.of_no_class.sum())
+    return summarize(counts, num_none, settings.voxel_size, masks.views, path, box, num_turned)
 
 
 def _on_the_right_side(

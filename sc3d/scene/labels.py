@@ -26,6 +26,13 @@ class Labels:
             *(function(values) for values in (self.label, self.confidence, self.state, self.num_views))
         )
 
+    @property
+    def of_no_class(self) -> np.ndarray:
+        """(N,) bool points known to be of none of the classes; of others with label 0 nothing is known. Labels
+        are ids.
+        """
+        return (self.label == 0) & np.isin(self.state, (SEED, PROPAGATED, UNLOCKED, CORRECTED))
+
     def __getitem__(self, rows: np.ndarray) -> Labels:
         """Labels of some points, or of all in another order."""
         return self.map(lambda values: values[rows])

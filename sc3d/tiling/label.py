@@ -28,7 +28,7 @@ from sc3d.labelling.inputs import (
     require_in_view,
     voxel_size_for,
 )
-from sc3d.labelling.label import LabelSummary, none_of_classes, summarize
+from sc3d.labelling.label import LabelSummary, summarize
 from sc3d.labelling.normal_sides import Sides, judge_sides, sample_step, with_sides
 from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import (
@@ -312,7 +312,7 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, channels: Channels) -> t
             for name in ("label", "confidence", "state", "num_views"):
                 result[name] = values[name]
             counts[:] += np.bincount(values["state"], minlength=len(STATE_NAMES))
-            num_none[:] += none_of_classes(Labels(*(values[name] for name in names[:4])))
+            num_none[:] += Labels(*(values[name] for name in names[:4])).of_no_class.sum()
             yield result
 
     write_records(path, chunks(), dtype, cloud.num_points, ["sc3d"])

@@ -60,11 +60,16 @@ def middles(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return vertices[triangles].mean(axis=1)
 
 
-def test_views_that_see_a_point_are_counted(store):
+def points_on_site() -> tuple[np.ndarray, np.ndarray, Surface]:
+    """The middles of the triangles, their normals, and the surface."""
     vertices, triangles = site()
     points = middles(vertices, triangles)
     up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    surface = Surface.from_mesh(vertices, triangles, np.zeros(3))
+    return points, up, Surface.from_mesh(vertices, triangles, np.zeros(3))
+
+
+def test_views_that_see_a_point_are_counted(store):
+    points, up, surface = points_on_site()
     counts = count_views(data(), store, surface, points, up, 0.1)
     found = [seen_by_hand(view, points) for view in data().views]
     clear = np.all([clear for _, clear in found], axis=0)
@@ -75,10 +80,7 @@ def test_views_that_see_a_point_are_counted(store):
 
 
 def test_pixels_of_sky_and_transparent_ones_see_nothing(store):
-    vertices, triangles = site()
-    points = middles(vertices, triangles)
-    up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    surface = Surface.from_mesh(vertices, triangles, np.zeros(3))
+    points, up, surface = points_on_site()
     whole = count_views(data(), store, surface, points, up, 0.1)
     store.save(2, "sky", np.ones((120, 160), bool))
     clear = replace(data(), opaque=lambda row: np.full((120, 160), row != 4) if row > 2 else None)
