@@ -106,7 +106,7 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         settings = replace(settings, voxel_size=default_voxel_size(points, masks))
     surface, density = None, None
     if settings.depth_filter:
-        surface = read_surface(scene.mesh, points, normals, local_origin(masks.views), settings.surface)
+        surface = read_surface(scene.surface, points, normals, local_origin(masks.views), settings.surface)
     if settings.mechanisms.density:
         density = point_density(scene, points, settings.voxel_size)
     channels = masks.channels

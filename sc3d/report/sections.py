@@ -217,7 +217,7 @@ def photo_section(data: ReportData) -> str:
     chosen, rows = _choose_views(data), []
     labelled = None
     if chosen and data.label_counts is not None:
-        labelled = LabelledSurface.build(data.cloud, data.views, data.scene.mesh)
+        labelled = LabelledSurface.build(data.cloud, data.views, data.scene.surface)
     for view in chosen:
         panels = comparison(data, view, labelled)
         if len(panels) > 1:

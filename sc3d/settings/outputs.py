@@ -46,6 +46,10 @@ class Export:
     """Names of the classes to write; all otherwise (laz, clouds, splats, spz)."""
     labelled: Path | None = None
     """Labelled cloud; SCENE/labelled.ply otherwise."""
+    unconfirmed: bool = False
+    """Write points too that one photo only shows (`extract --fill`); in LAZ they are flagged synthetic (laz,
+    clouds, maps, objects).
+    """
     max_size: int = 0
     """Longest side of the masks, px; 0 = as the photo (masks)."""
     epsg: int = 0
@@ -109,6 +113,8 @@ class ViewCommand:
     """Names of the classes to show; all otherwise."""
     file: Path | None = None
     """Cloud or mesh to show; the labelled cloud, or else cloud.ply, otherwise."""
+    unconfirmed: bool = False
+    """Show points too that one photo only shows (`extract --fill`); --file shows all that it holds."""
     photo: str | None = None
     """Look through the camera of this photo; its suffix and folders may be missing where that is clear."""
     splats: bool = False

@@ -113,7 +113,7 @@ class Extract:
     """Fuse depth into a truncated signed distance field: that which the Gaussians render, or that of `sc3d
     depth`, which needs no training. Or take the Gaussians' centers as the cloud.
     """
-    depth_mode: DepthMode = "blended"
+    depth_mode: DepthMode = "median"
     """Depth that the Gaussians render: of the alpha-blended planes, or where half of the light is gone
     (median): it does not mix surfaces that lie behind one another; any trained model will do (tsdf).
     """

@@ -21,7 +21,7 @@ def inputs(scene: Scene, settings: Label) -> list[Input]:
     cloud = [settings.cloud, georeference_path(scene)] if settings.cloud else [scene.cloud]
     frames = PhotoFrames(scene.images)
     confidence = best_confidence(scene)
-    return [scene.sparse, scene.classes, scene.masks, confidence, scene.mesh, *cloud, *splats, frames]
+    return [scene.sparse, scene.classes, scene.masks, confidence, *scene.surface, *cloud, *splats, frames]
 
 
 def outputs(scene: Scene, settings: Label) -> list[Path]:

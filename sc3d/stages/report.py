@@ -19,7 +19,7 @@ def inputs(scene: Scene, settings: Report) -> list[Path]:
         scene.sparse,
         scene.masks,
         scene.classes,
-        scene.mesh,
+        *scene.surface,
         scene.images,
         evaluated_truth(scene),
         scene.path / "train.jpg",

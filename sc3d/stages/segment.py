@@ -20,7 +20,15 @@ from sc3d.settings.labels import Segment
 def inputs(scene: Scene, settings: Segment) -> list[Input]:
     frames = PhotoFrames(scene.images)
     if settings.refine:
-        return [scene.classes, scene.sparse, scene.masks, scene.confidence, scene.cloud, scene.mesh, frames]
+        return [
+            scene.classes,
+            scene.sparse,
+            scene.masks,
+            scene.confidence,
+            scene.cloud,
+            *scene.surface,
+            frames,
+        ]
     given = [path for path in (settings.masks, settings.confidence, settings.mapping) if path is not None]
     if settings.backend == "files":
         return [scene.classes, *given, frames, *([] if settings.masks else [scene.sparse])]

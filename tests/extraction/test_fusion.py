@@ -30,9 +30,9 @@ def test_completion_covers_what_only_one_view_sees():
     )
     without = surface_of(flat_square(8.0, 0.0), lonely, "nothing")
     completed = surface_of(flat_square(8.0, 0.0), lonely, "continued")
-    assert completed.coverage > without.coverage + 0.02
+    assert completed.covered > without.covered + 0.02
     assert completed.confirmed == without.confirmed and completed.occluders == without.continued == 0
-    assert completed.coverage - without.coverage > completed.continued - 0.01  # others see it, too
+    assert completed.covered - without.covered > completed.continued - 0.01  # others see it, too
     assert np.abs(completed.cloud.point.positions.numpy()[:, 2]).max() < 0.1
     assert surface_of(flat_square(8.0, 0.0), lonely).occluders < 0.001  # nothing is before the plane
 
