@@ -49,7 +49,7 @@ def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) 
             _extract(database, images, names, settings, readable, masks)
             _write_priors(database, flight)
             _match(database, len(names), settings)
-            model, parts = _map(database, readable, work, settings, len(names), flight is not None)
+            model, parts = map_database(database, readable, work, settings, len(names), flight is not None)
             reasons = _reasons(database, names, model, parts)
             clear = transparent_photos({name: images / name for name in reasons})
             reasons |= dict.fromkeys(clear, "wholly transparent")
@@ -127,10 +127,10 @@ def _match(database: Path, num_photos: int, settings: Mapping) -> None:
         match[settings.matching](database, verification_options=verification, device=pycolmap.Device.cpu)
 
 
-def _map(
+def map_database(
     database: Path, images: Path, work: Path, settings: Mapping, num_photos: int, has_gps: bool
 ) -> tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction]]:
-    """The largest model, and the others."""
+    """The largest model of what a COLMAP database holds, and the others; Sc3dError if there is none."""
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = settings.seed
     options.num_threads = 1  # with more, sums of larger scenes are rounded otherwise in each run

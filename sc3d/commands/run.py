@@ -76,7 +76,7 @@ def list_stages(command: Run, scene: Scene, segment: Segment) -> list[Stage]:
 def _masks_first(scene: Scene, command: Run) -> bool:
     """Whether depth takes the sky of the masks."""
     other = command.depth.sky_masks is not None or command.depth.ignore_masks
-    return not other and bool(scene.class_table().without_surface)
+    return not other and scene.classes.exists() and bool(scene.class_table().without_surface)
 
 
 def check(command: Run, segment: Segment) -> None:
