@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -110,9 +110,9 @@ def check_folder(folder: Path, scene: Scene | None) -> CheckResult:
     if len(names) < 2:
         raise InputError(f"{folder} holds fewer than two photos that can be used: {len(broken)} cannot")
     looks = look_at_photos(folder, names)
-    tags, reasons = read_geotags(folder, names)
+    tags = read_geotags(folder, names)[0]
     flight = read_flight(folder, names, quiet=True)
-    model = scene.model if scene is not None and scene.sparse.is_dir() else None
+    model = _model(scene) if scene is not None and scene.sparse.is_dir() else None
     pairs = _pairs(folder, names, looks, flight, model)
     placed = model if model is not None else _rough(folder, names, pairs)
     centers = {view.name: view.center for view in placed.views} if placed else {}
@@ -124,8 +124,9 @@ def check_folder(folder: Path, scene: Scene | None) -> CheckResult:
         "exposure": [name for name, bad in zip(names, exposed, strict=True) if bad],
     }
     findings += _unregistered(names, looks, pairs, model, found)
+    findings += _missing(folder, model)
     findings += _appearance(found, sharpness, exposure, names)
-    findings += _gps(wrong, len(tags), reasons, len(names))
+    findings += _gps(wrong, flight, len(tags), len(names))
     findings += _few_partners(names, overlap, findings)
     coverage = _coverage(placed, model is not None, flight)
     classes = check_classes(scene) if scene is not None and masks_to_check(scene) else []
@@ -143,6 +144,13 @@ def check_folder(folder: Path, scene: Scene | None) -> CheckResult:
         for row, name in enumerate(names)
     }
     return CheckResult(figures, [look.size for look in looks], findings, coverage, classes)
+
+
+def _model(scene: Scene) -> SparseModel:
+    """That of a scene, its views named as their files are spelled."""
+    model = scene.model
+    views = [replace(view, name=photo_name(scene.photo(view.name), scene.images)) for view in model.views]
+    return replace(model, views=views)
 
 
 def _rounded(value: float | None) -> float | None:
@@ -227,6 +235,14 @@ def _unregistered(
     ]
 
 
+def _missing(folder: Path, model: SparseModel | None) -> Iterator[Finding]:
+    """Photos that a model has and the folder has not."""
+    gone = tuple(view.name for view in model.views if not (folder / view.name).is_file()) if model else ()
+    if gone:
+        text = f"{len(gone)} photos that have a camera are not in {folder}"
+        yield Finding("missing", gone, text, "put them back: the stages need them")
+
+
 def _appearance(
     found: dict[str, list[str]], sharpness: np.ndarray, exposure: np.ndarray, names: list[str]
 ) -> Iterator[Finding]:
@@ -247,18 +263,19 @@ def _appearance(
         )
 
 
-def _gps(wrong: dict[str, float], tagged: int, reasons: dict[str, str], number: int) -> Iterator[Finding]:
+def _gps(wrong: dict[str, float], flight: Flight | None, tagged: int, number: int) -> Iterator[Finding]:
     if wrong:
         text = (
             f"GPS of {len(wrong)} of {number} photos is wrong, by up to {told_distance(max(wrong.values()))}"
         )
         yield Finding("gps", tuple(wrong), text, "correct it or take it out of their EXIF, or pass --no-gps")
-    if not tagged:
-        text = "no photo has GPS: the result will have no scale, no north and no place"
+    if flight is None:
+        why = "no photo has GPS" if not tagged else f"GPS of {tagged} of {number} photos cannot place a model"
+        text = f"{why}: the result will have no scale, no north and no place"
         yield Finding("no-gps", (), text, "pass control points (--gcp) if it shall have them", problem=False)
-    elif reasons:
-        text = f"{len(reasons)} of {number} photos have no GPS that can be used"
-        yield Finding("no-gps", tuple(reasons), text, "the others place the scene", problem=False)
+    elif tagged < number:
+        text = f"{number - tagged} of {number} photos have no GPS that can be used"
+        yield Finding("no-gps", (), text, "the others place the scene", problem=False)
 
 
 def _few_partners(names: list[str], overlap: Overlap, findings: list[Finding]) -> list[Finding]:
