@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.commands.plan import Stage, expected_seconds, plan
+from sc3d.commands.plan import Stage, expected_seconds, plan, warn_of_slow
 from sc3d.commands.run import list_stages
 from sc3d.errors import InputError
 from sc3d.io.atomic import require_writable
@@ -32,6 +32,9 @@ def main(command: Check) -> None:
         result = check_folder(scene.images if scene else command.path, scene)
     stages, runs = _stages(command, scene)
     _tell(result, plan(stages, runs, result.sizes, finished="done"))
+    warn_of_slow(stages, runs, result.sizes)
+    problems = sum(finding.problem for finding in result.findings)
+    logger.info("check: %s", "ready" if result.ready else f"not ready, {problems} problems")
     if output is not None:
         seconds = zip(stages, expected_seconds(stages, runs, result.sizes), strict=True)
         write_json(output, result.as_json() | {"seconds": {name: told for (name, _), told in seconds}})
@@ -88,5 +91,3 @@ def _tell(result: CheckResult, expected: str) -> None:
     for finding in result.findings:
         logger.log(logging.WARNING if finding.problem else logging.INFO, finding.line())
     logger.info(expected)
-    problems = sum(finding.problem for finding in result.findings)
-    logger.info("check: %s", "ready" if result.ready else f"not ready, {problems} problems")

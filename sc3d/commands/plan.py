@@ -14,13 +14,20 @@ from typing import Any
 from sc3d.io.progress import duration
 from sc3d.runner import files, up_to_date
 from sc3d.scene.scene import Scene
+from sc3d.sfm import num_pairs
 
 logger = logging.getLogger(__name__)
 
 Stage = tuple[str, Any]  # name and settings
 Sizes = Sequence[tuple[int, int]]  # width and height of every photo, px
-PARTNERS = {"sequential": 10, "spatial": 50}  # photos that each is matched with
 ROUND = 5  # s
+SLOW = 3600  # s that a stage takes to be warned of
+FASTER = {  # what makes stages faster, and coarser
+    "map_photos": "less with --matching auto, a smaller --max-size or --max-features",
+    "depth": "less with a smaller --max-size or --num-sources",
+    "train": "less with fewer --iterations, a smaller --max-size, or a GPU",
+    "extract": "less with a smaller --max-size",
+}
 
 # seconds on two idle cores. Each rule lies between what the sidecars of two scenes recorded, 18 photos of
 # 1600x900 and 24 of 640x427, and at most 1.5 times off either; compared with these alone. Too little where time
@@ -45,12 +52,6 @@ def megapixels(sizes: Sizes, longest: int | None = None) -> float:
     """Of all photos, or of what is left of them where their longest side is no more than `longest` px."""
     scales = [1.0 if longest is None else min(1.0, longest / max(size)) for size in sizes]
     return sum(width * height * scale**2 for (width, height), scale in zip(sizes, scales, strict=True)) / 1e6
-
-
-def num_pairs(num_photos: int, matching: str) -> float:
-    """Photo pairs that are matched."""
-    partners = PARTNERS.get(matching, num_photos)
-    return num_photos * min(partners, num_photos - 1) / (2 if partners == num_photos else 1)
 
 
 def _training(settings: Any, sizes: Sizes) -> float | None:
@@ -113,6 +114,18 @@ def plan(stages: Sequence[Stage], runs: Sequence[bool], sizes: Sizes, finished: 
             f"  in all       {_told(sum(known))}{more}; rough estimates for two cores, here are {os.cpu_count()}",
         ]
     )
+
+
+def warn_of_slow(stages: Sequence[Stage], runs: Sequence[bool], sizes: Sizes) -> None:
+    """Warn of the stages that may take hours, and say which option makes them faster."""
+    seconds = expected_seconds(stages, runs, sizes)
+    slow = [
+        f"{name} {_told(value)}{f' ({FASTER[name]})' if name in FASTER else ''}"
+        for (name, _), value in zip(stages, seconds, strict=True)
+        if value is not None and value > SLOW
+    ]
+    if slow:
+        logger.warning("slow on %d photos: %s", len(sizes), "; ".join(slow))
 
 
 def _told(seconds: float | None) -> str:

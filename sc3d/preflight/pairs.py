@@ -8,13 +8,12 @@ from functools import partial
 from itertools import combinations
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
 
 from sc3d.geometry.cameras import project
+from sc3d.geometry.shortlist import neighbors_by_look, neighbors_by_place, neighbors_in_order
 from sc3d.io.progress import progress
 from sc3d.preflight.looks import GRID, QUICK, THOROUGH, Effort, Look, features, in_threads
 from sc3d.scene.scene import SparseModel
@@ -22,8 +21,6 @@ from sc3d.scene.scene import SparseModel
 ALL_PAIRS = 40  # photos up to which each is compared with every other
 IN_ORDER, NEAREST, ALIKE = 3, 8, 6  # partners of each beyond that: by name, on the map, by look
 MORE = 2  # times as many for a second look
-WORDS = 32  # visual words of a set
-SAMPLE = 20_000  # descriptors that they are made from
 RATIO = 0.8  # of the distances to the first and second in the other photo (Lowe 2004)
 TOLERANCE = 2.0  # px at the size of the look, off the epipolar line
 LEAST = 15  # matches along one epipolar geometry that make a pair, as in COLMAP
@@ -108,51 +105,11 @@ def _candidates(looks: list[Look], positions: dict[int, np.ndarray], times: int)
     number = len(looks)
     if number <= ALL_PAIRS:
         return set(combinations(range(number), 2))
-    ordered = {(row, row + step) for step in range(1, times * IN_ORDER + 1) for row in range(number - step)}
-    return ordered | _near(positions, times * NEAREST) | _alike(looks, times * ALIKE)
-
-
-def _near(positions: dict[int, np.ndarray], count: int) -> set[tuple[int, int]]:
-    if len(positions) < 2:
-        return set()
-    rows = np.array(list(positions))
-    places = np.array(list(positions.values()))
-    found = cKDTree(places).query(places, min(count + 1, len(rows)))[1]
-    return {
-        _sorted(rows[row], rows[other]) for row in range(len(rows)) for other in found[row] if row != other
-    }
-
-
-def _alike(looks: list[Look], count: int) -> set[tuple[int, int]]:
-    """Photos whose features are alike on the whole: vectors of locally aggregated descriptors (Jegou et al.
-    2010) over the set's own visual words.
-    """
-    all_descriptors = np.concatenate([look.descriptors for look in looks])
-    if len(all_descriptors) < WORDS:
-        return set()
-    cv2.setRNGSeed(0)
-    sample = all_descriptors[:: max(1, len(all_descriptors) // SAMPLE)]
-    criteria = (cv2.TERM_CRITERIA_MAX_ITER, 10, 0)
-    words = cv2.kmeans(sample, min(WORDS, len(sample)), None, criteria, 1, cv2.KMEANS_PP_CENTERS)[2]
-    vectors = np.stack([_aggregate(look.descriptors, words) for look in looks])
-    likeness = vectors @ vectors.T
-    np.fill_diagonal(likeness, -np.inf)
-    best = np.argsort(-likeness, axis=1, kind="stable")[:, :count]
-    return {_sorted(row, other) for row, others in enumerate(best) for other in others}
-
-
-def _aggregate(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
-    """(words x 128,) unit vector."""
-    total = np.zeros_like(words)
-    if len(descriptors):
-        nearest = np.argmax(descriptors @ words.T - 0.5 * (words**2).sum(axis=1), axis=1)
-        np.add.at(total, nearest, descriptors - words[nearest])
-    total = np.sign(total) * np.sqrt(np.abs(total))
-    return total.ravel() / max(float(np.linalg.norm(total)), 1e-9)
-
-
-def _sorted(one: int, other: int) -> tuple[int, int]:
-    return (int(min(one, other)), int(max(one, other)))
+    return (
+        neighbors_in_order(number, times * IN_ORDER)
+        | neighbors_by_place(positions, times * NEAREST)
+        | neighbors_by_look([look.descriptors for look in looks], times * ALIKE)
+    )
 
 
 def _compare(
@@ -211,7 +168,7 @@ def pairs_of_model(model: SparseModel, rows: dict[str, int]) -> list[Pair]:
     wanted = set()
     for view, counts in enumerate(shared):
         best = np.argsort(-counts, kind="stable")[:STRONGEST]
-        wanted |= {_sorted(view, other) for other in best if counts[other] >= LEAST}
+        wanted |= {(min(view, int(other)), max(view, int(other))) for other in best if counts[other] >= LEAST}
     return list(_seen_by_both(model, rows, sorted(wanted)))
 
 
