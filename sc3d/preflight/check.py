@@ -214,7 +214,8 @@ def _unregistered(
         what, group_of = "have no camera", dict.fromkeys(alone, 1)
     else:
         parts = sorted(groups(len(names), pairs), key=lambda group: (-len(group), min(group)))
-        group_of = {names[row]: len(group) for group in parts[1:] for row in group}
+        apart = parts[1:] if len(parts[0]) > 1 else parts
+        group_of = {names[row]: len(group) for group in apart for row in group}
         alone, what = set(group_of), "will not register: they share nothing with the others"
     if not alone:
         return []

@@ -180,7 +180,8 @@ def _seen_by_both(model: SparseModel, rows: dict[str, int], wanted: list[tuple[i
         both = model.points[np.intersect1d(model.tracks[first], model.tracks[second])]
         points, others = (project(view, both)[0] / (view.width, view.height) for view in views)
         inside = ((points > 0) & (points < 1) & (others > 0) & (others < 1)).all(axis=1)
-        yield Pair(rows[views[0].name], rows[views[1].name], points[inside], others[inside])
+        if inside.sum() >= LEAST:
+            yield Pair(rows[views[0].name], rows[views[1].name], points[inside], others[inside])
 
 
 def cells(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -225,6 +225,20 @@ def test_in_a_scene_photos_without_camera_and_cameras_without_photo_are_told(tmp
     assert result.coverage is None
 
 
+def test_photos_that_show_nothing_are_told_apart_from_those_that_do(tmp_path):
+    for row in range(2):
+        Image.fromarray(np.full((60, 80, 3), 120, np.uint8)).save(tmp_path / f"{row}.jpg")
+    result = check_folder(tmp_path, None)
+    assert not result.ready and result.findings[0].told == (
+        "0.jpg (little texture)",
+        "1.jpg (little texture)",
+    )
+    assert result.photos["0.jpg"].sharpness is None and json.dumps(result.as_json())
+    clear = np.zeros((60, 80, 4), np.uint8)
+    Image.fromarray(clear).save(tmp_path / "2.png")
+    assert check_folder(tmp_path, None).findings[0].kind == "transparent"
+
+
 def test_a_folder_without_photos_and_a_scene_without_them_are_refused(tmp_path, scene):
     for path, reason in ((tmp_path / "none", "is not a folder"), (scene.path, "images is missing")):
         with pytest.raises(SystemExit) as ended:
