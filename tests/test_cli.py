@@ -59,8 +59,9 @@ def test_run_makes_masks_first_where_depth_takes_sky_from_them(scene, monkeypatc
     stages: list[str] = []
     table = [{"id": 1, "name": "road", "color": [1, 1, 1]}, {"id": 3, "name": name, "color": [9, 9, 9]}]
     (scene / "classes.json").write_text(json.dumps(table))
-    for step in ("check", "prepare", "tell_plan"):
+    for step in ("check", "tell_plan"):
         monkeypatch.setattr(run, step, lambda *arguments: None)
+    monkeypatch.setattr(run, "prepare", lambda photos, scene, settings: settings)
     monkeypatch.setattr(run, "execute", lambda stage, *arguments: stages.append(stage))
     main(["run", "photos", str(scene), *options])
     others = [stage for stage in stages if stage != "segment"]

@@ -7,7 +7,7 @@ import shutil
 import time
 from dataclasses import replace
 
-from sc3d.commands.plan import Stage, pending, plan, results
+from sc3d.commands.plan import Stage, pending, plan, results, warn_of_slow
 from sc3d.errors import InputError
 from sc3d.io.atomic import atomic_path
 from sc3d.io.progress import under_way
@@ -35,7 +35,7 @@ def run(command: Run) -> None:
         confidence=command.confidence or command.segment.confidence,
     )
     check(command, segment)
-    prepare(command.photos, scene, command.reconstruct)
+    command = replace(command, reconstruct=prepare(command.photos, scene, command.reconstruct))
     if command.classes is not None:
         with atomic_path(scene.classes) as temporary:
             shutil.copyfile(command.classes, temporary)
@@ -50,7 +50,9 @@ def run(command: Run) -> None:
 def tell_plan(command: Run, scene: Scene, stages: list[Stage]) -> None:
     """Which stages will run, and for how long about."""
     runs = pending(scene, stages, command.overwrite)
-    logger.info(plan(stages, runs, list(photo_sizes(command.photos).values())))
+    sizes = list(photo_sizes(command.photos).values())
+    logger.info(plan(stages, runs, sizes))
+    warn_of_slow(stages, runs, sizes)
 
 
 def list_stages(command: Run, scene: Scene, segment: Segment) -> list[Stage]:
@@ -76,7 +78,7 @@ def list_stages(command: Run, scene: Scene, segment: Segment) -> list[Stage]:
 def _masks_first(scene: Scene, command: Run) -> bool:
     """Whether depth takes the sky of the masks."""
     other = command.depth.sky_masks is not None or command.depth.ignore_masks
-    return not other and bool(scene.class_table().without_surface)
+    return not other and scene.classes.exists() and bool(scene.class_table().without_surface)
 
 
 def check(command: Run, segment: Segment) -> None:

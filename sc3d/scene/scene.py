@@ -139,6 +139,10 @@ class Scene:
         return self.path / "metrics.json"
 
     @property
+    def check(self) -> Path:
+        return self.path / "check.json"
+
+    @property
     def report(self) -> Path:
         return self.path / "report.html"
 

@@ -77,6 +77,25 @@ class Export:
 
 
 @dataclass(frozen=True)
+class Check:
+    """Before hours of work: blurred and badly exposed photos, wrong GPS, photos that will not register, overlap,
+    weak classes, and how long each stage will take; what to do about it. Exit status 0 = ready, 1 = not.
+    """
+
+    path: Annotated[
+        Positional[Path], arg(help="Folder of photos, or scene folder; only its check.json is written.")
+    ]
+    json: Path | None = None
+    """File for scripts to write: ready, findings, figures of every photo, coverage, classes, seconds per stage.
+    SCENE/check.json otherwise, which the report shows; none for a folder of photos.
+    """
+    reconstruct: Reconstruct = Reconstruct()
+    depth: Depth = Depth()
+    train: Train = Train()
+    extract: Extract = Extract()
+
+
+@dataclass(frozen=True)
 class Compare:
     """What changed between two dates: heights and classes on a common grid, and a picture."""
 
