@@ -43,6 +43,10 @@ class Segment:
     """Folder of strokes and polygons per class, LabelMe JSON or PNG in the colors of the class table;
     SCENE/strokes otherwise (strokes).
     """
+    model: Path | None = None
+    """What another site's strokes taught, a file of `sc3d propagate --save-model`: no strokes are needed here
+    (strokes).
+    """
     prompts: tuple[str, ...] = ()
     """Texts per class, each as NAME=text,text (grounded-sam, sam3); they replace those of classes.json."""
     model_dir: Path | None = None
@@ -74,6 +78,12 @@ class Segment:
     """Compute in half precision (bfloat16; float16 on older GPUs); needs CUDA (grounded-sam, sam3)."""
     device: str = "auto"
     """torch device: auto, cpu, cuda."""
+
+    def __post_init__(self) -> None:
+        if self.model is not None and (self.backend != "strokes" or self.strokes is not None):
+            raise InputError(
+                "--model takes the place of strokes: it needs --backend strokes without --strokes"
+            )
 
 
 @dataclass(frozen=True)
@@ -176,8 +186,22 @@ class Propagate(Resources):
     """Drop seeds that look like another class before the labels spread (knn, geometry); not in the paper."""
     seeds: Path | None = None
     """Cloud written by label; SCENE/seeds.ply otherwise."""
+    model: Path | None = None
+    """Start from what another site taught, a file of --save-model (map): where masks voted it weighs as much
+    as they do at most; without seeds.ply, the cloud of the scene is labelled by it alone.
+    """
+    save_model: Path | None = None
+    """Keep what color and relief the classes have here, and what was learned from SCENE/strokes if there are
+    any, in this file, for --model on other sites (map).
+    """
     output: Path | None = None
     """Labelled cloud to write; SCENE/labelled.ply otherwise."""
+
+    def __post_init__(self) -> None:
+        if (self.model or self.save_model) and (self.method != "map" or not self.appearance):
+            raise InputError(
+                "--model and --save-model are of color and relief: they need --method map with appearance"
+            )
 
 
 @dataclass(frozen=True)
