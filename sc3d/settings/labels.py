@@ -145,9 +145,24 @@ class Label(Resources):
     """
     cloud: Path | None = None
     """Cloud to label, also of another program, as `sc3d import` reads it; SCENE/cloud.ply otherwise."""
+    prior: Path | None = None
+    """Cloud that another program has classified (LAZ, LAS, PLY): its points vote for the nearest ones within a
+    label voxel, by the ASPRS codes of classes.json or by a column `label` with class ids. Masks are not needed
+    then.
+    """
+    prior_weight: float = 1.0
+    """How many photos that agree a vote of --prior is worth, up to 15."""
     output: Path | None = None
     """Labelled cloud to write; SCENE/seeds.ply otherwise."""
     mechanisms: PaperMechanisms = PaperMechanisms()
+
+    def __post_init__(self) -> None:
+        if not 0 < self.prior_weight <= 15:
+            raise InputError("prior_weight must be above 0 and at most 15")
+        if self.prior is not None and self.method == "direct":
+            raise InputError(
+                "--prior has no place among photos of which the last one wins: choose another --method"
+            )
 
     @property
     def resolved(self) -> Label:
