@@ -253,7 +253,7 @@ class Evaluate(Resources):
 @dataclass(frozen=True)
 class Annotate:
     """Draw strokes and polygons per class on photos, on a page in the browser that only this machine can
-    open, and try them out.
+    open, and try them out; or (`--suggest`) answer what the places are of which the labels are least sure.
     """
 
     scene: Annotated[Positional[Path], arg(help="Scene folder with images/ and classes.json.")]
@@ -261,3 +261,11 @@ class Annotate:
     """Port to serve on; the next free one if it is taken."""
     photo: str | None = None
     """Name of the photo to show first."""
+    suggest: bool = False
+    """Ask about places of the labelled cloud, those first where an answer changes most, each outlined in the
+    photo that sees it best; answers are corrections (corrections.json), which propagate takes.
+    """
+
+    def __post_init__(self) -> None:
+        if self.suggest and self.photo is not None:
+            raise InputError("--suggest chooses the photos itself: leave --photo out")

@@ -19,9 +19,9 @@ from sc3d.runner import sidecar
 from sc3d.scene.corrections import Balls, Corrections, add_correction, redo, undo
 from sc3d.scene.labelled_cloud import read_labelled
 from sc3d.scene.scene import Scene
+from sc3d.scene.selection import balls_around, region_around, seen_in_lasso
 from sc3d.settings.labels import Propagate
 from sc3d.view.picking import point_on_ray
-from sc3d.view.selection import balls_around, region_around, seen_in_lasso
 from sc3d.view.web.panel import Page, ShowPanel
 
 if TYPE_CHECKING:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sc3d.errors import InputError
-from sc3d.view import selection
-from sc3d.view.selection import balls_around, region_around, seen_in_lasso
+from sc3d.scene import selection
+from sc3d.scene.selection import balls_around, region_around, seen_in_lasso
 
 FAR = np.array([5e5, 4.2e6, 100.0])  # UTM
 
