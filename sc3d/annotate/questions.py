@@ -20,7 +20,7 @@ from sc3d.scene.labels import CORRECTED, LOCKED
 
 DOUBTFUL = 0.12  # doubt from which a point is asked about
 LOCKED_DOUBT = 1.25  # factor on the doubt of locked points, on which the views did not agree
-LINK = 2.5  # point spacings up to which doubtful points hang together
+LINK = 3.0  # point spacings up to which doubtful points hang together
 LIKE = 40.0  # distance of colors, of 255 per channel, up to which neighbors look alike
 FEW = 500  # sure examples of a class; with fewer, an answer counts up to twice
 SURE = 0.9  # confidence of such an example

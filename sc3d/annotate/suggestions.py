@@ -20,14 +20,15 @@ from sc3d.io.orientation import turned
 from sc3d.scene.corrections import Corrections, add_correction, undo
 from sc3d.scene.labelled_cloud import Votes, read_labelled, read_surface, read_votes, spacing_of
 from sc3d.scene.scene import Scene
-from sc3d.scene.selection import balls_around
+from sc3d.scene.selection import balls_within
 
 PROBES = 200  # points of a place that are looked for in photos
-CANDIDATES = 8  # photos in which the place is largest, of which the one that sees most of it is taken
+CANDIDATES = 8  # photos in which the place is largest, of which one is taken that sees most of it
 RANGE_TOLERANCE = (
     0.01  # of the range, and two point spacings: how far behind the first surface a point is seen
 )
 LEAST_SEEN = 0.2  # share of a place that a photo must see
+ALMOST = 0.98  # of the most that any of these photos sees: then the one that shows it largest is taken
 SMALLEST = 2.5  # px, half width of a point in an outline
 
 
@@ -77,7 +78,7 @@ class Suggestions(Session):
                 raise InputError("an answer needs a class: a name, or null for none")
             rows = self._places[self._next].rows
             known = self._known
-            add_correction(self._scene, name, balls_around(known.points, rows, known.spacing))
+            add_correction(self._scene, name, balls_within(known.points, rows, known.spacing))
             self._answered.append(self._next)
             self._next += 1
             return self._question()
@@ -161,13 +162,11 @@ class Suggestions(Session):
             inside = in_image(view, pixels) & (depth > 0)
             near = float(np.median(depth[inside])) if inside.any() else np.inf
             sizes.append(float(inside.mean()) * (view.focal / near) ** 2)
-        best, found = 0.0, None
-        for index in np.argsort(-np.array(sizes), kind="stable")[:CANDIDATES]:
-            seen = self._seen(self._views[index], points)
-            if seen.mean() >= LEAST_SEEN and sizes[index] * seen.mean() > best:
-                best, found = sizes[index] * float(seen.mean()), self._views[index]
-        if found is None:
+        candidates = np.argsort(-np.array(sizes), kind="stable")[:CANDIDATES]
+        seen = np.array([self._seen(self._views[index], points).mean() for index in candidates])
+        if not len(seen) or seen.max() < LEAST_SEEN:
             return None
+        found = self._views[candidates[np.argmax(seen >= ALMOST * seen.max())]]  # the largest of them
         return Shown(found, place.rows[self._seen(found, self._known.points[place.rows])])
 
     def _seen(self, view: View, points: np.ndarray) -> np.ndarray:
