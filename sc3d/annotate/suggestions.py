@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sc3d.annotate.questions import Evidence, Place, doubt_of, rank_places
+from sc3d.annotate.questions import Evidence, Place, rank_places
 from sc3d.annotate.session import Session
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, local_origin, project, rays
@@ -19,6 +19,7 @@ from sc3d.io.images import read_orientation
 from sc3d.io.orientation import turned
 from sc3d.scene.corrections import Corrections, add_correction, undo
 from sc3d.scene.labelled_cloud import Votes, read_labelled, read_surface, read_votes, spacing_of
+from sc3d.scene.labels import CORRECTED
 from sc3d.scene.scene import Scene
 from sc3d.scene.selection import balls_within
 
@@ -57,7 +58,10 @@ class Suggestions(Session):
         self._known = evidence_of_scene(scene)
         self._views = [view for view in scene.model.views if self.has(view.name)]
         self._places = rank_places(self._known)
-        self._doubt, self._lock = doubt_of(self._known), threading.Lock()
+        unsure = 1 - self._known.confidence.astype(np.float64)
+        unsure[self._known.label == 0] = 1
+        self._unsure = np.where(self._known.state == CORRECTED, 0, unsure)
+        self._lock = threading.Lock()
         self._next, self._answered, self._skipped = 0, list[int](), set[int]()
         self._surface: RayTarget | None = None
         self._unseen = set[int]()
@@ -138,12 +142,12 @@ class Suggestions(Session):
         }
 
     def line(self) -> str:
-        """How much is left, and how sure the rest is."""
-        settled = np.zeros(len(self._doubt), bool)
+        """How much is left, and how sure the rest is by its confidences."""
+        settled = np.zeros(len(self._unsure), bool)
         for row in self._answered:
             settled[self._places[row].rows] = True
         rest = ~settled
-        wrong = float(self._doubt[rest].sum())
+        wrong = float(self._unsure[rest].sum())
         sure = 1 - wrong / max(int(rest.sum()), 1)
         left = len(self._places) - self._next
         unseen = f", {len(self._unseen)} in no photo" if self._unseen else ""
