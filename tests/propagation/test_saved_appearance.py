@@ -12,6 +12,7 @@ import pytest
 from sc3d.errors import InputError
 from sc3d.io.clouds import read_cloud, write_geometry
 from sc3d.propagation.propagate import propagate_scene
+from sc3d.runner import execute
 from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import Votes, with_labels
 from sc3d.scene.labels import CORRECTED, PROPAGATED
@@ -19,6 +20,7 @@ from sc3d.scene.scene import Scene
 from sc3d.scene.site_model import ModelPart, read_model, write_model
 from sc3d.settings.labels import Propagate
 from sc3d.stages import propagate as stage
+from sc3d.view.web.correction_panel import made_with
 from tests.builders import views
 from tests.builders import write_model as write_cameras
 from tests.propagation.test_appearance import evidence_of, village
@@ -195,3 +197,10 @@ def test_too_little_to_learn_from_is_said_and_labels_are_kept(tmp_path):
     with pytest.raises(InputError, match="is not written, as fewer than two classes"):
         stage.run(scene, Propagate(save_model=tmp_path / "site.npz"))
     assert scene.labelled.exists() and not (tmp_path / "site.npz").exists()
+
+
+def test_apply_in_the_viewer_starts_from_the_same_model(model, tmp_path):
+    scene, _ = site(tmp_path, 1, votes=False)
+    (scene.path / "town.npz").write_bytes(model.read_bytes())
+    execute("propagate", scene, Propagate(model=scene.path / "town.npz", save_model=scene.path / "again.npz"))
+    assert made_with(scene) == Propagate(model=scene.path / "town.npz")
