@@ -136,7 +136,8 @@ class PropagateSummary:
 
 def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     """Complete the labels of a scene's seeds (or of `settings.seeds`) and write the labelled cloud."""
-    saved, meters = _saved_appearance(scene, settings), _meters(scene)
+    saved = _saved_appearance(scene, settings)
+    meters = _meters(scene) if settings.model or settings.save_model else None
     cloud, seeds, votes, path = _read_start(scene, settings)
     positions = cloud.point.positions.numpy().astype(np.float64)
     corrections = Corrections.of_scene(scene)

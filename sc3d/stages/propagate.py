@@ -79,7 +79,7 @@ def _strokes_source(scene: Scene) -> tuple[Path | None, Path | None]:
 
 def _strokes_inputs(scene: Scene) -> list[Input]:
     folder, model = _strokes_source(scene)
-    return [*([folder, scene.images] if folder else []), *([model] if model else [])]
+    return [sidecar(scene.masks), *([folder, scene.images] if folder else []), *([model] if model else [])]
 
 
 def _strokes_part(scene: Scene) -> ModelPart | None:
