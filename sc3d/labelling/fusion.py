@@ -55,8 +55,7 @@ def fuse(
     read_mask: mask of a view, any size of the photo's aspect; masks are streamed
     surface: what blocks the view; None (or settings.depth_filter off) = labels penetrate
     num_channels: as masks and labels hold channels, see `sc3d.scene.channels`, of which with `none` the last
-        stands for "looked at, none of the classes"; settings.voxel_size must be set
-    prior: votes beside those of the views
+        stands for "looked at, none of the classes"; settings.voxel_size must be set; prior: more votes
     """
     settings = settings.resolved
     last = num_channels - 1 if none else 0
