@@ -14,6 +14,7 @@ from sc3d.io.progress import under_way
 from sc3d.runner import execute
 from sc3d.scene.class_table import read_classes
 from sc3d.scene.scene import Scene, match_masks, photo_sizes
+from sc3d.scene.site_model import read_model
 from sc3d.settings.labels import Evaluate, Segment
 from sc3d.settings.outputs import Report, Run
 from sc3d.stages.reconstruct import prepare, steps
@@ -101,6 +102,9 @@ def check(command: Run, segment: Segment) -> None:
             )
         source = mask_source(segment, masks) if segment.masks else MaskFiles(masks, "index")
         check_masks(source, sizes, class_table, segment.confidence, command.photos)
+    for model, part in ((segment.model, "strokes"), (command.propagate.model, "appearance")):
+        if model is not None:
+            read_model(model, class_table, part)
     if command.extract.crop > len(sizes):
         raise InputError(f"--extract.crop {command.extract.crop}: there are only {len(sizes)} photos")
     if command.depth.sky_masks is not None:

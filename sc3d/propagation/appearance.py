@@ -115,6 +115,10 @@ class AppearanceModel:
         """What the examples (N,) bool of label (N,) uint8 teach."""
         return tuple(group.count(label, examples, num_classes) for group in self.groups)
 
+    def offers(self, num_classes: int) -> np.ndarray:
+        """(C,) bool classes that points may get without a single seed of them."""
+        return np.zeros(num_classes, bool)
+
     def log_likelihood(self, statistics: AppearanceStatistics, label: np.ndarray) -> np.ndarray | None:
         """(N, C) float32 log-probability of the classes as color and relief see them; None where there is
         too little to learn from.

@@ -31,6 +31,8 @@ def minimize_energy(
     appearance: votes beside the views; what it teaches is learned again from each round's result. None = votes alone
     """
     offered = np.bincount(known.seed_labels, minlength=known.num_classes + 1)[1:] > 0
+    if appearance is not None:
+        offered |= appearance.model.offers(known.num_classes)
     found, label, rounds = None, known.seed_labels, max(settings.rounds, 1)
     while appearance is not None and rounds:
         rating = appearance.log_likelihood(label)

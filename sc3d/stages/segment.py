@@ -8,11 +8,13 @@ from sc3d.io.atomic import discard
 from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
+from sc3d.scene.site_model import read_model
 from sc3d.segmentation.grounded_sam import GroundedSam
 from sc3d.segmentation.mask_formats.import_masks import import_scene_masks
 from sc3d.segmentation.sam3 import Sam3
 from sc3d.segmentation.segment import Segmenter, segment_scene
 from sc3d.segmentation.strokes.backend import Strokes
+from sc3d.segmentation.strokes.model_file import from_part
 from sc3d.segmentation.text_prompts import replace_prompts
 from sc3d.settings.labels import Segment
 
@@ -35,7 +37,7 @@ def inputs(scene: Scene, settings: Segment) -> list[Input]:
     return [
         scene.classes,
         scene.images,
-        *([settings.strokes or scene.strokes] if settings.backend == "strokes" else []),
+        *([settings.model or settings.strokes or scene.strokes] if settings.backend == "strokes" else []),
     ]
 
 
@@ -63,6 +65,8 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
 
 
 def _segmenter(scene: Scene, settings: Segment, class_table: ClassTable) -> Segmenter:
+    if settings.backend == "strokes" and settings.model is not None:
+        return from_part(read_model(settings.model, class_table, "strokes"), class_table, settings.model)
     if settings.backend == "strokes":
         return Strokes.fit(settings.strokes or scene.strokes, scene.images, class_table)
     return (Sam3 if settings.backend == "sam3" else GroundedSam)(settings, class_table)
