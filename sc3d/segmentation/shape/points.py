@@ -33,6 +33,7 @@ ROUGH, ROUGH_WIDTH = 0.15, 0.03
 SMOOTH = 0.1  # of the same, what may be ground; crowns seen from above are rougher
 BUSH, BUSH_WIDTH, AROUND = 0.12, 0.02, 5.0  # of the same, leaves that are no lawn; of plants this far around, m
 LIMIT = 4.0  # of each piece of evidence, log-odds
+EVEN = 0.17  # standard deviation of the logarithm of light, beyond which it is more likely leaves than lawn
 SPREAD = 3  # times that evidence is shared with the neighbors
 
 
@@ -84,7 +85,10 @@ def classify(points: np.ndarray, colors: np.ndarray | None) -> np.ndarray:
     flat, ruffled = steep < 1 - FLAT, rough
     relief = find_relief(points, flat & (rough < SMOOTH))
     if green is not None:  # once more, without the smooth places of woods
-        ruffled = _ruffled(points, rough, _sigmoid(green), _sigmoid(green) * (1 - _standing(relief)))
+        plants = _sigmoid(green)
+        ruffled = _ruffled(points, rough, plants * (1 - _standing(relief)))
+        uneven = _shared(graph, _unevenness(graph, colors[graph.order])) - EVEN
+        ruffled = rough + plants * (ruffled - rough + uneven) / 2
         relief = find_relief(points, flat & (ruffled < SMOOTH))
     result = np.empty((len(points), 5), np.float32)
     result[graph.order] = _combined(points, relief, steep, green, rough, ruffled)
@@ -154,9 +158,18 @@ def _standing(relief: Relief) -> np.ndarray:
     return _sigmoid((relief.height - STANDS) / STANDS_WIDTH)
 
 
-def _ruffled(points: np.ndarray, rough: np.ndarray, green: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(N,) roughness (N,) where nothing is green, else half of it and half of what is around: woods have
-    smooth places. green: (N,) 0 to 1; weight: (N,) of each point in its surroundings, >= 0
+def _unevenness(graph: Graph, colors: np.ndarray) -> np.ndarray:
+    """(N,) standard deviation of the logarithm of the light of the neighbors; colors: (N, 3) 0 to 255."""
+    links = graph.sparse()
+    links.data[:] = 1
+    light, count = np.log(np.maximum(colors.sum(axis=1), 20.0)), np.diff(graph.starts) + 1
+    mean, squared = ((links @ values + values) / count for values in (light, light**2))
+    return np.sqrt(np.maximum(squared - mean**2, 0))
+
+
+def _ruffled(points: np.ndarray, rough: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(N,) mean of the roughness (N,) around: woods have smooth places. weight: (N,) of each point in its
+    surroundings, >= 0
     """
     grid = Raster.around(points, _cell(points))
     cells, size = grid.flat_cells(points), max(3, 2 * round(AROUND / 2 / grid.pixel) + 1)
@@ -167,8 +180,7 @@ def _ruffled(points: np.ndarray, rough: np.ndarray, green: np.ndarray, weight: n
         for weights in (weight, weight * rough)
     ]
     some = sums[0][cells] > 1e-6
-    around = np.where(some, sums[1][cells] / np.maximum(sums[0][cells], 1e-6), rough)
-    return rough + green * (around - rough) / 2
+    return np.where(some, sums[1][cells] / np.maximum(sums[0][cells], 1e-6), rough)
 
 
 def _cell(points: np.ndarray) -> float:
