@@ -70,7 +70,9 @@ def segment_by_shape(scene: Scene, table: ClassTable) -> dict[str, object]:
     )
     _write(scene, surface, sure[thinned.rows])
     counts = np.bincount(label[thinned.rows], minlength=256)
-    shares = {f"points_{table.name(row)}": f"{counts[row] / len(points):.1%}" for row in np.flatnonzero(counts)}
+    shares = {
+        f"points_{table.name(int(row))}": f"{counts[row] / len(points):.1%}" for row in np.flatnonzero(counts)
+    }
     measured = "measured" if frame.measured else "estimated"
     return {"masks": len(views), "meters_per_unit": f"{frame.scale:.3g} ({measured})", **shares}
 

@@ -31,9 +31,13 @@ GREEN, GREEN_WIDTH = 0.05, 0.02
 # as a surface
 ROUGH, ROUGH_WIDTH = 0.15, 0.03
 SMOOTH = 0.1  # of the same, what may be ground; crowns seen from above are rougher
-BUSH, BUSH_WIDTH, AROUND = 0.12, 0.02, 5.0  # of the same, leaves that are no lawn; of plants this far around, m
+BUSH, BUSH_WIDTH, AROUND = (
+    0.12,
+    0.02,
+    5.0,
+)  # of the same, leaves that are no lawn; of plants this far around, m
 LIMIT = 4.0  # of each piece of evidence, log-odds
-EVEN = 0.17  # standard deviation of the logarithm of light, beyond which it is more likely leaves than lawn
+EVEN = 0.16  # standard deviation of the logarithm of light, beyond which it is more likely leaves than lawn
 SPREAD = 3  # times that evidence is shared with the neighbors
 
 
@@ -81,14 +85,15 @@ def classify(points: np.ndarray, colors: np.ndarray | None) -> np.ndarray:
     graph = build_graph(points, None, NEIGHBORS)
     points = points[graph.order]
     steep, rough = 1 - np.abs(graph.normals[:, 2]), _shared(graph, graph.roughness)
-    green = None if colors is None else _shared(graph, _green_odds(colors[graph.order]))
-    flat, ruffled = steep < 1 - FLAT, rough
+    flat, ruffled, green = steep < 1 - FLAT, rough, None
     relief = find_relief(points, flat & (rough < SMOOTH))
-    if green is not None:  # once more, without the smooth places of woods
+    if colors is not None:  # once more, without the smooth places of woods
+        colors = colors[graph.order]
+        green = _shared(graph, _green_odds(colors))
+        leafy = rough + (_shared(graph, _unevenness(graph, colors)) - EVEN) / 2
         plants = _sigmoid(green)
-        ruffled = _ruffled(points, rough, plants * (1 - _standing(relief)))
-        uneven = _shared(graph, _unevenness(graph, colors[graph.order])) - EVEN
-        ruffled = rough + plants * (ruffled - rough + uneven) / 2
+        around = _surroundings(points, leafy, plants * (1 - _standing(relief)))
+        ruffled = rough + plants * ((leafy + 2 * around) / 3 - rough)
         relief = find_relief(points, flat & (ruffled < SMOOTH))
     result = np.empty((len(points), 5), np.float32)
     result[graph.order] = _combined(points, relief, steep, green, rough, ruffled)
@@ -167,20 +172,20 @@ def _unevenness(graph: Graph, colors: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(squared - mean**2, 0))
 
 
-def _ruffled(points: np.ndarray, rough: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(N,) mean of the roughness (N,) around: woods have smooth places. weight: (N,) of each point in its
-    surroundings, >= 0
+def _surroundings(points: np.ndarray, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(N,) mean of values (N,) around each point, seen from above, those of the points without any around;
+    weights: (N,) >= 0
     """
     grid = Raster.around(points, _cell(points))
     cells, size = grid.flat_cells(points), max(3, 2 * round(AROUND / 2 / grid.pixel) + 1)
     sums = [
         ndimage.uniform_filter(
-            np.bincount(cells, weights, grid.height * grid.width).reshape(grid.shape), size
+            np.bincount(cells, share, grid.height * grid.width).reshape(grid.shape), size
         ).ravel()
-        for weights in (weight, weight * rough)
+        for share in (weights, weights * values)
     ]
     some = sums[0][cells] > 1e-6
-    return np.where(some, sums[1][cells] / np.maximum(sums[0][cells], 1e-6), rough)
+    return np.where(some, sums[1][cells] / np.maximum(sums[0][cells], 1e-6), values)
 
 
 def _cell(points: np.ndarray) -> float:
