@@ -33,8 +33,8 @@ MAX_SIDE = 1600  # px, of the masks; larger photos show no more of the shapes
 
 
 def write_default_classes(scene: Scene) -> None:
-    """classes.json, where a scene has none."""
-    if not scene.classes.exists():
+    """classes.json, where a scene has none, but a folder."""
+    if scene.path.is_dir() and not scene.classes.exists():
         write_json(scene.classes, DEFAULT.as_json())
         logger.info("%s: ground, low vegetation, high vegetation, building", scene.classes)
 
@@ -89,6 +89,8 @@ def confidence_of(probabilities: np.ndarray, ids: np.ndarray) -> np.ndarray:
 def cloud_path(scene: Scene) -> Path:
     """What is classified: the cloud, else the vertices of the mesh; InputError if there is neither."""
     source = scene.cloud if scene.cloud.exists() else scene.mesh
+    if not source.exists():
+        source = scene.cloud
     scene.require(source, hint="--backend geometry looks at the surface: run `sc3d extract SCENE` first")
     return source
 

@@ -10,13 +10,14 @@ import numpy as np
 from sc3d.georeferencing.georeference import read_georeference
 from sc3d.georeferencing.up_direction import find_up, view_poses
 from sc3d.scene.scene import Scene
-from sc3d.segmentation.shape.points import STANDS, find_relief
+from sc3d.segmentation.shape.points import STANDS, Thinned, find_relief
 
 logger = logging.getLogger(__name__)
 
 TALL, SHARE = 10.0, 95  # m: the taller houses and trees, give or take half; of what stands, percent are lower
 COARSEST, FINEST = 1 / 20, 1 / 1000  # meters that are tried, as shares of the extent on the plan
-STEPS, SAMPLE, AGREED = 8, 50_000, 1.1
+STEPS, AGREED = 8, 1.1
+CUBES = 400  # along the extent: one point of each is enough
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,8 @@ class Frame:
     measured: bool
 
     def place(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) m of points (N, 3) world, from their first one."""
-        return (points - points[0]) @ (self.axes * self.scale).T
+        """(N, 3) m of points (N, 3) world, from their lowest corner."""
+        return (points - points.min(axis=0)) @ (self.axes * self.scale).T
 
 
 def find_frame(scene: Scene, points: np.ndarray) -> Frame:
@@ -42,7 +43,7 @@ def find_frame(scene: Scene, points: np.ndarray) -> Frame:
     found = find_up(view_poses(scene.model.views, scene.images), scene.model.points)
     found.tell()
     axes = upright(found.up)
-    return Frame(axes, estimate_scale((points - points[0]) @ axes.T), False)
+    return Frame(axes, estimate_scale((points - points.min(axis=0)) @ axes.T), False)
 
 
 def upright(up: np.ndarray) -> np.ndarray:
@@ -55,7 +56,7 @@ def upright(up: np.ndarray) -> np.ndarray:
 def estimate_scale(points: np.ndarray) -> float:
     """Meters per unit of points (N, 3), up is z: such that what stands on the ground is TALL."""
     extent = float(np.ptp(np.percentile(points[:, :2], [2, 98], axis=0), axis=0).max()) or 1.0
-    some, meter = points[:: max(1, len(points) // SAMPLE)], extent * COARSEST
+    some, meter = Thinned.from_points(points, None, extent / CUBES).points, extent * COARSEST
     for _ in range(STEPS):
         tall = standing_height(some / meter) * meter
         previous, meter = meter, float(np.clip(tall / TALL, extent * FINEST, meter)) if tall else meter

@@ -53,14 +53,15 @@ class Thinned:
 
     @classmethod
     def from_points(cls, points: np.ndarray, colors: np.ndarray | None, side: float) -> Thinned:
-        """points: (M, 3) m; colors: (M, 3) uint8 or None; side: of the cubes, m"""
+        """points: (M, 3) m, in any order; colors: (M, 3) uint8 or None; side: of the cubes, m"""
         cubes = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
         sizes = cubes.max(axis=0) + 1
         keys = (cubes[:, 0] * sizes[1] + cubes[:, 1]) * sizes[2] + cubes[:, 2]
         _, rows, counts = np.unique(keys, return_inverse=True, return_counts=True)
+        order = np.lexsort(points.T)  # sums depend on it
 
         def means(values: np.ndarray) -> np.ndarray:
-            return np.stack([np.bincount(rows, column) / counts for column in values.T], axis=1)
+            return np.stack([np.bincount(rows[order], column[order]) / counts for column in values.T], axis=1)
 
         return cls(means(points), None if colors is None else means(colors.astype(np.float64)), rows)
 
@@ -88,7 +89,7 @@ def classify(points: np.ndarray, colors: np.ndarray | None) -> np.ndarray:
     flat, ruffled, green = steep < 1 - FLAT, rough, None
     relief = find_relief(points, flat & (rough < SMOOTH))
     if colors is not None:  # once more, without the smooth places of woods
-        colors = colors[graph.order]
+        colors = colors[graph.order].astype(np.float64)
         green = _shared(graph, _green_odds(colors))
         leafy = rough + (_shared(graph, _unevenness(graph, colors)) - EVEN) / 2
         plants = _sigmoid(green)
