@@ -14,7 +14,7 @@ from sc3d.segmentation.shape.points import STANDS, Thinned, find_relief
 
 logger = logging.getLogger(__name__)
 
-TALL, SHARE = 10.0, 95  # m: the taller houses and trees, give or take half; of what stands, percent are lower
+TALL, SHARE = 7.5, 90  # m: the taller houses and trees, give or take half; of what stands, percent are lower
 COARSEST, FINEST = 1 / 20, 1 / 1000  # meters that are tried, as shares of the extent on the plan
 STEPS, AGREED = 8, 1.1
 CUBES = 400  # along the extent: one point of each is enough

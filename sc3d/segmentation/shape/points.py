@@ -19,6 +19,7 @@ MIN_POINTS = 100
 NEIGHBORS = 16
 CELL, MAX_SIDE = 0.5, 4096  # of the raster of the ground: m; cells
 WIDEST = (*RADII, 30.0)  # of what may stand on the ground, from small to large, m
+USUAL = 60  # per cent of the slopes around that are no steeper than the ground
 PITS = (1.0, 2.0)  # half widths of what lies below the ground by mistake, m
 FLAT = 0.5  # |cosine| to up of what may be ground: slopes to 60 degrees
 # height above the ground from which something stands on it, and from which it is no car or fence; both m, with
@@ -118,7 +119,7 @@ def find_relief(points: np.ndarray, flat: np.ndarray) -> Relief:
     np.minimum.at(lowest, grid.flat_cells(points[flat]), points[flat, 2])
     heights = np.where(np.isfinite(lowest), lowest, np.nan).reshape(grid.shape)
     heights[low_objects(-heights, grid.pixel, PITS)] = np.nan
-    known = np.isfinite(heights) & ~low_objects(heights, grid.pixel, WIDEST)
+    known = np.isfinite(heights) & ~low_objects(heights, grid.pixel, WIDEST, USUAL)
     if known.any():
         ground = interpolate(heights, known)
     else:
