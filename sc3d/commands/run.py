@@ -131,7 +131,7 @@ def check(command: Run, segment: Segment) -> None:
         masks = segment.masks or Scene(command.scene).masks
         if not masks.exists():
             raise InputError(
-                "--masks PATH is needed (or --segment.backend strokes, grounded-sam or sam3, which make masks)"
+                "--masks PATH is needed (or --segment.backend geometry, strokes, grounded-sam or sam3, which make masks)"
             )
         source = mask_source(segment, masks) if segment.masks else MaskFiles(masks, "index")
         check_masks(source, sizes, class_table, segment.confidence, command.photos)

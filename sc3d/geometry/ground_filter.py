@@ -12,7 +12,7 @@ from sc3d.geometry.raster import interpolate
 RADII = (1.0, 2.0, 4.0, 8.0, 15.0)  # of what may stand on the ground, from small to large, m
 SLOPE, BUMP = 0.05, 0.2  # of the ground itself: m per m, beside the slope around; m
 SMOOTH = 2.0  # the slope is that of the ground without what is narrower, m
-COARSE = 4  # samples of the slope along a radius
+COARSE = 2  # samples of the slope along a radius
 
 
 def low_objects(

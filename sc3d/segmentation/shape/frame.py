@@ -15,8 +15,9 @@ from sc3d.segmentation.shape.points import STANDS, Thinned, find_relief
 logger = logging.getLogger(__name__)
 
 TALL, SHARE = 7.5, 90  # m: the taller houses and trees, give or take half; of what stands, percent are lower
-COARSEST, FINEST = 1 / 20, 1 / 1000  # meters that are tried, as shares of the extent on the plan
-STEPS, AGREED = 8, 1.1
+FIRST = 1 / 150  # the first guess of a meter, as a share of the extent on the plan
+# guesses at most; one that is between these, times the one before, stands: windows that far off still find the ground
+STEPS, LEAST, MOST = 4, 0.5, 4.0
 CUBES = 400  # along the extent: one point of each is enough
 
 
@@ -54,13 +55,19 @@ def upright(up: np.ndarray) -> np.ndarray:
 
 
 def estimate_scale(points: np.ndarray) -> float:
-    """Meters per unit of points (N, 3), up is z: such that what stands on the ground is TALL."""
-    extent = float(np.ptp(np.percentile(points[:, :2], [2, 98], axis=0), axis=0).max()) or 1.0
-    some, meter = Thinned.from_points(points, None, extent / CUBES).points, extent * COARSEST
+    """Meters per unit of points (N, 3), up is z: such that SHARE per cent of what stands on the ground is lower
+    than TALL.
+    """
+    low, high = np.percentile(points[:, :2], [2, 98], axis=0)
+    extent = float((high - low).max()) or 1.0
+    inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
+    some, meter = Thinned.from_points(points[inside], None, extent / CUBES).points, FIRST * extent
     for _ in range(STEPS):
         tall = standing_height(some / meter) * meter
-        previous, meter = meter, float(np.clip(tall / TALL, extent * FINEST, meter)) if tall else meter
-        if previous < AGREED * meter:
+        if not tall:
+            break
+        previous, meter = meter, tall / TALL
+        if LEAST * previous <= meter <= MOST * previous:
             break
     return 1 / meter
 
