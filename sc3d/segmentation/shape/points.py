@@ -19,7 +19,7 @@ MIN_POINTS = 100
 NEIGHBORS = 16
 CELL, MAX_SIDE = 0.5, 4096  # of the raster of the ground: m; cells
 WIDEST = (*RADII, 30.0)  # of what may stand on the ground, from small to large, m
-USUAL = 60  # per cent of the slopes around that are no steeper than the ground
+USUAL = 70  # per cent of the slopes around that are no steeper than the ground
 PITS = (1.0, 2.0)  # half widths of what lies below the ground by mistake, m
 FLAT = 0.5  # |cosine| to up of what may be ground: slopes to 60 degrees
 # height above the ground from which something stands on it, and from which it is no car or fence; both m, with
