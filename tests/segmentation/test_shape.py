@@ -96,7 +96,7 @@ def right(points, colors, shapes) -> dict[int, float]:
 @pytest.mark.parametrize("slope", [0.0, 0.15])
 def test_road_lawn_houses_and_tree_are_found_on_the_level_and_on_a_slope(slope):
     shares = right(*village(slope))
-    assert shares[GROUND] > 0.97 and shares[LOW_VEGETATION] > 0.95
+    assert shares[GROUND] > 0.97 and shares[LOW_VEGETATION] > 0.9
     assert shares[BUILDING] > 0.87 and shares[HIGH_VEGETATION] > 0.9
 
 
