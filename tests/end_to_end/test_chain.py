@@ -130,6 +130,7 @@ def test_second_run_does_nothing_and_a_changed_option_reruns_what_follows(site, 
     ]
 
 
+@pytest.mark.slow
 def test_photos_alone_give_ground_trees_and_buildings(site, scene, tmp_path, caplog):
     alone, truth = tmp_path / "scene", tmp_path / "truth"
     shutil.copytree(scene, alone, symlinks=True)
