@@ -452,6 +452,7 @@ def reading_runs(scene: Path) -> dict[str, tuple[str, object]]:
         "extract depth": ("extract", reconstruction.Extract(method="depth")),
         "segment masks": ("segment", labels.Segment(masks=scene / "truth")),
         "segment in place": ("segment", labels.Segment()),
+        "segment geometry": ("segment", labels.Segment(backend="geometry")),
         "label cloud": ("label", labels.Label(cloud=scene / "seeds.ply")),
         "label density": ("label", labels.Label(mechanisms=labels.PaperMechanisms(density=True))),
         "import cloud": ("import_project", reconstruction.Import(**own)),
@@ -460,7 +461,7 @@ def reading_runs(scene: Path) -> dict[str, tuple[str, object]]:
 
 
 READS = [
-    *STAGES[1:], "georeference gps", "georeference again", "depth masks", "depth sky", "extract depth", "segment masks", "segment in place", "label cloud", "label density",
+    *STAGES[1:], "georeference gps", "georeference again", "depth masks", "depth sky", "extract depth", "segment masks", "segment in place", "segment geometry", "label cloud", "label density",
     "import cloud",
 ]  # fmt: skip
 

@@ -23,7 +23,7 @@ from sc3d.scene.labelled_cloud import REACH, LabelledSurface, read_surface, spac
 from sc3d.scene.scene import Scene
 from sc3d.segmentation.segment import Folders, set_aside, unfinished_marker
 from sc3d.segmentation.shape.classes import DEFAULT, class_ids
-from sc3d.segmentation.shape.frame import Frame, find_frame
+from sc3d.segmentation.shape.frame import SHARE, TALL, Frame, find_frame
 from sc3d.segmentation.shape.points import Thinned, classify, require_enough
 
 logger = logging.getLogger(__name__)
@@ -98,8 +98,10 @@ def cloud_path(scene: Scene) -> Path:
 def _tell(frame: Frame, colors: np.ndarray | None) -> None:
     if not frame.measured:
         logger.warning(
-            "the scene has no place, so that lengths are a guess: what stands on the ground is taken to be up to "
-            "10 m high, which makes a unit %.3g m; GPS, control points or `sc3d georeference` say it rightly",
+            "the scene has no place, so that lengths are a guess: %d %% of what stands on the ground are taken to be "
+            "lower than %g m, which makes a unit %.3g m; GPS, control points or `sc3d georeference` say it rightly",
+            SHARE,
+            TALL,
             frame.scale,
         )
     if colors is None:
