@@ -177,7 +177,7 @@ class Suggestions(Session):
         """(N,) bool points that lie in the image and not behind the first surface."""
         if self._surface is None:
             origin = local_origin(self._views)
-            self._surface = read_surface(self._scene.mesh, self._known.points, None, origin)
+            self._surface = read_surface(self._scene.surface, self._known.points, None, origin)
         pixels, _ = project(view, points)
         inside = in_image(view, pixels)
         directions, _ = rays(view, pixels[inside])

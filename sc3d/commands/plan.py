@@ -68,6 +68,8 @@ def _training(settings: Any, sizes: Sizes) -> float | None:
 
 def _segmenting(settings: Any, sizes: Sizes) -> float | None:
     """None: how long models and strokes take was not measured."""
+    if settings.backend == "geometry":
+        return 10 + 3.0 * megapixels(sizes, 1600)
     if settings.backend != "files":
         return None
     return (0.5 * len(sizes) if settings.refine else 0.0) + 0.1 * megapixels(sizes)

@@ -16,9 +16,10 @@ from sc3d.settings.common import Resources
 class Segment:
     """2D masks for all photos."""
 
-    backend: Literal["files", "strokes", "grounded-sam", "sam3"] = "files"
-    """Where masks come from: files (--masks), a few strokes that you drew (--strokes, no model), or text
-    prompts with Grounding DINO and SAM 2 or with SAM 3.
+    backend: Literal["files", "geometry", "strokes", "grounded-sam", "sam3"] = "files"
+    """Where masks come from: files (--masks), the scene's own surface (geometry: ground, low and high
+    vegetation, building by height above the ground, shape and color; no model, nothing to draw), a few
+    strokes that you drew (--strokes, no model), or text prompts with Grounding DINO and SAM 2 or with SAM 3.
     """
     masks: Path | None = None
     """Masks made elsewhere: a folder of PNGs named like the photos, a folder of LabelMe JSONs, a COCO JSON,

@@ -183,7 +183,9 @@ class Run:
     photos: Annotated[Positional[Path], arg(help="Folder of photos; never modified.")]
     scene: Annotated[Positional[Path], arg(help="Scene folder to write.")]
     masks: Path | None = None
-    """Masks made elsewhere; short for --segment.masks."""
+    """Masks made elsewhere; short for --segment.masks. Without any, and without --segment.backend, they are made
+    from the shape of the scene (geometry).
+    """
     confidence: Path | None = None
     """Folder of confidence maps; short for --segment.confidence."""
     classes: Path | None = None

@@ -1,9 +1,10 @@
-"""Photos (or a folder of masks) -> masks/ and confidence/."""
+"""Photos (or a folder of masks, or the cloud) -> masks/ and confidence/."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from sc3d.georeferencing.georeference import georeference_path
 from sc3d.io.atomic import discard
 from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.scene.class_table import ClassTable
@@ -13,6 +14,7 @@ from sc3d.segmentation.grounded_sam import GroundedSam
 from sc3d.segmentation.mask_formats.import_masks import import_scene_masks
 from sc3d.segmentation.sam3 import Sam3
 from sc3d.segmentation.segment import Segmenter, segment_scene
+from sc3d.segmentation.shape.backend import segment_by_shape, write_default_classes
 from sc3d.segmentation.strokes.backend import Strokes
 from sc3d.segmentation.strokes.model_file import from_part
 from sc3d.segmentation.text_prompts import replace_prompts
@@ -31,6 +33,8 @@ def inputs(scene: Scene, settings: Segment) -> list[Input]:
             *scene.surface,
             frames,
         ]
+    if settings.backend == "geometry":
+        return [scene.classes, scene.sparse, scene.cloud, *scene.surface, georeference_path(scene), frames]
     given = [path for path in (settings.masks, settings.confidence, settings.mapping) if path is not None]
     if settings.backend == "files":
         return [scene.classes, *given, frames, *([] if settings.masks else [scene.sparse])]
@@ -49,6 +53,11 @@ def besides(scene: Scene, settings: Segment) -> list[Path]:
     return [] if settings.refine else [scene.confidence, scene.instances]
 
 
+def begin(scene: Scene, settings: Segment) -> None:
+    if settings.backend == "geometry" and not settings.refine:
+        write_default_classes(scene)
+
+
 def run(scene: Scene, settings: Segment) -> dict[str, object]:
     """Make masks with a backend, import them, or (`--refine`) lower the confidence of those that are there."""
     class_table = scene.class_table()
@@ -59,6 +68,8 @@ def run(scene: Scene, settings: Segment) -> dict[str, object]:
     discard(scene.confidence_refined)  # it belongs to the masks that are replaced
     if settings.backend == "files":
         return import_scene_masks(scene, settings, class_table)
+    if settings.backend == "geometry":
+        return segment_by_shape(scene, class_table)
     class_table = replace_prompts(class_table, settings.prompts)
     segmenter = _segmenter(scene, settings, class_table)
     return segment_scene(scene, settings, class_table, segmenter).figures(class_table)

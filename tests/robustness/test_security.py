@@ -452,6 +452,7 @@ def reading_runs(scene: Path) -> dict[str, tuple[str, object]]:
         "extract depth": ("extract", reconstruction.Extract(method="depth")),
         "segment masks": ("segment", labels.Segment(masks=scene / "truth")),
         "segment in place": ("segment", labels.Segment()),
+        "segment geometry": ("segment", labels.Segment(backend="geometry")),
         "label cloud": ("label", labels.Label(cloud=scene / "seeds.ply")),
         "label prior": ("label", labels.Label(prior=scene / "seeds.ply")),
         "propagate save": ("propagate", labels.Propagate(save_model=scene / "site.npz")),
@@ -462,7 +463,7 @@ def reading_runs(scene: Path) -> dict[str, tuple[str, object]]:
 
 
 READS = [
-    *STAGES[1:], "georeference gps", "georeference again", "depth masks", "depth sky", "extract depth", "segment masks", "segment in place", "label cloud", "label density",
+    *STAGES[1:], "georeference gps", "georeference again", "depth masks", "depth sky", "extract depth", "segment masks", "segment in place", "segment geometry", "label cloud", "label density",
     "label prior", "propagate save", "import cloud",
 ]  # fmt: skip
 
