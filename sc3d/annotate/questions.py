@@ -1,10 +1,11 @@
-"""Where an answer of a person would change most: places of a labelled cloud, ranked. Knows nothing of photos or
-pages.
+"""Where an answer of a person would change most: places of a labelled cloud, ranked. Knows nothing of photos
+or pages.
 
-A point is doubtful as far as its label is not sure, and as the views that voted on it name another class. Doubts
-hang together: a place is a region of doubtful points with one label and one rival, the class that speaks most
-against it, and about one color. All of it is likely right or wrong together, so one answer settles it, and what
-it changes is the sum of its doubts. Of classes with few sure examples each answer also teaches the look.
+A point is doubtful as far as its label is not sure, and as the views that voted on it name another class.
+Doubts hang together: a place is a region of doubtful points with one label and one rival, the class that
+speaks most against it, and about one color. All of it is likely right or wrong together, so one answer
+settles it, and what it changes is the sum of its doubts. Of classes with few sure examples each answer also
+teaches the look.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ LEAST = 3  # points of a place
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of N points. points: (N, 3) float64 world; label: (N,) uint8 ids, 0 = none; confidence: (N,)
-    float32; state: (N,) uint8; votes: (N, C) float32 of the classes `ids` (C,) uint8, in views; colors: (N, 3)
-    uint8 or None; spacing: of the points, world units
+    """What is known of N points. points: (N, 3) float64 world; label: (N,) uint8 ids, 0 = none; confidence:
+    (N,) float32; state: (N,) uint8; votes: (N, C) float32 of the classes `ids` (C,) uint8, in views; colors:
+    (N, 3) uint8 or None; spacing: of the points, world units
     """
 
     points: np.ndarray
@@ -46,8 +47,8 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Place:
-    """A region to ask about. rows: (R,) of the cloud; label, rival: ids, 0 = none; gain: points that an answer
-    likely changes, more for rare classes
+    """A region to ask about. rows: (R,) of the cloud; label, rival: ids, 0 = none; gain: points that an
+    answer likely changes, more for rare classes
     """
 
     rows: np.ndarray

@@ -1,5 +1,5 @@
-"""What the page of `sc3d annotate --suggest` can do: show the place where an answer changes most, in the photo that
-sees it best, and write the answer down as a correction. Knows nothing of HTTP.
+"""What the page of `sc3d annotate --suggest` can do: show the place where an answer changes most, in the
+photo that sees it best, and write the answer down as a correction. Knows nothing of HTTP.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Which cells of a height raster stand on the ground: the simple morphological filter of Pingel et al. (2013),
-which allows for the slope around.
+"""Which cells of a height raster stand on the ground: the simple morphological filter of Pingel et al.
+(2013), which allows for the slope around.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def opened(heights: np.ndarray, size: int) -> np.ndarray:
 
 
 def _steepest(flat: np.ndarray, radius: float, pixel: float, share: int) -> np.ndarray:
-    """(H, W) percentile `share` of the slope of an opened surface (H, W), m per m, within reach of the flat tops that an
-    opening by `radius`, m, leaves.
+    """(H, W) percentile `share` of the slope of an opened surface (H, W), m per m, within reach of the flat
+    tops that an opening by `radius`, m, leaves.
     """
     if min(flat.shape) < 2:
         return np.zeros(flat.shape)

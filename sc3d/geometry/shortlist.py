@@ -1,4 +1,6 @@
-"""Which photos may show the same: neighbors by name, by place and by look, so that not all pairs must be matched."""
+"""Which photos may show the same: neighbors by name, by place and by look, so that not all pairs must be
+matched.
+"""
 
 from __future__ import annotations
 

@@ -42,8 +42,8 @@ def read_prior(
 ) -> PriorVotes:
     """What a classified cloud says of points (N, 3) float64 world.
 
-    path: the cloud in the world of the scene; name: as the user knows it; reach: largest distance of a classified
-        point, world units
+    path: the cloud in the world of the scene; name: as the user knows it; reach: largest distance of a
+        classified point, world units
     Raises InputError if the cloud has no classes of the table, or none of its points is near.
     """
     cloud = read_cloud(path)
@@ -68,8 +68,8 @@ def read_prior(
 
 
 def classes_of(cloud: o3d.t.geometry.PointCloud, table: ClassTable, name: Path) -> np.ndarray:
-    """(N,) uint8 ids that a cloud states, 0 = none: its own column `label`, else the ASPRS codes of its column
-    `classification`. One line counts what is of no class of the table.
+    """(N,) uint8 ids that a cloud states, 0 = none: its own column `label`, else the ASPRS codes of its
+    column `classification`. One line counts what is of no class of the table.
     """
     if "label" in cloud.point:
         ids, told = cloud.point["label"].numpy().ravel().astype(np.int64), "class id"

@@ -31,8 +31,9 @@ POOR = 50  # features: a photo with less shows little that can be found again
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that people should know. kind: one word for scripts; photos: their names; text: what; advice: what
-    to do; problem: it makes the check fail; told: the photos as the line names them, if not by name alone.
+    """Something that people should know. kind: one word for scripts; photos: their names; text: what; advice:
+    what to do; problem: it makes the check fail; told: the photos as the line names them, if not by name
+    alone.
     """
 
     kind: str
@@ -51,9 +52,9 @@ class Finding:
 class PhotoFigures:
     """Of one photo.
 
-    sharpness: share of the fine structure of the others where they show the same; exposure: stops brighter than
-        they; partners: others that show the same; overlap: share of it that the best of them shows; covered:
-        share that two others show
+    sharpness: share of the fine structure of the others where they show the same; exposure: stops brighter
+        than they; partners: others that show the same; overlap: share of it that the best of them shows;
+        covered: share that two others show
     position: east, north, up, m, by GPS; gps_offset: m from where the cameras are
     """
 

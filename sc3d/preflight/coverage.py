@@ -18,8 +18,8 @@ ENOUGH = 3  # photos that make a surface sure
 
 @dataclass(frozen=True)
 class Coverage:
-    """photos: (rows, columns) int, how many show each cell, north or top first; cell: its side; metric: in m, not
-    in units of the model.
+    """photos: (rows, columns) int, how many show each cell, north or top first; cell: its side; metric: in m,
+    not in units of the model.
     """
 
     photos: np.ndarray
@@ -41,8 +41,8 @@ class Coverage:
 
 
 def coverage_of(model: SparseModel, points: np.ndarray, metric: bool) -> Coverage | None:
-    """What a photo shows from above is the convex hull of the points that it sees. points: (P, 3) those of the
-    model, z up; None without any.
+    """What a photo shows from above is the convex hull of the points that it sees. points: (P, 3) those of
+    the model, z up; None without any.
     """
     seen = np.unique(np.concatenate([*model.tracks, np.zeros(0, int)])).astype(int)
     if not len(seen):

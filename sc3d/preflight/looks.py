@@ -42,7 +42,8 @@ class Look:
     size: width and height as stored, px
     points: (K, 2) float32 features, shares of width and height; descriptors: (K, 128) float32 unit RootSIFT
     sharpness: (GRID, GRID) log of fine by coarse structure, nan where there is none
-    brightness: (GRID, GRID) log2 of the light, 0 = white; white, black: shares of the pixels that show nothing
+    brightness: (GRID, GRID) log2 of the light, 0 = white; white, black: shares of the pixels that show
+        nothing
     """
 
     size: tuple[int, int]
@@ -112,8 +113,8 @@ def _features(gray: np.ndarray, opaque: np.ndarray | None, effort: Effort) -> tu
 
 
 def sharpness(gray: np.ndarray) -> np.ndarray:
-    """(GRID, GRID) log of the amplitude of fine by coarse structure in the cells of a (H, W) uint8 picture; nan
-    where it has no structure. The ratio does not depend on contrast.
+    """(GRID, GRID) log of the amplitude of fine by coarse structure in the cells of a (H, W) uint8 picture;
+    nan where it has no structure. The ratio does not depend on contrast.
     """
     pixels = gray.astype(np.float32)
     levels = [cv2.GaussianBlur(pixels, (0, 0), sigma) for sigma in BANDS]

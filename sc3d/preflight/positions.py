@@ -12,7 +12,8 @@ ORDERED = 0.5  # of the usual distance from the middle: photos whose steps are l
 
 
 def jumps(flight: Flight, centers: dict[str, np.ndarray]) -> tuple[dict[str, float], dict[str, float]]:
-    """How far, m, cameras lie from their GPS, by photo name; and the photos whose GPS is wrong, and by how much.
+    """How far, m, cameras lie from their GPS, by photo name; and the photos whose GPS is wrong, and by how
+    much.
 
     centers: camera center (3,) by photo name, in any frame
     """

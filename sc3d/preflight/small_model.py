@@ -21,8 +21,8 @@ logger = logging.getLogger(__name__)
 
 
 def rough_model(folder: Path, names: list[str], pairs: list[Pair]) -> SparseModel | None:
-    """Cameras and points of the photos that fit together, in a frame of their own; GPS is not used. None if no
-    two fit.
+    """Cameras and points of the photos that fit together, in a frame of their own; GPS is not used. None if
+    no two fit.
 
     names: relative to `folder`, in the order of the rows of `pairs`
     """

@@ -1,5 +1,5 @@
-"""What classes look like, from one site to another: the examples' histograms of `appearance`, with the borders
-of their bins and the unit of heights, so that they are the same bins on another cloud.
+"""What classes look like, from one site to another: the examples' histograms of `appearance`, with the
+borders of their bins and the unit of heights, so that they are the same bins on another cloud.
 
 A site's own borders are quantiles and its heights are in point spacings, which differ from site to site: a
 model keeps its borders, and heights in meters where the scene is georeferenced. Where no scale is known,

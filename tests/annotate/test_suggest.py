@@ -1,4 +1,6 @@
-"""Asking where an answer changes most: the ranking, the corrections that answers become, and the page in a browser."""
+"""Asking where an answer changes most: the ranking, the corrections that answers become, and the page in a
+browser.
+"""
 
 import io
 import json

@@ -1,4 +1,6 @@
-"""What one site taught labels another: by color and relief in meters, as a prior beside votes, or it is refused."""
+"""What one site taught labels another: by color and relief in meters, as a prior beside votes, or it is
+refused.
+"""
 
 import json
 import zipfile
@@ -35,7 +37,9 @@ PLACE = {"epsg": 32615, "offset": [576000, 5188000, 0]}
 def site(
     path: Path, seed: int, *, votes: bool, size: float = 1.0, place: dict | None = PLACE, every: int = 1
 ) -> tuple[Scene, np.ndarray]:
-    """A village, as a scene with a cloud or seeds, and its truth. size: world units per meter; every: thins it."""
+    """A village, as a scene with a cloud or seeds, and its truth. size: world units per meter; every: thins
+    it.
+    """
     points, normals, colors, truth = (part[::every] for part in village(seed))
     write_cameras(path / "sparse" / "0", views())
     (path / "classes.json").write_text(json.dumps(CLASSES))

@@ -221,7 +221,9 @@ TURN = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], float)  # z to y: a world wh
 
 @pytest.fixture
 def scene(tmp_path):
-    """The village in a world whose up is -y, half as large, with four photos from above; no classes, no place."""
+    """The village in a world whose up is -y, half as large, with four photos from above; no classes, no
+    place.
+    """
     points, colors, _ = village()
     world = 0.5 * points @ TURN.T
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(world))

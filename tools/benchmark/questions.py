@@ -1,6 +1,6 @@
-"""What answers are worth: the error that is left after so many of them, asked by `sc3d annotate --suggest`, at
-random places, and at the least sure ones. A person is simulated who knows the truth of each point, and skips a
-place that is several things at once.
+"""What answers are worth: the error that is left after so many of them, asked by `sc3d annotate --suggest`,
+at random places, and at the least sure ones. A person is simulated who knows the truth of each point, and
+skips a place that is several things at once.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Meters, up is z: as the scene's place says, else up by the cameras and a scale by what stands on the ground."""
+"""Meters, up is z: as the scene's place says, else up by the cameras and a scale by what stands on the
+ground.
+"""
 
 from __future__ import annotations
 
@@ -55,8 +57,8 @@ def upright(up: np.ndarray) -> np.ndarray:
 
 
 def estimate_scale(points: np.ndarray) -> float:
-    """Meters per unit of points (N, 3), up is z: such that SHARE per cent of what stands on the ground is lower
-    than TALL.
+    """Meters per unit of points (N, 3), up is z: such that SHARE per cent of what stands on the ground is
+    lower than TALL.
     """
     low, high = np.percentile(points[:, :2], [2, 98], axis=0)
     extent = float((high - low).max()) or 1.0

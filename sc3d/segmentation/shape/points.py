@@ -1,5 +1,6 @@
 """Ground, low vegetation, high vegetation, building or none of them: by height above the ground, shape and
-color. Nothing is learned; every length is in meters, measured or estimated by `sc3d.segmentation.shape.frame`.
+color. Nothing is learned; every length is in meters, measured or estimated by
+`sc3d.segmentation.shape.frame`.
 """
 
 from __future__ import annotations
