@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from sc3d.errors import Sc3dError
+from sc3d.errors import InputError, Sc3dError
 from sc3d.extraction.centers import center_cloud
+from sc3d.geometry.raycast import first_surface
+from sc3d.io.clouds import read_mesh, write_geometry
+from sc3d.io.ply import num_triangles
+from sc3d.scene.labelled_cloud import read_surface
 from sc3d.splatting.gaussians import Gaussians
 from tests.extraction.builders import data, flat_square, surface_of, views
 
@@ -65,3 +69,17 @@ def test_centers_with_colors_and_normals_towards_the_cameras():
     assert np.abs(cloud.point.colors.numpy().astype(int) - [200, 120, 40]).max() <= 1
     with pytest.raises(Sc3dError, match="min-opacity"):
         center_cloud(gaussians, np.zeros((1, 3)), 0.99)
+
+
+def test_nothing_unconfirmed_is_a_mesh_file_without_triangles(tmp_path):
+    surfaces = surface_of(flat_square(4.0, 0.5), data(), "nothing")
+    files = [tmp_path / "mesh.ply", tmp_path / "unconfirmed.ply"]
+    for path, mesh in zip(files, (surfaces.mesh, surfaces.unconfirmed), strict=True):
+        write_geometry(path, mesh)
+    count = len(surfaces.mesh.triangle.indices)
+    assert num_triangles(files[1:]) == 0 and num_triangles(files) == count
+    with pytest.raises(InputError, match="holds no triangles"):
+        read_mesh(files[1])
+    points = surfaces.cloud.point.positions.numpy().astype(np.float64)
+    target = read_surface(files, points, None, np.zeros(3))
+    assert np.isfinite(first_surface(target, views()[0]).range).any()
