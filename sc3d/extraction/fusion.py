@@ -132,7 +132,9 @@ def _split(sure: Part, unsure: Part, supported: tuple[np.ndarray, np.ndarray]) -
     if triangles.all() and points.all():
         return sure, unsure
     if not (triangles.any() and points.any()):
-        logger.warning("the photos correlate nowhere on the surface of the Gaussians: none of it is sure")
+        logger.warning(
+            "the photos correlate nowhere on the surface of the Gaussians: none of it is sure, and all is kept"
+        )
         return sure, unsure
     kept, others = (
         (mesh.select_faces_by_mask(o3d.core.Tensor(rows)), cloud.select_by_mask(o3d.core.Tensor(chosen)))

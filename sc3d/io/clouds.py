@@ -25,6 +25,7 @@ from sc3d.io.ply import (
     Property,
     check_ply,
     format_header,
+    num_triangles,
     read_columns,
     read_header,
     read_positions,
@@ -71,6 +72,8 @@ def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
     """
     if path.is_file() and _has_capitals(read_header(path)):
         raise InputError(f"{path} has its positions as X Y Z: name these properties of the mesh x y z")
+    if path.is_file() and path.suffix.lower() == ".ply" and not num_triangles([path]):
+        raise InputError(f"{path} holds no triangles")
     mesh = _read_geometry(path, "read_triangle_mesh", {".ply"})
     if "positions" not in mesh.vertex or "indices" not in mesh.triangle or not len(mesh.triangle.indices):
         raise InputError(f"{path} holds no triangles")
