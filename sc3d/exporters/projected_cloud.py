@@ -169,7 +169,7 @@ def _tell_unconfirmed(path: Path, count: int, total: int) -> None:
         )
     if count:
         logger.info(
-            "%d of %d points are left out, as no second photo confirms them; --unconfirmed writes them too",
+            "%d of %d points are left out, as no second photo confirms them; `sc3d export --unconfirmed` writes them",
             count,
             total,
         )
@@ -189,10 +189,13 @@ def projected_chunks(scene: Scene, settings: Export) -> Iterator[ProjectedCloud]
         yield read_projected_cloud(scene, settings)
         return
     projection, table = find_projection(scene, settings), scene.class_table()
+    left = 0
     for _, records in CloudFile.open(path).chunks():
         names = records.dtype.names or ()
         if UNCONFIRMED in names and not settings.unconfirmed:
-            records = records[records[UNCONFIRMED] == 0]
+            kept = records[UNCONFIRMED] == 0
+            left += int((~kept).sum())
+            records = records[kept]
         if not len(records):
             continue
         cloud = o3d.t.geometry.PointCloud(positions(records))
@@ -205,6 +208,8 @@ def projected_chunks(scene: Scene, settings: Export) -> Iterator[ProjectedCloud]
         labels = take_labels(cloud, path, "propagate")
         _require_known(table, labels, path, scene)
         yield ProjectedCloud(cloud, labels, projection.to_crs(positions(records)), projection)
+    if left:
+        _tell_unconfirmed(path, left, count)
 
 
 def chosen_classes(scene: Scene, settings: Export) -> set[int]:

@@ -224,7 +224,10 @@ def test_points_that_no_second_photo_confirms_are_left_out_or_flagged(tmp_path, 
     np.testing.assert_array_equal(las.synthetic, flags)
 
 
-def test_a_cloud_without_any_confirmed_point_is_refused(tmp_path):
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_cloud_without_any_confirmed_point_is_refused(tmp_path, monkeypatch, whole):
+    if not whole:
+        monkeypatch.setattr("sc3d.exporters.projected_cloud.fits", lambda *_: False)
     cloud = random_cloud(50)
     cloud.point.unconfirmed = o3d.core.Tensor(np.ones((50, 1), np.uint8))
     with pytest.raises(InputError, match="--unconfirmed"):
