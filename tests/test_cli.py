@@ -357,3 +357,16 @@ def test_a_log_gets_the_messages_and_the_error(scene, tmp_path, capsys):
     message = fails(capsys, "propagate", scene, "--quiet", "--log", log)
     assert log.read_text().endswith(f" {message}\n")
     assert "cannot write" in fails(capsys, "propagate", scene, "--log", tmp_path / "nowhere" / "file.log")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("label", "--prior-weight", "nan"),
+        ("propagate", "--method", "geometry", "--save-model", "m.npz"),
+        ("extract", "--crop", "2", "--from", "centers"),
+    ],
+)
+def test_settings_that_do_not_go_together_are_one_line(scene, capsys, options):
+    name, *rest = options
+    fails(capsys, name, scene, *rest)

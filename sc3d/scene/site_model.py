@@ -34,6 +34,17 @@ class ModelPart:
     arrays: Mapping[str, np.ndarray]
 
 
+def require_model_or_nothing(path: Path) -> None:
+    """InputError if there is anything but a model that a new one would replace."""
+    if path.exists():
+        try:
+            _read_head(path)
+        except InputError:
+            raise InputError(
+                f"{path} exists and is no model of this sc3d, so that --save-model does not replace it: choose another name"
+            ) from None
+
+
 def write_model(path: Path, table: ClassTable, parts: Mapping[str, ModelPart]) -> None:
     """Write a model of the classes of a table."""
     head = {

@@ -45,6 +45,8 @@ def run(scene: Scene, settings: Label) -> dict[str, object]:
     """Fuse the masks, in memory or, where the cloud does not fit, by tiles; clouds of another program are
     brought into the world of the scene before.
     """
+    if settings.prior and settings.prior.resolve() == (settings.output or scene.seeds).resolve():
+        raise InputError(f"{settings.prior} is what label writes, and no prior: copy it, or pass --output")
     scene.warn_of_unplaced(scene.masks, *([best_confidence(scene)] if settings.use_confidence else []))
     output = settings.output or scene.seeds
     with ExitStack() as stack:

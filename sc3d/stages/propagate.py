@@ -11,12 +11,18 @@ from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.propagation.propagate import propagate_scene
 from sc3d.runner import MAX_SIDECAR, sidecar
 from sc3d.scene.scene import Scene
-from sc3d.scene.site_model import ModelPart, read_model, write_model
+from sc3d.scene.site_model import ModelPart, read_model, require_model_or_nothing, write_model
 from sc3d.segmentation.strokes.backend import Strokes
 from sc3d.segmentation.strokes.model_file import to_part
 from sc3d.settings.labels import Propagate
 from sc3d.tiling.propagate import propagate_fits
 from sc3d.tiling.propagate import propagate_scene as propagate_scene_by_tiles
+
+
+def begin(scene: Scene, settings: Propagate) -> None:
+    """Refuse a model that would replace another file."""
+    if settings.save_model:
+        require_model_or_nothing(settings.save_model)
 
 
 def inputs(scene: Scene, settings: Propagate) -> list[Input]:

@@ -111,3 +111,8 @@ def test_a_cloud_in_tiles_is_refused(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(stage, "label_fits", lambda *_: False)
     with pytest.raises(InputError, match="--prior needs the whole cloud in memory"):
         stage.run(scene, Label(prior=prior))
+
+
+def test_the_labels_of_before_are_no_prior(scene):
+    with pytest.raises(InputError, match="is what label writes"):
+        stage.run(scene, Label(prior=scene.seeds))

@@ -208,3 +208,13 @@ def test_apply_in_the_viewer_starts_from_the_same_model(model, tmp_path):
     (scene.path / "town.npz").write_bytes(model.read_bytes())
     execute("propagate", scene, Propagate(model=scene.path / "town.npz", save_model=scene.path / "again.npz"))
     assert made_with(scene) == Propagate(model=scene.path / "town.npz")
+
+
+def test_a_model_replaces_a_model_only(model, tmp_path):
+    stage.begin(Scene(tmp_path), Propagate(save_model=tmp_path / "new.npz"))
+    stage.begin(Scene(tmp_path), Propagate(save_model=model))
+    np.savez(tmp_path / "votes.npz", np.zeros(3))
+    (tmp_path / "cloud.ply").write_text("ply\n")
+    for path in (tmp_path, tmp_path / "votes.npz", tmp_path / "cloud.ply"):
+        with pytest.raises(InputError, match="exists and is no model"):
+            stage.begin(Scene(tmp_path), Propagate(save_model=path))
