@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.errors import InputError, examples
+from sc3d.errors import InputError, examples, left_out
 from sc3d.georeferencing.geotags import read_geotags
 from sc3d.georeferencing.gps import Flight, read_flight, told_distance
 from sc3d.io.images import check_photo
@@ -109,7 +109,8 @@ def check_folder(folder: Path, scene: Scene | None) -> CheckResult:
     broken = {name for finding in findings for name in finding.photos}
     names = [name for name in names if name not in broken]
     if len(names) < 2:
-        raise InputError(f"{folder} holds fewer than two photos that can be used: {len(broken)} cannot")
+        why = f"; {left_out(sorted(broken), len(names) + len(broken), 'cannot')}" if broken else ""
+        raise InputError(f"{folder} holds fewer than two photos that can be used{why}")
     looks = look_at_photos(folder, names)
     tags = read_geotags(folder, names)[0]
     flight = read_flight(folder, names, quiet=True)

@@ -279,3 +279,10 @@ def _save(file: Path, pixels: np.ndarray, exif: Image.Exif | None = None) -> Non
     """With the EXIF that the photo has, unless there is another."""
     kept = exif or Image.open(file).getexif()
     Image.fromarray(pixels).save(file, quality=95, exif=kept)
+
+
+def test_photos_that_leave_too_few_are_named(tmp_path):
+    for name in ("one.jpg", "two.jpg"):
+        (tmp_path / name).write_text("none")
+    with pytest.raises(InputError, match="2 of 2 cannot: one.jpg, two.jpg"):
+        check_folder(tmp_path, None)
