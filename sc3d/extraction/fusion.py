@@ -163,7 +163,13 @@ def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[P
     if few := hardly_confirmed([view.name for view in data.views], shares):
         logger.warning(few)
     sizes = [view.width * view.height for view in data.views]
-    return _part(fusion), float(np.average(shares, weights=sizes))
+    part = _part(fusion)
+    if not len(part[0].vertex.positions):
+        raise Sc3dError(
+            f"all confirmed surface is in loose parts of fewer than {MIN_PART} triangles: "
+            "more overlap is needed, or longer training, or a smaller --voxel-size"
+        )
+    return part, float(np.average(shares, weights=sizes))
 
 
 def _part(fusion: DepthFusion) -> Part:

@@ -174,6 +174,8 @@ def drop_small_parts(mesh: o3d.t.geometry.TriangleMesh, min_triangles: int) -> o
     """Remove connected components of fewer than `min_triangles` triangles (floaters); those that share a
     vertex are connected.
     """
+    if not len(mesh.vertex.positions):
+        return mesh  # Open3D cannot choose from nothing
     triangles = mesh.triangle.indices.numpy()
     ends, num_vertices = triangles[:, [1, 2]].ravel(), len(mesh.vertex.positions)
     edges = coo_array(

@@ -3,12 +3,17 @@
 from dataclasses import replace
 
 import numpy as np
+import open3d as o3d
 import pytest
 import torch
 
 from sc3d.errors import InputError, Sc3dError
 from sc3d.extraction.centers import center_cloud
+from sc3d.extraction.evidence import EvidenceStore
+from sc3d.extraction.fusion import fuse_views
+from sc3d.extraction.rendered import write_rendered
 from sc3d.geometry.raycast import first_surface
+from sc3d.geometry.tsdf import drop_small_parts
 from sc3d.io.clouds import read_mesh, write_geometry
 from sc3d.io.ply import num_triangles
 from sc3d.scene.labelled_cloud import read_surface
@@ -83,3 +88,19 @@ def test_nothing_unconfirmed_is_a_mesh_file_without_triangles(tmp_path):
     points = surfaces.cloud.point.positions.numpy().astype(np.float64)
     target = read_surface(files, points, None, np.zeros(3))
     assert np.isfinite(first_surface(target, views()[0]).range).any()
+
+
+@pytest.mark.parametrize("voxel_size", [0.5, 40.0])
+def test_a_surface_of_loose_parts_only_is_said(tmp_path, voxel_size):
+    """Small enough to be dropped, or no triangle at all."""
+    store = EvidenceStore(tmp_path)
+    write_rendered(flat_square(0.4, 0.0), data(), store, 1, "blended")
+    with pytest.raises(Sc3dError, match="loose parts"):
+        fuse_views(data(), store, voxel_size, "nothing")
+
+
+def test_no_parts_of_nothing():
+    empty = o3d.t.geometry.TriangleMesh(
+        o3d.core.Tensor.zeros((0, 3)), o3d.core.Tensor.zeros((0, 3), o3d.core.int32)
+    )
+    assert not len(drop_small_parts(empty, 100).triangle.indices)
