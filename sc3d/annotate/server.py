@@ -2,8 +2,7 @@
 
 What keeps others out: requests under another name or from another page are refused (`sc3d.io.local_page`),
 and whatever writes or computes must come from the page's own origin and carry the token that only this page
-was given. Photos are found by
-their names in a list, never by a path.
+was given. Photos are found by their names in a list, never by a path.
 """
 
 from __future__ import annotations
@@ -33,6 +32,7 @@ PORTS_TRIED = 20
 STATIC = {
     "/": ("page.html", "text/html"),
     "/page.js": ("page.js", "text/javascript"),
+    "/ask.js": ("ask.js", "text/javascript"),
     "/canvas.js": ("canvas.js", "text/javascript"),
     "/drawing.js": ("drawing.js", "text/javascript"),
     "/style.css": ("style.css", "text/css"),
@@ -212,6 +212,7 @@ class SuggestHandler(Handler):
     static = {
         "/": ("suggest.html", "text/html"),
         "/suggest.js": ("suggest.js", "text/javascript"),
+        "/ask.js": STATIC["/ask.js"],
         "/style.css": STATIC["/style.css"],
     }
 

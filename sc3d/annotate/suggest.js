@@ -1,18 +1,10 @@
 // The page that asks: one place at a time, outlined in a photo; a key answers.
 
-const $ = id => document.getElementById(id);
-const token = document.querySelector("meta[name=token]").content;
+import { $, ask } from "/ask.js";
+
 const canvas = $("canvas"), context = canvas.getContext("2d");
 const AROUND = 5; // sizes of the place that are shown around it
 let now = null, image = null, stem = "", wide = false, busy = false;
-
-async function ask(path, content) {
-  const headers = { "Content-Type": "application/json", "X-Token": token };
-  const options = content === undefined ? {} : { method: "POST", headers, body: JSON.stringify(content) };
-  const answer = await fetch(path, options).catch(() => { throw new Error("the server does not answer: is `sc3d annotate` still running?"); });
-  if (!answer.ok) throw new Error((await answer.json().catch(() => ({}))).error || `the server answers ${answer.status}`);
-  return answer.headers.get("Content-Type").startsWith("image/") ? createImageBitmap(await answer.blob()) : answer.json();
-}
 
 // One request at a time; what is pressed meanwhile says nothing.
 async function go(path, content) {

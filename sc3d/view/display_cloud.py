@@ -172,7 +172,8 @@ def load_cloud(
 ) -> o3d.t.geometry.PointCloud:
     """The cloud of a file, else the best of the scene; InputError if there is none.
 
-    unconfirmed: of the scene, with what no second photo confirms; votes: add those of seeds.ply to a cloud of the scene that has none; None = where that is possible
+    unconfirmed: of the scene, with what no second photo confirms
+    votes: add those of seeds.ply to a cloud of the scene that has none; None = where that is possible
     """
     path = file or scene.best_cloud
     if path is None:
