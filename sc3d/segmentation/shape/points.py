@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
+from scipy.special import expit
 
 from sc3d.errors import InputError
 from sc3d.geometry.graph import Graph, build_graph
@@ -94,7 +95,7 @@ def classify(points: np.ndarray, colors: np.ndarray | None) -> np.ndarray:
         colors = colors[graph.order].astype(np.float64)
         green = _shared(graph, _green_odds(colors))
         leafy = rough + (_shared(graph, _unevenness(graph, colors)) - EVEN) / 2
-        plants = _sigmoid(green)
+        plants = expit(green)
         around = _surroundings(points, leafy, plants * (1 - _standing(relief)))
         ruffled = rough + plants * ((leafy + 2 * around) / 3 - rough)
         relief = find_relief(points, flat & (ruffled < SMOOTH))
@@ -143,11 +144,11 @@ def _combined(
     """
     leaves = _odds(rough, ROUGH, ROUGH_WIDTH)
     stands = _standing(relief)
-    plant = _sigmoid(leaves if green is None else green + leaves / 2)
-    low = np.zeros(len(points)) if green is None else _sigmoid(green)
-    bush = _sigmoid((ruffled - BUSH) / BUSH_WIDTH)
-    tall = _sigmoid((relief.height - HIGH) / HIGH_WIDTH)
-    foot = _built_above(points, relief, plant) * _sigmoid((steep - 0.7) / 0.1)
+    plant = expit(leaves if green is None else green + leaves / 2)
+    low = np.zeros(len(points)) if green is None else expit(green)
+    bush = expit((ruffled - BUSH) / BUSH_WIDTH)
+    tall = expit((relief.height - HIGH) / HIGH_WIDTH)
+    foot = _built_above(points, relief, plant) * expit((steep - 0.7) / 0.1)
     wall, built = np.maximum(tall, foot), stands * (1 - plant)
     return np.stack(
         [
@@ -163,7 +164,7 @@ def _combined(
 
 def _standing(relief: Relief) -> np.ndarray:
     """(N,) probability that a point stands on the ground, and is none of it."""
-    return _sigmoid((relief.height - STANDS) / STANDS_WIDTH)
+    return expit((relief.height - STANDS) / STANDS_WIDTH)
 
 
 def _unevenness(graph: Graph, colors: np.ndarray) -> np.ndarray:
@@ -225,7 +226,3 @@ def _shared(graph: Graph, values: np.ndarray) -> np.ndarray:
     for _ in range(SPREAD):
         values = (weights @ values + values) / total
     return values
-
-
-def _sigmoid(odds: np.ndarray) -> np.ndarray:
-    return 1 / (1 + np.exp(-np.clip(odds, -30, 30)))
