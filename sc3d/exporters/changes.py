@@ -12,9 +12,9 @@ from sc3d.errors import InputError
 from sc3d.exporters.height_grids import LabelledPoints, SurfaceGrid, surface_grid
 from sc3d.exporters.packages import load
 from sc3d.exporters.polygonize import polygonize, simplified
-from sc3d.exporters.regions import cells_by_number, disk, renumbered
-from sc3d.exporters.terrain import ground_classes
 from sc3d.geometry.raster import Raster
+from sc3d.instances.regions import cells_by_number, disk, renumbered
+from sc3d.instances.terrain import ground_classes
 from sc3d.scene.class_table import ClassTable
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import numpy as np
 import sc3d
 from sc3d.errors import InputError
 from sc3d.exporters.projected_cloud import ProjectedCloud, chosen_classes, projected_chunks
-from sc3d.exporters.terrain import require_ground
+from sc3d.instances.terrain import require_ground
 from sc3d.io.atomic import atomic_path
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import is_confirmed

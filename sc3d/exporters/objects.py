@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.exporters.buildings import roof_heights, roof_tops, split_buildings
 from sc3d.exporters.packages import load
 from sc3d.exporters.polygonize import orthogonalized, polygonize, simplified
 from sc3d.exporters.projected_cloud import ProjectedCloud, find_projection, read_projected_cloud
-from sc3d.exporters.regions import cells_by_number
-from sc3d.exporters.terrain import ground_classes, ground_height, tree_codes
-from sc3d.exporters.trees import MIN_CROWN, canopy_height, split_crowns
 from sc3d.exporters.vector_files import Feature, has_geopackage, write_geojson, write_geopackage
 from sc3d.geometry.raster import Raster, spacing_of_all
+from sc3d.instances.buildings import roof_heights, roof_tops, split_buildings
+from sc3d.instances.regions import cells_by_number
+from sc3d.instances.terrain import ground_classes, ground_height, tree_codes
+from sc3d.instances.trees import MIN_CROWN, canopy_height, split_crowns
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export

@@ -71,6 +71,12 @@ class Raster:
         rows, columns = self.cells(points)
         return rows * self.width + columns
 
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """(N,) bool: which of the (N, >= 2) points, CRS, lie on the grid, edges included."""
+        across, down = points[:, 0] - self.left, self.top - points[:, 1]
+        inside = (across >= 0) & (across <= self.width * self.pixel)
+        return inside & (down >= 0) & (down <= self.height * self.pixel)
+
     def centers(self, first_row: int = 0, num_rows: int | None = None) -> np.ndarray:
         """(num_rows * width, 2) float64 positions of the cell centers, CRS, row by row."""
         num_rows = self.height - first_row if num_rows is None else num_rows

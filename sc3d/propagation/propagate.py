@@ -5,7 +5,7 @@ method, in the paper's order. By tiles, with the same signature: `tiling.propaga
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.graph import Graph, build_graph
 from sc3d.georeferencing.georeference import read_georeference
 from sc3d.georeferencing.up_direction import scene_up
+from sc3d.instances.scene_objects import SceneObjects
 from sc3d.io.clouds import read_cloud, write_geometry
 from sc3d.propagation.appearance import LearnedAppearance, learn_appearance, plausible, uses_appearance
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
@@ -25,7 +26,14 @@ from sc3d.propagation.region_growing import grow_regions, reachable, vote_neares
 from sc3d.propagation.saved_appearance import SavedAppearance
 from sc3d.scene.channels import Channels
 from sc3d.scene.corrections import Corrections
-from sc3d.scene.labelled_cloud import Votes, point_arrays, read_labelled, read_votes, with_labels
+from sc3d.scene.labelled_cloud import (
+    Votes,
+    is_confirmed,
+    point_arrays,
+    read_labelled,
+    read_votes,
+    with_labels,
+)
 from sc3d.scene.labels import CORRECTED, LOCKED, PROPAGATED, SEED, UNLOCKED, UNSEEN, Labels
 from sc3d.scene.scene import Scene
 from sc3d.scene.site_model import ModelPart, read_model
@@ -115,6 +123,7 @@ def with_states(
 class PropagateSummary:
     """Of a finished cloud: points, those with a label, those that got it here, the sum of the labelled
     points' confidences, and those that people corrected. learned: what `--save-model` keeps, if it is asked for.
+    objects: how many there are of each countable class.
     """
 
     num_points: int
@@ -123,6 +132,7 @@ class PropagateSummary:
     confidence: float
     corrected: int = 0
     learned: ModelPart | None = None
+    objects: dict[str, int] = field(default_factory=dict)
 
     def figures(self) -> dict[str, object]:
         """What the stage reports."""
@@ -131,7 +141,9 @@ class PropagateSummary:
             "labelled": f"{self.labelled / self.num_points:.1%}",
             "propagated": f"{self.propagated / self.num_points:.1%}",
             "mean_confidence": round(self.confidence / max(self.labelled, 1), 3),
-        } | ({"corrected": self.corrected} if self.corrected else {})
+            **({"corrected": self.corrected} if self.corrected else {}),
+            **({"objects": self.objects} if self.objects else {}),
+        }
 
 
 def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
@@ -156,16 +168,20 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
         learn = partial(saved.on, channels=channels, meters=meters, origin=settings.model)
     found = propagate(points, normals, settings, graph, learn)
     labels = replace(found, label=channels.to_ids(found.label))
-    write_geometry(settings.output or scene.labelled, with_labels(cloud, normals, labels))
+    sure = is_confirmed(cloud)
+    objects = SceneObjects.tell_apart(scene, lambda: iter([(positions, labels.label, sure)]))
+    instance = None if objects is None else objects.find(positions, labels.label)
+    output = settings.output or scene.labelled
+    write_geometry(output, with_labels(cloud, normals, labels, instance=instance))
     learned = None
     if settings.save_model is not None:
         kept = SavedAppearance.learn(graph, points, found, channels, meters)
         learned = None if kept is None else kept.to_part()
-    labelled, sure = labels.label > 0, labels.confidence
+    labelled, counts = labels.label > 0, {} if objects is None else objects.figures()
     propagated = int((labelled & (labels.state == PROPAGATED)).sum())
-    total = float(sure[labelled].sum(dtype=np.float64))
+    total = float(labels.confidence[labelled].sum(dtype=np.float64))
     corrected = int((labels.state == CORRECTED).sum())
-    return PropagateSummary(len(labelled), int(labelled.sum()), propagated, total, corrected, learned)
+    return PropagateSummary(len(labelled), int(labelled.sum()), propagated, total, corrected, learned, counts)
 
 
 def _read_start(

@@ -19,13 +19,17 @@ CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 MAX_NAME, MAX_BYTES = 200, 1 << 20
 # in truth masks, unless a class has one of these ids: looked at and none of the classes; not to be judged
 OTHER, UNJUDGED = 254, 255
+BUILDING_CODE = 6  # ASPRS code
+LOW, MEDIUM, HIGH = 3, 4, 5  # ASPRS codes of vegetation
+VEHICLES = ("car", "cars", "vehicle", "vehicles")  # names of what LAS has no code for
 
 
 @dataclass(frozen=True)
 class SemanticClass:
     """One class. id: 1 to 255 (0 is reserved: unlabelled); color: RGB uint8; prompts: texts for segmenters;
     asprs: LAS class code; surface: False for what masks may show and no point can be, such as the sky;
-    rest: mask pixels without a class are of this one.
+    rest: mask pixels without a class are of this one; countable: whether its objects are told apart, None =
+    as `ClassTable.is_countable` has it.
     """
 
     id: int
@@ -35,6 +39,7 @@ class SemanticClass:
     asprs: int = 1
     surface: bool = True
     rest: bool = False
+    countable: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -94,6 +99,23 @@ class ClassTable:
             (entry.name for entry in self.classes if entry.id == label), rest.get(label, f"class {label}")
         )
 
+    def entry(self, label: int) -> SemanticClass:
+        """The class of an id that the table has."""
+        return next(entry for entry in self.classes if entry.id == label)
+
+    @property
+    def tree_codes(self) -> set[int]:
+        """ASPRS codes of trees: medium and high vegetation; low if no class has those."""
+        codes = {entry.asprs for entry in self.classes}
+        return {MEDIUM, HIGH} if {MEDIUM, HIGH} & codes else {LOW}
+
+    def is_countable(self, entry: SemanticClass) -> bool:
+        """Whether objects of a class are told apart: as the table says, else buildings, trees and vehicles."""
+        if entry.countable is not None:
+            return entry.countable
+        coded = entry.asprs in {BUILDING_CODE, *self.tree_codes}
+        return entry.surface and (coded or entry.name.casefold() in VEHICLES)
+
     def find(self, name: str) -> int | None:
         """Id of a class by its name: as it is written, else in any letter case if only one class fits; None if
         none does.
@@ -109,13 +131,17 @@ class ClassTable:
 
     def as_json(self) -> list[dict]:
         """The list that `classes.json` holds; `surface` where it is not what the name says, `rest` where it
-        is true.
+        is true, `countable` where it is said.
         """
         return [
             {
                 key: value
                 for key, value in asdict(entry).items()
-                if {"surface": value != _usual_surface(entry.name), "rest": value}.get(key, True)
+                if {
+                    "surface": value != _usual_surface(entry.name),
+                    "rest": value,
+                    "countable": value is not None,
+                }.get(key, True)
             }
             for entry in self.classes
         ]
@@ -182,7 +208,12 @@ def _parse_class(entry: object, origin: Path | str) -> SemanticClass:
     for key, value in (("surface", surface), ("rest", rest)):
         if not isinstance(value, bool):
             raise InputError(f"{origin}: {key} of class {label} must be true or false")
-    return SemanticClass(label, name.strip(), tuple(color), tuple(prompts), asprs, surface, rest)
+    countable = entry.get("countable")
+    if countable is not None and not (isinstance(countable, bool) and surface >= countable):
+        raise InputError(
+            f"{origin}: countable of class {label} must be true or false, and false without a surface"
+        )
+    return SemanticClass(label, name.strip(), tuple(color), tuple(prompts), asprs, surface, rest, countable)
 
 
 def _usual_surface(name: str) -> bool:

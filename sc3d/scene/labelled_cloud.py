@@ -31,6 +31,7 @@ SURFACE_VOXEL = 2.5  # of the grid that blocks rays where there is no mesh, in p
 REACH = 4.0
 UNCONFIRMED = "unconfirmed"  # attribute: 1 where one photo only shows the surface
 VOTES = "votes_"  # + class id; PLY has scalar properties only
+INSTANCE = "instance"  # attribute: number of the object that a point belongs to, 0 = none
 
 
 def point_arrays(cloud: o3d.t.geometry.PointCloud, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -112,9 +113,15 @@ def read_surface(
 
 
 def with_labels(
-    cloud: o3d.t.geometry.PointCloud, normals: np.ndarray, labels: Labels, votes: Votes | None = None
+    cloud: o3d.t.geometry.PointCloud,
+    normals: np.ndarray,
+    labels: Labels,
+    votes: Votes | None = None,
+    instance: np.ndarray | None = None,
 ) -> o3d.t.geometry.PointCloud:
-    """The same points, in order, with attributes label, confidence, state, num_views (and votes per class)."""
+    """The same points, in order, with attributes label, confidence, state, num_views (and votes per class; and the
+    object (N,) uint32 of each point).
+    """
     result = cloud.clone()
     attributes = {
         "normals": normals.astype(np.float32),
@@ -123,8 +130,10 @@ def with_labels(
         "state": labels.state[:, None],
         "num_views": labels.num_views[:, None].astype(np.int32),
     }
-    for name in [name for name in result.point if name.startswith(VOTES)]:
+    for name in [name for name in result.point if name.startswith(VOTES) or name == INSTANCE]:
         del result.point[name]
+    if instance is not None:
+        attributes[INSTANCE] = instance.astype(np.uint32)[:, None]
     if votes is not None:
         attributes |= {
             f"{VOTES}{name}": votes.values[:, channel, None].astype(np.float32)
@@ -160,6 +169,13 @@ def take_labels(cloud: o3d.t.geometry.PointCloud, path: Path, made_by: str) -> L
     for name in ranges:
         cloud.point[name] = o3d.core.Tensor(getattr(labels, name)[:, None])
     return labels
+
+
+def instances_of(cloud: o3d.t.geometry.PointCloud, path: Path) -> np.ndarray | None:
+    """(N,) uint32 object of each point of a cloud that was read from `path`, 0 = none; None if it does not say."""
+    if INSTANCE not in cloud.point:
+        return None
+    return _in_range(path, INSTANCE, cloud.point[INSTANCE].cpu().numpy().ravel(), 2**32 - 1, np.uint32)
 
 
 def _in_range(path: Path, name: str, values: np.ndarray, largest: int, dtype: type) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sc3d.errors import InputError
-from sc3d.georeferencing.georeference import georeference_path
+from sc3d.georeferencing.georeference import georeference_path, read_georeference
 from sc3d.io.json_files import read_json
 from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.propagation.propagate import propagate_scene
@@ -20,9 +20,12 @@ from sc3d.tiling.propagate import propagate_scene as propagate_scene_by_tiles
 
 
 def begin(scene: Scene, settings: Propagate) -> None:
-    """Refuse a model that would replace another file."""
+    """Refuse a model that would replace another file; read what the end needs."""
     if settings.save_model:
         require_model_or_nothing(settings.save_model)
+    if scene.classes.exists():
+        scene.class_table()
+    read_georeference(scene)
 
 
 def inputs(scene: Scene, settings: Propagate) -> list[Input]:
@@ -32,9 +35,9 @@ def inputs(scene: Scene, settings: Propagate) -> list[Input]:
     start = scene.cloud if settings.model and not settings.seeds and not seeds.exists() else seeds
     model = [settings.model] if settings.model else []
     learned = _strokes_inputs(scene) if settings.save_model else []
-    scale = [georeference_path(scene)] if settings.model or settings.save_model else []
-    table = [scene.classes] if corrections or scale else []
-    return [start, scene.sparse, photos, *corrections, *table, *model, *scale, *learned]
+    place = georeference_path(scene)  # which says how long a meter is
+    table = [scene.classes] if corrections or model or settings.save_model or scene.classes.exists() else []
+    return [start, scene.sparse, photos, *corrections, *table, *model, place, *learned]
 
 
 def outputs(scene: Scene, settings: Propagate) -> list[Path]:

@@ -10,6 +10,7 @@ otherwise than in one piece.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +21,8 @@ from scipy.sparse.csgraph import connected_components
 
 from sc3d.errors import InputError
 from sc3d.georeferencing.up_direction import scene_up
-from sc3d.io.chunked_clouds import CloudFile
+from sc3d.instances.scene_objects import SceneObjects
+from sc3d.io.chunked_clouds import CloudFile, positions
 from sc3d.io.ply import read_header, write_records
 from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.propagation.appearance import (
@@ -40,7 +42,7 @@ from sc3d.propagation.propagate import PropagateSummary, fill_from_nearest, no_s
 from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.terrain import WINDOWS, GroundModel, NormalStatistics
 from sc3d.scene.corrections import Corrections
-from sc3d.scene.labelled_cloud import VOTES, vote_channels
+from sc3d.scene.labelled_cloud import INSTANCE, UNCONFIRMED, VOTES, vote_channels
 from sc3d.scene.labels import CORRECTED, PROPAGATED
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
@@ -99,7 +101,7 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     job = PropagateJob(settings, statistics.extent, store, results, margin, channels, shared, up, corrections)
     with open_executor(settings) as executor:
         _solve(job, executor, cloud.path)
-    summary = _write(output, cloud, job)
+    summary = _write(output, cloud, job, scene)
     folder.remove()
     return summary
 
@@ -362,22 +364,36 @@ def _state_task(
     )
 
 
-def _write(path: Path, cloud: CloudFile, job: PropagateJob) -> PropagateSummary:
-    kept = [(name, cloud.dtype[name].str[1:]) for name in cloud.names if not name.startswith(VOTES)]
+def _parts(cloud: CloudFile, job: PropagateJob) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """As `instances.scene_objects.Parts`, in the order of the cloud."""
+    found = job.results.in_order(["label"], cloud.rows_at_once)
+    for (_, records), values in zip(cloud.chunks(), found, strict=True):
+        doubted = records[UNCONFIRMED] if UNCONFIRMED in cloud.names else np.zeros(len(records), np.uint8)
+        yield positions(records), values["label"], doubted == 0
+
+
+def _write(path: Path, cloud: CloudFile, job: PropagateJob, scene: Scene) -> PropagateSummary:
+    objects = SceneObjects.tell_apart(scene, partial(_parts, cloud, job))
+    taken = {INSTANCE, *(name for name in cloud.names if name.startswith(VOTES))}
+    kept = [(name, cloud.dtype[name].str[1:]) for name in cloud.names if name not in taken]
+    written = kept + ([(INSTANCE, "u4")] if objects is not None else [])
     counts, confidence = np.zeros(4, np.int64), [0.0]
 
     def chunks():
         found = job.results.in_order(["label", "confidence", "state"], cloud.rows_at_once)
         for (_, records), values in zip(cloud.chunks(), found, strict=True):
-            result = np.empty(len(records), np.dtype(kept))
+            result = np.empty(len(records), np.dtype(written))
             for name, _ in kept:
                 result[name] = values[name] if name in values else records[name]
+            if objects is not None:
+                result[INSTANCE] = objects.find(positions(records), values["label"])
             labelled = values["label"] > 0
             states = (labelled & (values["state"] == PROPAGATED)).sum(), (values["state"] == CORRECTED).sum()
             counts[:] += len(records), labelled.sum(), *states
             confidence[0] += float(values["confidence"][labelled].sum(dtype=np.float64))
             yield result
 
-    write_records(path, chunks(), np.dtype(kept), cloud.num_points, ["sc3d"])
+    write_records(path, chunks(), np.dtype(written), cloud.num_points, ["sc3d"])
     num_points, labelled, propagated, corrected = counts.tolist()
-    return PropagateSummary(num_points, labelled, propagated, confidence[0], corrected)
+    numbers = {} if objects is None else objects.figures()
+    return PropagateSummary(num_points, labelled, propagated, confidence[0], corrected, objects=numbers)

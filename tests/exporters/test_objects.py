@@ -12,12 +12,12 @@ from scipy import ndimage
 
 from sc3d.errors import InputError
 from sc3d.exporters import objects
-from sc3d.exporters.buildings import join_enclosed, roof_tops, split_buildings
 from sc3d.exporters.polygonize import main_direction, orthogonalized, polygonize, simplified
-from sc3d.exporters.regions import cells_by_number, connected_cells, renumbered
-from sc3d.exporters.terrain import block_medians, ground_height
-from sc3d.exporters.trees import split_crowns, watershed
 from sc3d.geometry.raster import Raster
+from sc3d.instances.buildings import join_enclosed, roof_tops, split_buildings
+from sc3d.instances.regions import cells_by_number, connected_cells, renumbered
+from sc3d.instances.terrain import block_medians, ground_height
+from sc3d.instances.trees import split_crowns, watershed
 from sc3d.scene.class_table import OTHER
 from sc3d.settings.outputs import Export
 from sc3d.settings.synthesize import Synthesize

@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 from scipy import ndimage
 
-from sc3d.exporters.regions import cells_by_number, connected_cells, disk, neighbors, renumbered
-from sc3d.geometry.raster import Raster, highest_points
+from sc3d.geometry.raster import Raster
+from sc3d.instances.regions import cells_by_number, connected_cells, disk, neighbors, renumbered
 
 CLOSING, OPENING = 0.6, 0.5  # gaps and strips narrower than about twice this vanish, m
 SMOOTHING = 0.4  # standard deviation of the Gaussian that evens the border out, m
@@ -24,27 +24,19 @@ MAX_SLOPE = 1.5  # steeper is an edge, not a roof, in wide cells
 TOP = 0.98  # quantile of the roof that is its height: the ridge without single high points
 
 
-def roof_heights(
-    points: np.ndarray, is_building: np.ndarray, above_ground: np.ndarray, grid: Raster
-) -> tuple[np.ndarray, np.ndarray]:
+def roof_heights(tops: np.ndarray, share: np.ndarray, pixel: float) -> tuple[np.ndarray, np.ndarray]:
     """Cells that a roof covers, also under overhanging crowns, and its height there.
 
-    points: (N, 3) m; is_building, above_ground: (N,) bool
+    tops: (H, W) z of the highest building point above the ground, m, -inf = none; share: (H, W) of the points
+        above the ground that are of buildings; pixel: side of the cells, m
     returns: (H, W) bool; (H, W) float64 z, m, NaN elsewhere
     """
-    roof = is_building & above_ground
-    size = grid.height * grid.width
-    cells = grid.flat_cells(points[above_ground])
-    share = np.bincount(cells, is_building[above_ground], size) / np.maximum(
-        np.bincount(cells, minlength=size), 1
-    )
-    rows = highest_points(grid, points, roof)
-    known = (rows >= 0) & (share.reshape(grid.shape) >= ROOF_SHARE)
+    known = np.isfinite(tops) & (share >= ROOF_SHARE)
     if not known.any():
-        return known, np.full(grid.shape, np.nan)
-    covered = close_roofs(known, grid.pixel)
+        return known, np.full(tops.shape, np.nan)
+    covered = close_roofs(known, pixel)
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    heights = ndimage.median_filter(points[rows[tuple(nearest)], 2], 3, mode="nearest")
+    heights = ndimage.median_filter(tops[tuple(nearest)], 3, mode="nearest")
     return covered, np.where(covered, heights, np.nan)
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from sc3d.exporters.regions import disk, renumbered
-from sc3d.geometry.raster import Raster, close_gaps, highest_points
+from sc3d.geometry.raster import Raster, close_gaps
+from sc3d.instances.regions import disk, renumbered
 
 GAP = 0.5  # gaps of the canopy narrower than about twice this are filled, m
 SMOOTHING = 0.4  # standard deviation of the Gaussian that joins the lobes of a crown, m
@@ -14,15 +14,17 @@ UNDER = 0.5  # tree points this far below the top of their cell are not canopy, 
 MIN_CROWN = 2.0  # m2
 
 
-def canopy_height(points: np.ndarray, is_tree: np.ndarray, ground: np.ndarray, grid: Raster) -> np.ndarray:
+def canopy_height(trees: np.ndarray, tops: np.ndarray, ground: np.ndarray, pixel: float) -> np.ndarray:
     """(H, W) float64 height of the canopy above the ground, m; NaN where nothing or something else is on top.
 
-    points: (N, 3) m; is_tree: (N,) bool; ground: (H, W) z of the ground, m
+    trees, tops: (H, W) z of the highest tree point, and of the highest point, m, -inf = none; ground: (H, W) z of
+        the ground, m; pixel: side of the cells, m
     """
-    top, trees = highest_points(grid, points), highest_points(grid, points, is_tree)
-    canopy = (trees >= 0) & (points[trees, 2] >= points[top, 2] - UNDER)
-    rows = close_gaps(np.where(canopy, trees, -1), round(GAP / grid.pixel))
-    return np.where(rows >= 0, points[rows, 2] - ground, np.nan)
+    with np.errstate(invalid="ignore"):  # of cells without points
+        canopy = np.isfinite(trees) & (trees >= tops - UNDER)
+    cells = np.where(canopy.ravel(), np.arange(trees.size), -1).reshape(trees.shape)
+    nearest = close_gaps(cells, round(GAP / pixel))
+    return np.where(nearest >= 0, trees.ravel()[nearest] - ground, np.nan)
 
 
 def split_crowns(canopy: np.ndarray, grid: Raster, min_height: float) -> np.ndarray:
