@@ -1,15 +1,16 @@
-"""The labelled cloud as one PLY per class, with all its attributes."""
+"""The labelled cloud as one PLY per class, or per object, with all its attributes."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.exporters.projected_cloud import chosen_classes, read_projected_cloud
+from sc3d.exporters.projected_cloud import ProjectedCloud, chosen_classes, read_projected_cloud
 from sc3d.io.atomic import atomic_path
 from sc3d.io.clouds import write_geometry
 from sc3d.scene.scene import Scene
@@ -31,21 +32,32 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     ]
     if not present:
         raise InputError(f"no point has one of the classes {', '.join(settings.classes)}: nothing to write")
-    cloud = projected.cloud.clone()
+    parts = [
+        (f"{label}_{file_name(table.name(label))}.ply", projected.labels.label == label) for label in present
+    ]
+    counts = write_parts(outputs(scene, settings)[0], projected, parts)
+    names = [table.name(label) for label in present]
+    return {**projected.projection.figures(), "points_by_class": dict(zip(names, counts, strict=True))}
+
+
+def write_parts(path: Path, projected: ProjectedCloud, parts: Iterable[tuple[str, np.ndarray]]) -> list[int]:
+    """A folder of clouds, by file name and the points (N,) bool of each; positions float64 in the CRS. Returns how
+    many points each has.
+    """
+    cloud, counts = projected.cloud.clone(), []
     if "normals" in cloud.point:
         normals = projected.projection.directions_to_crs(
             cloud.point.positions.numpy().astype(np.float64), cloud.point.normals.numpy()
         )
         cloud.point.normals = o3d.core.Tensor(np.ascontiguousarray(normals))
     cloud.point.positions = o3d.core.Tensor(np.ascontiguousarray(projected.points))
-    counts = {}
-    with atomic_path(outputs(scene, settings)[0]) as folder:
+    with atomic_path(path) as folder:
         folder.mkdir()
-        for label in present:
-            part = cloud.select_by_mask(o3d.core.Tensor(projected.labels.label == label))
-            write_geometry(folder / f"{label}_{file_name(table.name(label))}.ply", part)
-            counts[table.name(label)] = len(part.point.positions)
-    return {**projected.projection.figures(), "points_by_class": counts}
+        for name, chosen in parts:
+            part = cloud.select_by_mask(o3d.core.Tensor(chosen))
+            write_geometry(folder / name, part)
+            counts.append(len(part.point.positions))
+    return counts
 
 
 def file_name(name: str) -> str:

@@ -15,7 +15,7 @@ from sc3d.exporters.projected_cloud import ProjectedCloud, chosen_classes, proje
 from sc3d.instances.terrain import require_ground
 from sc3d.io.atomic import atomic_path
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.labelled_cloud import is_confirmed
+from sc3d.scene.labelled_cloud import INSTANCE, instances_of, is_confirmed
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
 
@@ -29,6 +29,7 @@ DIMENSIONS = (
     ("state", np.uint8, "how the label was found"),
     ("num_views", np.uint16, "photos that saw the point"),
     ("label", np.uint8, "class id of sc3d, 0 = none"),
+    (INSTANCE, np.uint32, "object of a point, 0 = none"),
 )
 
 
@@ -122,5 +123,7 @@ def point_record(
         labels.state[rows],
         labels.label[rows],
     )
+    instance = instances_of(projected.cloud, Path("labelled.ply"))
+    record.instance = np.zeros(len(rows), np.uint32) if instance is None else instance[rows]
     record.num_views = np.minimum(labels.num_views[rows], np.iinfo(np.uint16).max).astype(np.uint16)
     return record

@@ -27,7 +27,14 @@ from sc3d.georeferencing.georeference import (
 from sc3d.georeferencing.up_direction import tell_tilt
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.labelled_cloud import UNCONFIRMED, confirmed_only, is_confirmed, read_labelled, take_labels
+from sc3d.scene.labelled_cloud import (
+    INSTANCE,
+    UNCONFIRMED,
+    confirmed_only,
+    is_confirmed,
+    read_labelled,
+    take_labels,
+)
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.common import Resources
@@ -199,7 +206,7 @@ def projected_chunks(scene: Scene, settings: Export) -> Iterator[ProjectedCloud]
         if not len(records):
             continue
         cloud = o3d.t.geometry.PointCloud(positions(records))
-        for name in ("label", "confidence", "state", "num_views", UNCONFIRMED):
+        for name in ("label", "confidence", "state", "num_views", UNCONFIRMED, INSTANCE):
             if name in names:
                 cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(records[name])[:, None])
         colors = columns(records, ("red", "green", "blue"))

@@ -28,19 +28,21 @@ DEGREES, METERS = 9, 3  # decimals of coordinates: 0.1 mm and 1 mm
 FIELDS: dict[str, type] = {  # what the map shows of a feature
     "id": np.int32, "class": object, "label": np.int32, "area_m2": np.float64, "height_m": np.float64,
     "ground_m": np.float64, "confidence": np.float64, "points": np.int32, "volume_m3": np.float64,
+    "instance": np.int64, "best_photo": object,
 }
 # fmt: on
 
 
 @dataclass(frozen=True)
 class Feature:
-    """A building or a tree.
+    """A building, a tree or another object.
 
     polygon: shapely polygon in the CRS; number: from 1, per layer; name, label: its class; area: m2 of the
         outline
     height: of its top above the ground, m; ground: z of the ground under it, m; confidence: mean of its
         points, 0 to 1; num_points: of its class; volume: between its top, as seen from above, and the
         ground, m3
+    instance: its number in the cloud, 0 = it has none; photo: name of the one that shows it best, "" = none does
     """
 
     polygon: shapely.Polygon
@@ -53,12 +55,14 @@ class Feature:
     confidence: float
     num_points: int
     volume: float
+    instance: int = 0
+    photo: str = ""
 
     def properties(self) -> dict[str, object]:
         """What the map shows, by name of the field."""
         lengths = round(self.area, 2), round(self.height, 2), round(self.ground, 2)
         values = self.number, self.name, self.label, *lengths, round(self.confidence, 3), self.num_points
-        return dict(zip(FIELDS, (*values, round(self.volume, 1))))
+        return dict(zip(FIELDS, (*values, round(self.volume, 1), self.instance, self.photo), strict=True))
 
 
 def has_geopackage() -> bool:

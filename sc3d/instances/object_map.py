@@ -55,8 +55,8 @@ class Tops:
     """What stands on each cell of a grid, (H, W) each, z in m, -inf = nothing.
 
     ground: z of the ground; all: highest point; kinds: highest point of each kind, with roofs only those above the
-    ground by MIN_HEIGHT; lows: the lowest point of each kind, inf = nothing; above, roofs: number of points above
-    the ground by MIN_HEIGHT, and of them that are of buildings
+    ground; lows: the lowest point of each kind, inf = nothing; above, roofs: number of points above the ground, and
+    of them that are of buildings
     """
 
     grid: Raster
@@ -113,7 +113,8 @@ def map_objects(
     if not ground:
         return ObjectMap(why="no point belongs to a ground class, from which heights are measured")
     grid = _grid(chunks, low, high)
-    tops = measure(chunks, kinds, grid, ground_height(*_lowest(chunks, ground, grid), grid))
+    heights = ground_height(*_lowest(chunks, ground, grid), grid)
+    tops = measure(chunks, kinds, grid, heights, MIN_HEIGHT)
     regions, used = [], 0
     for number, kind in enumerate(kinds):
         found = split(tops, number, kind)
@@ -125,24 +126,50 @@ def map_objects(
 
 
 def split(tops: Tops, number: int, kind: Kind) -> np.ndarray:
-    """(H, W) int32 regions from 1 of one of the kinds of `tops`."""
+    """(H, W) int32 regions from 1 of one of the kinds of `tops`; also of buildings of which only walls show."""
+    covered, heights = cover(tops, number, kind)
+    found = split_covered(covered, heights, tops.grid, kind, (MIN_HEIGHT, MIN_AREA))
+    if kind.how == "roofs":
+        return find_facades(tops.kinds[number], tops.lows[number], found, tops.grid)
+    return found
+
+
+def cover(tops: Tops, number: int, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
+    """Cells that a kind covers, gaps closed, (H, W) bool, and its height there, (H, W) m: z, but of crowns above
+    the ground; NaN elsewhere.
+    """
     grid, highest = tops.grid, tops.kinds[number]
     if kind.how == "roofs":
-        covered, roofs = roof_heights(highest, tops.roof_share, grid.pixel)
-        buildings = split_buildings(covered, roofs, grid, MIN_AREA)
-        return find_facades(highest, tops.lows[number], buildings, grid)
+        return roof_heights(highest, tops.roof_share, grid.pixel)
     if kind.how == "crowns":
         canopy = canopy_height(highest, tops.all, tops.ground, grid.pixel)
-        return split_crowns(canopy, grid, MIN_HEIGHT)
-    return split_parts(np.isfinite(highest), grid)
+        return np.isfinite(canopy), canopy
+    covered = close_parts(np.isfinite(highest), grid.pixel)
+    nearest = ndimage.distance_transform_edt(
+        ~np.isfinite(highest), return_distances=False, return_indices=True
+    )
+    return covered, np.where(covered, highest[tuple(nearest)], np.nan)
 
 
-def split_parts(occupied: np.ndarray, grid: Raster) -> np.ndarray:
-    """(H, W) int32 connected parts from 1 of the occupied cells (H, W) bool; small ones vanish."""
-    shape = disk(PART_GAP / grid.pixel)
+def split_covered(
+    covered: np.ndarray, heights: np.ndarray, grid: Raster, kind: Kind, least: tuple[float, float]
+) -> np.ndarray:
+    """(H, W) int32 regions from 1 of what `cover` returns. least: height of plants, m, and area of buildings, m2"""
+    if kind.how == "roofs":
+        return split_buildings(covered, heights, grid, least[1])
+    return split_crowns(heights, grid, least[0]) if kind.how == "crowns" else split_parts(covered, grid)
+
+
+def close_parts(occupied: np.ndarray, pixel: float) -> np.ndarray:
+    """(H, W) bool the occupied cells (H, W) bool and narrow gaps between them."""
+    shape = disk(PART_GAP / pixel)
     margin = len(shape)
-    closed = ndimage.binary_closing(np.pad(occupied, margin), shape)[margin:-margin, margin:-margin]
-    parts = connected_cells(closed.astype(np.int32), np.zeros(grid.shape), np.inf)
+    return ndimage.binary_closing(np.pad(occupied, margin), shape)[margin:-margin, margin:-margin] | occupied
+
+
+def split_parts(covered: np.ndarray, grid: Raster) -> np.ndarray:
+    """(H, W) int32 connected parts from 1 of the covered cells (H, W) bool; small ones vanish."""
+    parts = connected_cells(covered.astype(np.int32), np.zeros(grid.shape), np.inf)
     large = np.bincount(parts.ravel())[parts] * grid.pixel**2 >= MIN_PART
     return renumbered(np.where(large, parts, 0))
 
@@ -184,8 +211,12 @@ def _lowest(chunks: Chunks, ground: list[int], grid: Raster) -> tuple[np.ndarray
     return np.column_stack([grid.centers()[some], lowest[some]]), np.ones(int(some.sum()), bool)
 
 
-def measure(chunks: Chunks, kinds: Sequence[Kind], grid: Raster, ground: np.ndarray) -> Tops:
-    """What the sure points of a cloud leave on the cells of a grid. ground: (H, W) z of the ground, m."""
+def measure(
+    chunks: Chunks, kinds: Sequence[Kind], grid: Raster, ground: np.ndarray, min_height: float
+) -> Tops:
+    """What the sure points of a cloud leave on the cells of a grid. ground: (H, W) z of the ground, m; min_height:
+    lower is not above the ground, m
+    """
     size = grid.height * grid.width
     highest = np.full((len(kinds) + 1, size), -np.inf)
     lows, counts = np.full((len(kinds), size), np.inf), np.zeros((2, size), np.int64)
@@ -193,7 +224,7 @@ def measure(chunks: Chunks, kinds: Sequence[Kind], grid: Raster, ground: np.ndar
         kept = chunk.sure & grid.holds(chunk.points)
         points, label = chunk.points[kept], chunk.label[kept]
         cells = grid.flat_cells(points)
-        above = points[:, 2] >= ground.ravel()[cells] + MIN_HEIGHT
+        above = points[:, 2] >= ground.ravel()[cells] + min_height
         np.maximum.at(highest[-1], cells, points[:, 2])
         counts[0] += np.bincount(cells[above], minlength=size)
         for number, kind in enumerate(kinds):

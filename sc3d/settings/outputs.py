@@ -30,6 +30,7 @@ class Export:
             "ndsm",
             "contours",
             "objects",
+            "object-clouds",
             "transforms",
             "colmap-text",
         ],
@@ -39,8 +40,9 @@ class Export:
     clouds: one PLY per class; splats, spz: Gaussians with labels; orthophoto: GeoTIFFs of color, class and
     height; dtm, dsm, ndsm: GeoTIFFs of the height of the bare ground (holes interpolated, and marked in a file
     beside it), of the surface, and of the surface above the ground; contours: lines of equal height of the
-    ground as GeoPackage; objects: footprints of buildings and crowns of trees as GeoJSON; transforms: cameras
-    and sparse points as nerfstudio's transforms.json; colmap-text: the same as COLMAP's text files.
+    ground as GeoPackage; objects: footprints of buildings, crowns of trees and all countable objects as GeoJSON;
+    object-clouds: one PLY per object; transforms: cameras and sparse points as nerfstudio's transforms.json;
+    colmap-text: the same as COLMAP's text files.
     """
     classes: tuple[str, ...] = ()
     """Names of the classes to write; all otherwise (laz, clouds, splats, spz)."""
@@ -67,9 +69,9 @@ class Export:
     which terrain programs look for (laz).
     """
     min_height: float = 2.0
-    """Lower buildings and plants are left out, m (objects)."""
+    """Lower buildings and plants are left out, m (objects); below 2 objects are told apart anew."""
     min_area: float = 10.0
-    """Smaller buildings are left out, m2 (objects)."""
+    """Smaller buildings are left out, m2 (objects); below 10 objects are told apart anew."""
     rectangular: bool = True
     """Draw buildings with right angles where that fits; --no-rectangular keeps the simplified outline
     (objects).

@@ -21,6 +21,7 @@ MODULES = {
     "ndsm": "elevation",
     "contours": "elevation",
     "objects": "objects",
+    "object-clouds": "object_clouds",
     "transforms": "transforms",
     "colmap-text": "colmap_text",
 }
