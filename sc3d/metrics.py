@@ -15,16 +15,22 @@ import numpy as np
 
 from sc3d.errors import InputError, left_out
 from sc3d.geometry.cameras import View
+from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import FirstSurface
+from sc3d.instances.panoptic import Segments, panoptic_quality, summarize
+from sc3d.io.clouds import read_cloud
 from sc3d.io.json_files import write_json
+from sc3d.io.ply import read_header
 from sc3d.io.progress import progress
 from sc3d.scene.class_table import OTHER, ClassTable
-from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
+from sc3d.scene.labelled_cloud import INSTANCE, LabelledSurface, instances_of, read_labelled
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Evaluate
 
 logger = logging.getLogger(__name__)
+
+LEAST_NEAR = 0.5  # of the true cloud's points with a labelled one nearby: below, the two are not of one place
 
 
 @dataclass(frozen=True)
@@ -272,11 +278,13 @@ class EvaluationSummary:
     """totals: figures by source (SOURCES); calibration_error: expected error of the confidence, on pixels of
     classes and on all judged ones, None = no photo
     empty: of the truth's pixels of classes without surface, by class, how many there are and how many hit nothing
+    objects: panoptic quality, where the truth tells objects apart
     """
 
     totals: dict[str, dict]
     calibration_error: tuple[float, float] | None
     empty: dict[str, dict[str, int]] = field(default_factory=dict)
+    objects: dict | None = None
 
     @property
     def has_other(self) -> bool:
@@ -297,6 +305,8 @@ class EvaluationSummary:
             rows["calibration_error"] = round(on_classes, 4)
             if self.has_other:
                 rows["calibration_error_with_other"] = round(everywhere, 4)
+        if self.objects is not None:
+            rows["objects"] = _objects_row(self.objects)
         if self.empty:
             shares = [
                 f"{name} {found['right'] / found['pixels']:.1%} of {found['pixels']} pixels"
@@ -313,6 +323,15 @@ def _open_figures(found: dict) -> str:
     return "  ".join([f"{given} ({_listed(other['given'])})", *shares])
 
 
+def _objects_row(found: dict) -> str:
+    """PQ of what is counted, and of each of its classes with the number of objects."""
+    parts = [
+        f"{name} {entry['pq']:.1%} ({entry['matched']} of {entry['true']}, {entry['found']} found)"
+        for name, entry in found["classes"].items()
+    ]
+    return f"PQ {found['pq']:.1%}  ({'  '.join(parts)})"
+
+
 def _listed(shares: dict[str, float]) -> str:
     return "  ".join(f"{name} {value:.1%}" for name, value in shares.items())
 
@@ -321,12 +340,60 @@ def evaluate_scene(scene: Scene, settings: Evaluate) -> EvaluationSummary:
     """Judge the labelled cloud of a scene (or `settings.labelled`) by its truth masks and write the figures. By tiles,
     with the same signature: `tiling.evaluate`.
     """
-    cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
-    return judge(scene, settings, LabelledSurface.build(cloud, scene.model.views, scene.surface), labels)
+    path = settings.labelled or scene.labelled
+    cloud, labels = read_labelled(path, "propagate")
+    surface = LabelledSurface.build(cloud, scene.model.views, scene.surface)
+    found = None
+    if knows_objects(scene):
+        instance = instances_of(cloud, path)
+        found = judge_objects(scene, surface.index, surface.reach, labels.label, instance)
+    return judge(scene, settings, surface, labels, found)
 
 
-def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) -> EvaluationSummary:
-    """Judge labels, and the scene's masks, at every pixel that has truth, and write `metrics.json`."""
+def knows_objects(scene: Scene) -> bool:
+    """Whether the scene has a true cloud that tells objects apart."""
+    path = scene.truth_cloud
+    vertex = read_header(path).element("vertex") if path.is_file() else None
+    names = {entry.name for entry in vertex.properties} if vertex else set()
+    return {"label", INSTANCE} <= names
+
+
+def judge_objects(
+    scene: Scene, index: NeighborIndex, reach: float, label: np.ndarray, instance: np.ndarray | None
+) -> dict | None:
+    """Panoptic quality at the points of the true cloud, by the nearest point of the labelled one; None where it
+    cannot be told. label, instance: (N,) of the labelled cloud; reach: farther points are none, world units
+    """
+    path, table = scene.truth_cloud, scene.class_table()
+    if instance is None:
+        logger.warning(
+            "the labelled cloud tells no objects apart, so that they are not judged: run `sc3d propagate` again"
+        )
+        return None
+    truth = read_cloud(path)
+    rows, distances = index.nearest(truth.point.positions.numpy(), 1)
+    near = distances[:, 0] <= reach
+    if near.mean() < LEAST_NEAR:
+        logger.warning(
+            "objects are not judged: %.0f%% of the points of %s have a labelled point nearby: it is in another frame,"
+            " or of another place",
+            100 * near.mean(),
+            path,
+        )
+        return None
+    true, found = (
+        Segments(truth.point["label"].numpy().ravel(), truth.point[INSTANCE].numpy().ravel()),
+        Segments(*(np.where(near, values[rows[:, 0]], 0) for values in (label, instance))),
+    )
+    return summarize(panoptic_quality(true, found, table), table)
+
+
+def judge(
+    scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels, objects: dict | None = None
+) -> EvaluationSummary:
+    """Judge labels, and the scene's masks, at every pixel that has truth, and write `metrics.json`. objects: what
+    `judge_objects` returns
+    """
     table, truth_files = scene.class_table(), truth_masks(scene, settings)
     mask_files = scene.mask_files(scene.masks, table) if scene.masks.is_dir() else {}
     views = [view for view in scene.model.views if view.name in truth_files]
@@ -359,13 +426,14 @@ def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) 
     metrics: dict[str, object] = {"photos": [view.name for view in views]}
     metrics["classes"] = [entry.name for entry in table]
     metrics |= totals | ({"without_surface": nothing} if nothing else {})
+    metrics |= {"panoptic": objects} if objects else {}
     metrics |= {
         name: found.summary()
         for name, found in zip(("reliability", "reliability_with_other"), overall, strict=False)
     }
     write_json(settings.output or scene.metrics, {"reliability": {}} | metrics | {"per_photo": photos})
     errors = (overall[0].ece, overall[1].ece) if overall else None
-    return EvaluationSummary(totals, errors, nothing)
+    return EvaluationSummary(totals, errors, nothing, objects)
 
 
 def _count_empty(truth: np.ndarray, ranges: np.ndarray, table: ClassTable) -> np.ndarray:

@@ -224,19 +224,19 @@ def measure(
         kept = chunk.sure & grid.holds(chunk.points)
         points, label = chunk.points[kept], chunk.label[kept]
         cells = grid.flat_cells(points)
-        above = points[:, 2] >= ground.ravel()[cells] + min_height
+        tall_enough = points[:, 2] >= ground.ravel()[cells] + min_height
         np.maximum.at(highest[-1], cells, points[:, 2])
-        counts[0] += np.bincount(cells[above], minlength=size)
+        counts[0] += np.bincount(cells[tall_enough], minlength=size)
         for number, kind in enumerate(kinds):
             chosen = np.isin(label, kind.ids)
             np.minimum.at(lows[number], cells[chosen], points[chosen, 2])
             if kind.how == "roofs":
-                chosen &= above
+                chosen &= tall_enough
                 counts[1] += np.bincount(cells[chosen], minlength=size)
             np.maximum.at(highest[number], cells[chosen], points[chosen, 2])
-    highest, lows = highest.reshape(-1, *grid.shape), lows.reshape(-1, *grid.shape)
+    tall, low = (list(values.reshape(-1, *grid.shape)) for values in (highest, lows))
     above, roofs = counts.reshape(2, *grid.shape)
-    return Tops(grid, ground, highest[-1], list(highest[:-1]), list(lows), above, roofs)
+    return Tops(grid, ground, tall[-1], tall[:-1], low, above, roofs)
 
 
 def _grown(regions: np.ndarray, reach: float) -> np.ndarray:

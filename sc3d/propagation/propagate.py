@@ -177,11 +177,11 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     if settings.save_model is not None:
         kept = SavedAppearance.learn(graph, points, found, channels, meters)
         learned = None if kept is None else kept.to_part()
-    labelled, counts = labels.label > 0, {} if objects is None else objects.figures()
+    labelled, numbers = labels.label > 0, {} if objects is None else objects.figures()
     propagated = int((labelled & (labels.state == PROPAGATED)).sum())
     total = float(labels.confidence[labelled].sum(dtype=np.float64))
     corrected = int((labels.state == CORRECTED).sum())
-    return PropagateSummary(len(labelled), int(labelled.sum()), propagated, total, corrected, learned, counts)
+    return PropagateSummary(len(labelled), int(labelled.sum()), propagated, total, corrected, learned, numbers)
 
 
 def _read_start(

@@ -115,6 +115,11 @@ class Scene:
         return self.path / "truth"
 
     @property
+    def truth_cloud(self) -> Path:
+        """True classes and objects of points, of synthetic scenes."""
+        return self.path / "truth.ply"
+
+    @property
     def votes(self) -> Path:
         return self.path / "votes.npz"
 

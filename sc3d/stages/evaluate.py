@@ -15,7 +15,8 @@ from sc3d.tiling.evaluate import evaluate_scene as evaluate_scene_by_tiles
 def inputs(scene: Scene, settings: Evaluate) -> list[Input]:
     truth, labelled = settings.truth or scene.truth, settings.labelled or scene.labelled
     frames = PhotoFrames(scene.images)
-    return [scene.sparse, scene.classes, scene.masks, *scene.surface, truth, labelled, frames]
+    objects = [scene.truth_cloud] if scene.truth_cloud.exists() else []
+    return [scene.sparse, scene.classes, scene.masks, *scene.surface, truth, labelled, frames, *objects]
 
 
 def outputs(scene: Scene, settings: Evaluate) -> list[Path]:

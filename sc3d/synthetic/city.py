@@ -147,9 +147,11 @@ def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
     with ExitStack() as files:
         cloud = files.enter_context(open_cloud(scene.path / "truth.ply", num_points))
         mesh = files.enter_context(open_mesh(scene.mesh))
+        objects = 0
         for site in progress(make_sites(settings), "building", "site", total=columns * rows):
-            _write_site(site, settings, cloud, mesh)
+            _write_site(site, settings, cloud, mesh, objects)
             city.add(site)
+            objects += int(site.world.ints[:, 2].max())
     views = fly_over((columns * EXTENT, rows * EXTENT), settings)
     write_cameras(scene.sparse, [view.shifted(-OFFSET) for view in views])
     accuracy = _write_masks(scene, city, views, settings.seed)
@@ -158,14 +160,19 @@ def synthesize_city(settings: SynthesizeCity) -> dict[str, object]:
     return {"points": num_points, "views": len(views), "triangles": mesh.triangles, "mask_accuracy": accuracy}
 
 
-def _write_site(site: Site, settings: SynthesizeCity, cloud: CloudWriter, mesh: MeshWriter) -> None:
+def _write_site(
+    site: Site, settings: SynthesizeCity, cloud: CloudWriter, mesh: MeshWriter, objects: int
+) -> None:
+    """objects: number of those on the sites before"""
     made = truth_cloud(
         site.world, settings.points_per_site, np.random.default_rng([settings.seed, 5, site.number])
     )
     names = ("normals", "colors", "label")
+    instance = made.point["instance"].numpy()
     cloud.append(
         made.point.positions.numpy() + site.middle + OFFSET,
         **{name: made.point[name].numpy() for name in names},
+        instance=np.where(instance > 0, instance + np.uint32(objects), 0).astype(np.uint32),
     )
     mesh.append(site.world.corners[site.own].astype(np.float64) + site.middle + OFFSET)
 

@@ -29,6 +29,7 @@ CLOUD = np.dtype(
         ("green", "u1"),
         ("blue", "u1"),
         ("label", "u1"),
+        ("instance", "<u4"),
     ]
 )
 VERTEX = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8")])
@@ -46,13 +47,19 @@ class CloudWriter:
     write: Callable[[np.ndarray], None]
 
     def append(
-        self, positions: np.ndarray, normals: np.ndarray, colors: np.ndarray, label: np.ndarray
+        self,
+        positions: np.ndarray,
+        normals: np.ndarray,
+        colors: np.ndarray,
+        label: np.ndarray,
+        instance: np.ndarray,
     ) -> None:
-        """positions: (N, 3) float64; normals: (N, 3) float32; colors: (N, 3) uint8; label: (N, 1) uint8."""
+        """positions: (N, 3) float64; normals: (N, 3) float32; colors: (N, 3) uint8; label: (N, 1) uint8;
+        instance: (N, 1) uint32.
+        """
         table = np.empty(len(positions), CLOUD)
-        for name, column in zip(
-            CLOUD.names or (), [*positions.T, *normals.T, *colors.T, label.ravel()], strict=True
-        ):
+        columns = [*positions.T, *normals.T, *colors.T, label.ravel(), instance.ravel()]
+        for name, column in zip(CLOUD.names or (), columns, strict=True):
             table[name] = column
         self.write(table)
 

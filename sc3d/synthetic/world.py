@@ -11,9 +11,11 @@ from sc3d.settings.synthesize import Synthesize
 from sc3d.synthetic.close_up import add_grain, cloudy_sky
 from sc3d.synthetic.ground import Ground, add_ground, plan_ground
 from sc3d.synthetic.layout import build_fences, park_cars, place_buildings, plant
-from sc3d.synthetic.mesh import LEAF, MeshBuilder, face_normals
+from sc3d.synthetic.mesh import BUILDING, LEAF, TREE, MeshBuilder, face_normals
 from sc3d.synthetic.objects import Building, add_building
 from sc3d.synthetic.shading import SKY, SUN, shade, surface_labels, truth_labels
+
+COUNTED = 2.0  # lower bushes and hedges are no objects, m
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,17 @@ class World:
             self.ground.rasters,
             self.ground.rects,
         )
+
+    def instances(self, triangles: np.ndarray) -> np.ndarray:
+        """(N,) uint32 object that triangles (N,) belong to, of what is counted: buildings, and plants at least
+        `COUNTED` m tall; else 0.
+        """
+        objects, heights = self.ints[:, 2], self.corners[:, :, 2]
+        low, high = (np.full(objects.max() + 1, value) for value in (np.inf, -np.inf))
+        np.minimum.at(low, objects, heights.min(axis=1))
+        np.maximum.at(high, objects, heights.max(axis=1))
+        counted = np.isin(self.ints[:, 1], (BUILDING, TREE)) & (high - low >= COUNTED)[objects]
+        return np.where(counted, objects, 0)[triangles].astype(np.uint32)
 
     def truth(self, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         """(N,) uint8 as `labels`, but other objects and sky are told from what lies outside the site, as in

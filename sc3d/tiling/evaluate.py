@@ -4,6 +4,7 @@ judged pixel shows.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from sc3d.geometry.raycast import FirstSurface, first_surface, surface_points
 from sc3d.io.chunked_clouds import CloudFile, positions
 from sc3d.io.ply import num_triangles
 from sc3d.io.provenance import PhotoFrames
-from sc3d.metrics import EvaluationSummary, judge, truth_masks
+from sc3d.metrics import EvaluationSummary, judge, knows_objects, truth_masks
 from sc3d.scene.labelled_cloud import REACH
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
@@ -35,6 +36,8 @@ from sc3d.tiling.label import sample_spacing
 from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, num_points
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
 from sc3d.tiling.work_folder import WorkFolder
+
+logger = logging.getLogger(__name__)
 
 BYTES = 260  # of a point while pixels look for the nearest one
 
@@ -86,6 +89,8 @@ def evaluate_scene(scene: Scene, settings: Evaluate) -> EvaluationSummary:
     cloud, output = CloudFile.open(settings.labelled or scene.labelled), settings.output or scene.metrics
     labels, truth = read_labels(cloud), settings.truth or scene.truth
     decisive = (scene.sparse, scene.classes, *scene.surface, truth, cloud.path, PhotoFrames(scene.images))
+    if knows_objects(scene):
+        logger.warning("objects are not judged, as that needs the whole cloud in memory")
     folder = WorkFolder(output, "evaluate", decisive, settings)
     with open_executor(settings) as executor:
         surface = find_points(scene, settings, cloud, folder, executor)

@@ -32,6 +32,7 @@ from sc3d.labelling.label import LabelSummary, summarize
 from sc3d.labelling.normal_sides import Sides, judge_sides, sample_step, with_sides
 from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import (
+    INSTANCE,
     SPACING_NEIGHBORS,
     SPACING_SAMPLE,
     VOTES,
@@ -286,7 +287,7 @@ def _write(path: Path, cloud: CloudFile, job: LabelJob, channels: Channels) -> t
         ("num_views", "i4"),
         *((f"{VOTES}{name}", "f4") for name in channels.names),
     ]
-    names = {name for name, _ in added} | {"nx", "ny", "nz"}
+    names = {name for name, _ in added} | {"nx", "ny", "nz", INSTANCE}
     kept = [
         (name, cloud.dtype[name].str[1:])
         for name in cloud.names
