@@ -10,6 +10,7 @@ import numpy as np
 
 from sc3d.instances.kinds import countable_kinds
 from sc3d.instances.object_map import Chunk, ObjectMap, map_objects
+from sc3d.instances.photo_votes import PhotoVotes
 from sc3d.instances.site_frame import SiteFrame
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene
@@ -44,7 +45,8 @@ class SceneObjects:
             for positions, label, sure in parts():
                 yield Chunk(frame.place(positions), label, sure)
 
-        found = map_objects(chunks, table)
+        votes = PhotoVotes.of_scene(scene, frame)
+        found = map_objects(chunks, table, votes.refine if votes is not None else None)
         if found.why:
             logger.warning("no objects are told apart: %s", found.why)
         elif found.kinds:

@@ -181,7 +181,9 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     propagated = int((labelled & (labels.state == PROPAGATED)).sum())
     total = float(labels.confidence[labelled].sum(dtype=np.float64))
     corrected = int((labels.state == CORRECTED).sum())
-    return PropagateSummary(len(labelled), int(labelled.sum()), propagated, total, corrected, learned, numbers)
+    return PropagateSummary(
+        len(labelled), int(labelled.sum()), propagated, total, corrected, learned, numbers
+    )
 
 
 def _read_start(

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.io.json_files import write_json
+from sc3d.io.json_files import read_json, write_json
 from sc3d.scene.class_table import ClassTable
+from sc3d.segmentation.mask_formats.coco import decompress
+from sc3d.segmentation.mask_formats.outlines import OutlineError
 from sc3d.segmentation.rle import Window, area, bounds, encode_runs, fill_runs, iou, move_runs
 
 SAME_OBJECT = 0.5  # two masks of one class with a larger intersection over union are one object
@@ -182,6 +184,37 @@ def write_instances(
             "annotations": annotations,
         },
     )
+
+
+class ObjectImage(NamedTuple):
+    """The objects of a photo. numbers: (H, W) int32 number of the best object at each pixel, 0 = none; class_ids:
+    (K + 1,) of each number, 0 first
+    """
+
+    numbers: np.ndarray
+    class_ids: np.ndarray
+
+
+def read_objects(path: Path) -> ObjectImage:
+    """What `write_instances` wrote, in the frame of the photo as shown; InputError if it is damaged."""
+    content: Any = read_json(path)
+    try:
+        image, entries = content["images"][0], content["annotations"]
+        size = int(image["height"]), int(image["width"])
+        ordered = sorted(entries, key=lambda entry: (entry["score"], -entry["area"], -entry["category_id"]))
+        numbers = np.zeros(size[0] * size[1], np.int32)
+        for number, entry in enumerate(ordered, start=1):  # better ones on top
+            edges = np.cumsum(decompress(entry["segmentation"]["counts"]))
+            if list(size) != entry["segmentation"]["size"] or edges[-1] != len(numbers):
+                raise ValueError("another size")
+            for start, end in zip(edges[:-1:2], edges[1::2], strict=False):
+                numbers[start:end] = number
+        ids = np.array([0, *(entry["category_id"] for entry in ordered)], np.uint8)
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError, OutlineError) as error:
+        raise InputError(
+            f"{path} is not what `sc3d segment` wrote ({error}): delete it, or run `sc3d segment` again"
+        ) from None
+    return ObjectImage(np.ascontiguousarray(numbers.reshape(size[::-1]).T), ids)
 
 
 def _annotation(number: int, instance: Instance, class_table: ClassTable) -> dict[str, object]:

@@ -37,7 +37,8 @@ def inputs(scene: Scene, settings: Propagate) -> list[Input]:
     learned = _strokes_inputs(scene) if settings.save_model else []
     place = georeference_path(scene)  # which says how long a meter is
     table = [scene.classes] if corrections or model or settings.save_model or scene.classes.exists() else []
-    return [start, scene.sparse, photos, *corrections, *table, *model, place, *learned]
+    objects = [scene.instances] if scene.instances.is_dir() else []
+    return [start, scene.sparse, photos, *corrections, *table, *model, place, *objects, *learned]
 
 
 def outputs(scene: Scene, settings: Propagate) -> list[Path]:

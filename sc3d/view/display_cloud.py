@@ -15,7 +15,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.graph import MORTON_BITS, morton_codes
 from sc3d.io.clouds import read_cloud
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.labelled_cloud import VOTES, confirmed_only, spacing_of
+from sc3d.scene.labelled_cloud import INSTANCE, VOTES, confirmed_only, spacing_of
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import COLORINGS, Coloring, can_color, color_points, shaded
 
@@ -78,10 +78,17 @@ class DisplayCloud:
         positions, others = (one.point.positions.cpu().numpy() for one in (self.cloud, labelled))
         if positions.shape != others.shape or not np.array_equal(positions, others):
             raise InputError("the labels are of other points than those shown: open the page again")
-        for name in ("label", "confidence", "state"):
-            self.cloud.point[name] = labelled.point[name]
+        for name in ("label", "confidence", "state", INSTANCE):
+            if name in labelled.point:
+                self.cloud.point[name] = labelled.point[name]
         self.label[:] = labelled.point["label"].cpu().numpy().ravel()[self.rows]
         self._colors.clear()
+
+    def rows_of_object(self, number: int) -> np.ndarray:
+        """(K,) rows, in the order shown, of the points of an object."""
+        if INSTANCE not in self.cloud.point:
+            return np.zeros(0, np.int64)
+        return np.flatnonzero(self.cloud.point[INSTANCE].cpu().numpy().ravel()[self.rows] == number)
 
     @property
     def colorings(self) -> tuple[Coloring, ...]:

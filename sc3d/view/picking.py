@@ -22,8 +22,9 @@ from sc3d.geometry.raycast import FirstSurface, see_points
 from sc3d.io.json_files import read_json
 from sc3d.runner import sidecar
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.labelled_cloud import NORMAL_NEIGHBORS, Votes, read_surface, read_votes, spacing_of
+from sc3d.scene.labelled_cloud import INSTANCE, NORMAL_NEIGHBORS, Votes, read_surface, read_votes, spacing_of
 from sc3d.scene.scene import Scene
+from sc3d.view.catalog import Catalog
 from sc3d.view.colors import STATES
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ class PickedPoint:
         `colors.STATES`
     votes: by class name, in photos of full weight, largest first; photos: names of those that see it on their
         first surface
+    object: number of the object that it belongs to, 0 = none; of_object: what is known of that, for people to read
     """
 
     row: int
@@ -49,6 +51,8 @@ class PickedPoint:
     state: str | None
     votes: dict[str, float]
     photos: tuple[str, ...]
+    object: int | None = None
+    of_object: tuple[tuple[str, str], ...] = ()
 
     def facts(self) -> list[tuple[str, str]]:
         """Names and values for people to read; photos not included."""
@@ -57,6 +61,8 @@ class PickedPoint:
             ("confidence", None if self.confidence is None else f"{self.confidence:.2f}"),
             ("state", self.state),
         ]
+        if self.object is not None:
+            found += [("object", str(self.object) if self.object else "none"), *self.of_object]
         found += [
             ("votes", ", ".join(f"{name} {count:.1f}" for name, count in self.votes.items()) or None),
             ("seen by", f"{len(self.photos)} photos"),
@@ -64,7 +70,7 @@ class PickedPoint:
         return [(name, value) for name, value in found if value is not None]
 
     def __str__(self) -> str:
-        facts = "; ".join(f"{name} {value}" for name, value in self.facts())
+        facts = "; ".join(f"{name} {value}".strip() for name, value in self.facts())
         return f"point {self.row}: {facts}{': ' if self.photos else ''}{', '.join(self.photos)}"
 
 
@@ -75,6 +81,7 @@ class Inspector:
     views: photos that may have seen the points; surface: `Scene.surface`, surfels of the cloud if there is
         no mesh
     voxel_size: of the labels, which is the tolerance of visibility, world units; None = 2 point spacings
+    catalog: of the objects that the cloud has
     """
 
     def __init__(
@@ -84,7 +91,9 @@ class Inspector:
         class_table: ClassTable | None,
         surface: Sequence[Path],
         voxel_size: float | None = None,
+        catalog: Catalog | None = None,
     ) -> None:
+        self._catalog = catalog
         self.cloud, self.views, self.class_table, self._files = cloud, list(views), class_table, surface
         self._points = cloud.point.positions.cpu().numpy().astype(np.float64)
         self._given_voxel_size = voxel_size
@@ -96,7 +105,7 @@ class Inspector:
         with suppress(InputError, KeyError, TypeError, ValueError):
             record: Any = read_json(sidecar(scene.seeds))
             voxel_size = float(record["summary"]["voxel_size"])
-        return cls(cloud, views, table, scene.surface, voxel_size)
+        return cls(cloud, views, table, scene.surface, voxel_size, Catalog(scene))
 
     def nearest(self, position: np.ndarray) -> int:
         """Row of the point nearest to a (3,) world position."""
@@ -130,9 +139,10 @@ class Inspector:
             if self.views
             else []
         )
-        return PickedPoint(
-            row, self._points[row], label, value.get("confidence"), state, self._votes_of(row), tuple(photos)
-        )
+        number = int(attributes[INSTANCE][row].item()) if INSTANCE in attributes else None
+        known = self._catalog.facts(number) if self._catalog is not None and number else []
+        about = label, value.get("confidence"), state, self._votes_of(row), tuple(photos)
+        return PickedPoint(row, self._points[row], *about, number, tuple(known))
 
     def _votes_of(self, row: int) -> dict[str, float]:
         votes = self._votes

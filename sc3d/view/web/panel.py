@@ -29,8 +29,9 @@ logger = logging.getLogger(__name__)
 
 _PHOTO_SIZE, _THUMBNAIL_SIZE = 800, 400  # px
 _NO_PHOTO = "none"
-_PICK_HINT = "Ctrl + click: what is known of a point"
+_PICK_HINT = "Ctrl + click: what is known of a point, and of the object that it belongs to"
 _PICKED_COLOR = (255, 0, 200)
+_OBJECT_COLOR, _OBJECT_COVER = (255, 220, 0), 1.2  # of the object that was clicked; in sizes of a shown point
 
 
 @dataclass(frozen=True)
@@ -187,10 +188,11 @@ class PhotoPanel:
 
 
 class PointPanel:
-    """What is known of a point that was clicked with Ctrl held."""
+    """What is known of a point that was clicked with Ctrl held, and of its object, whose points are marked."""
 
     def __init__(self, page: Page, panel: ShowPanel) -> None:
         self._page, self._panel, self._busy = page, panel, threading.Lock()
+        self._marked: viser.PointCloudHandle | None = None
         with page.server.gui.add_folder("Point"):
             self._text = page.server.gui.add_html(_note(_PICK_HINT))
         page.server.scene.on_click(modifier="cmd/ctrl")(
@@ -217,7 +219,26 @@ class PointPanel:
             receive_shadow=False,
             position=picked.position - display.origin,
         )
+        self._mark_object(picked.object or 0)
         self._text.content = point_html(picked)
+
+    def _mark_object(self, number: int) -> None:
+        """Another color for the points of an object, and for no others; 0 = none."""
+        display = self._page.display
+        rows = display.rows_of_object(number) if number else np.zeros(0, np.int64)
+        rows = rows[rows < self._page.cloud.count]
+        if self._marked is not None:
+            self._marked.remove()
+        self._marked = None
+        if len(rows):
+            self._marked = self._page.server.scene.add_point_cloud(
+                "/object",
+                display.points[rows],
+                np.tile(np.array(_OBJECT_COLOR, np.uint8), (len(rows), 1)),
+                point_size=_OBJECT_COVER * display.spacing_at(self._page.cloud.count),
+                precision="float32",
+                point_shading="flat",
+            )
 
 
 def legend_html(by: Coloring, display: DisplayCloud) -> str:
