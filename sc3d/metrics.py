@@ -17,11 +17,11 @@ from sc3d.errors import InputError, left_out
 from sc3d.geometry.cameras import View
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import FirstSurface
-from sc3d.instances.panoptic import Segments, panoptic_quality, summarize
 from sc3d.io.clouds import read_cloud
 from sc3d.io.json_files import write_json
 from sc3d.io.ply import read_header
 from sc3d.io.progress import progress
+from sc3d.panoptic import Segments, panoptic_quality, summarize
 from sc3d.scene.class_table import OTHER, ClassTable
 from sc3d.scene.labelled_cloud import INSTANCE, LabelledSurface, instances_of, read_labelled
 from sc3d.scene.labels import Labels
@@ -361,8 +361,9 @@ def knows_objects(scene: Scene) -> bool:
 def judge_objects(
     scene: Scene, index: NeighborIndex, reach: float, label: np.ndarray, instance: np.ndarray | None
 ) -> dict | None:
-    """Panoptic quality at the points of the true cloud, by the nearest point of the labelled one; None where it
-    cannot be told. label, instance: (N,) of the labelled cloud; reach: farther points are none, world units
+    """Panoptic quality at the points of the true cloud, by the nearest point of the labelled one; None
+    where it cannot be told. label, instance: (N,) of the labelled cloud; reach: farther points are none,
+    world units
     """
     path, table = scene.truth_cloud, scene.class_table()
     if instance is None:
@@ -391,8 +392,8 @@ def judge_objects(
 def judge(
     scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels, objects: dict | None = None
 ) -> EvaluationSummary:
-    """Judge labels, and the scene's masks, at every pixel that has truth, and write `metrics.json`. objects: what
-    `judge_objects` returns
+    """Judge labels, and the scene's masks, at every pixel that has truth, and write `metrics.json`.
+    objects: what `judge_objects` returns
     """
     table, truth_files = scene.class_table(), truth_masks(scene, settings)
     mask_files = scene.mask_files(scene.masks, table) if scene.masks.is_dir() else {}

@@ -41,8 +41,8 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
 
 
 def write_parts(path: Path, projected: ProjectedCloud, parts: Iterable[tuple[str, np.ndarray]]) -> list[int]:
-    """A folder of clouds, by file name and the points (N,) bool of each; positions float64 in the CRS. Returns how
-    many points each has.
+    """A folder of clouds, by file name and the points (N,) bool of each; positions float64 in the CRS.
+    Returns how many points each has.
     """
     cloud, counts = projected.cloud.clone(), []
     if "normals" in cloud.point:

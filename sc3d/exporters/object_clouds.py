@@ -20,8 +20,8 @@ def outputs(scene: Scene, settings: Export) -> list[Path]:
 
 
 def write(scene: Scene, settings: Export) -> dict[str, object]:
-    """`export/object_clouds/<instance>_<class>.ply` for each object of the chosen classes; float64 positions in the
-    CRS, points in their order.
+    """`export/object_clouds/<instance>_<class>.ply` for each object of the chosen classes; float64
+    positions in the CRS, points in their order.
     """
     projected, path = read_projected_cloud(scene, settings), settings.labelled or scene.labelled
     instance = instances_of(projected.cloud, path)

@@ -99,8 +99,8 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
 def find_objects(
     projected: ProjectedCloud, table: ClassTable, settings: Export, views: Sequence[View] = ()
 ) -> tuple[dict[str, list[Feature]], list[Feature]]:
-    """Buildings and trees of a labelled cloud, from north to south, each numbered from 1; and all objects, by the
-    numbers that the cloud has. InputError if its classes cannot tell them from the ground.
+    """Buildings and trees of a labelled cloud, from north to south, each numbered from 1; and all objects,
+    by the numbers that the cloud has. InputError if its classes cannot tell them from the ground.
     """
     kinds = require_kinds(table)
     site = look_at_site(projected, table, kinds, settings)
@@ -116,14 +116,14 @@ def find_objects(
 
 
 def require_kinds(table: ClassTable) -> list[Kind]:
-    """The kinds that are counted; InputError if neither buildings nor trees are among them and the table does not
-    say that anything is.
+    """The kinds that are counted; InputError if neither buildings nor trees are among them and the table
+    does not say that anything is.
     """
     kinds = countable_kinds(table)
     if all(kind.how == "parts" for kind in kinds) and not any(entry.countable for entry in table):
         raise InputError(
-            'no class has the ASPRS code of buildings (6) or vegetation (3 to 5): add "asprs" to the classes in '
-            'classes.json, or "countable": true to what is to be counted'
+            'no class has the ASPRS code of buildings (6) or vegetation (3 to 5): add "asprs" to the classes '
+            'in classes.json, or "countable": true to what is to be counted'
         )
     return kinds
 
@@ -177,8 +177,8 @@ def _find(site: Site, number: int, kind: Kind, settings: Export, views: Sequence
 
 
 def given_regions(site: Site, chosen: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """(H, W) int32 regions from 1 of covered cells (H, W) bool, by the objects of the highest of the chosen points
-    (N,) bool in each cell, or in the nearest that has one.
+    """(H, W) int32 regions from 1 of covered cells (H, W) bool, by the objects of the highest of the chosen
+    points (N,) bool in each cell, or in the nearest that has one.
     """
     instance = site.instance if site.instance is not None else np.zeros(len(chosen), np.uint32)
     rows = highest_points(site.grid, site.points, chosen & (instance > 0))
@@ -189,7 +189,9 @@ def given_regions(site: Site, chosen: np.ndarray, covered: np.ndarray) -> np.nda
 
 
 def _outlines(regions: np.ndarray, grid: Raster, kind: Kind, settings: Export) -> dict[int, shapely.Polygon]:
-    """Outline of each region, m: of buildings with right angles where that is wanted, of crowns without holes."""
+    """Outline of each region, m: of buildings with right angles where that is wanted, of crowns without
+    holes.
+    """
     traced = polygonize(regions, grid)
     if kind.how == "roofs":
         draw = orthogonalized if settings.rectangular else simplified

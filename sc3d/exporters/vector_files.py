@@ -42,7 +42,8 @@ class Feature:
     height: of its top above the ground, m; ground: z of the ground under it, m; confidence: mean of its
         points, 0 to 1; num_points: of its class; volume: between its top, as seen from above, and the
         ground, m3
-    instance: its number in the cloud, 0 = it has none; photo: name of the one that shows it best, "" = none does
+    instance: its number in the cloud, 0 = it has none; photo: name of the one that shows it best, "" = none
+    does
     """
 
     polygon: shapely.Polygon

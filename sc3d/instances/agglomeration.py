@@ -1,5 +1,5 @@
-"""Greedy agglomeration of a graph whose edges say how much two parts belong together (GAEC: Keuper et al. 2015,
-Efficient decomposition of image and mesh graphs by lifted multicuts).
+"""Greedy agglomeration of a graph whose edges say how much two parts belong together (GAEC: Keuper et al.
+2015, Efficient decomposition of image and mesh graphs by lifted multicuts).
 """
 
 from __future__ import annotations
@@ -10,10 +10,12 @@ import numpy as np
 
 
 def agglomerate(count: int, edges: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(count,) int64 group of each part: the two groups with the largest weight between them become one, until none
-    is above 0; equal weights are decided by the numbers of the parts, so that the order of the edges is nothing.
+    """(count,) int64 group of each part: the two groups with the largest weight between them become one,
+    until none is above 0; equal weights are decided by the numbers of the parts, so that the order of the
+    edges is nothing.
 
-    edges: (E, 2) int parts, none to itself; weights: (E,) int, > 0 = together, < 0 = apart; parallel ones add up
+    edges: (E, 2) int parts, none to itself; weights: (E,) int, > 0 = together, < 0 = apart; parallel ones
+    add up
     """
     around: list[dict[int, int]] = [{} for _ in range(count)]
     for (first, second), weight in zip(edges.tolist(), weights.tolist(), strict=True):

@@ -15,9 +15,11 @@ MIN_LENGTH, MIN_RISE = 2.0, 2.0  # of a wall that stands for a building, m
 
 
 def find_facades(tops: np.ndarray, lows: np.ndarray, buildings: np.ndarray, grid: Raster) -> np.ndarray:
-    """(H, W) int32 the buildings numbered from 1, and those of which only walls show, split where their tops part.
+    """(H, W) int32 the buildings numbered from 1, and those of which only walls show, split where their
+    tops part.
 
-    tops: (H, W) z of the highest building point above the ground, m, -inf = none; lows: of the lowest, inf = none
+    tops: (H, W) z of the highest building point above the ground, m, -inf = none; lows: of the lowest, inf
+    = none
     """
     far = (
         ndimage.distance_transform_edt(buildings == 0) * grid.pixel > BESIDE

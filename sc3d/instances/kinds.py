@@ -1,4 +1,6 @@
-"""What is counted, by the class table: buildings by their roofs, trees by their crowns, all else by its parts."""
+"""What is counted, by the class table: buildings by their roofs, trees by their crowns, all else by its
+parts.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +17,18 @@ NOISE = (7, 18)  # ASPRS codes
 
 @dataclass(frozen=True)
 class Kind:
-    """Classes whose points make up objects of one kind. ids: of the classes; how: what tells its objects apart"""
+    """Classes whose points make up objects of one kind. ids: of the classes; how: what tells its objects
+    apart
+    """
 
     ids: tuple[int, ...]
     how: Literal["roofs", "crowns", "parts"]
 
 
 def countable_kinds(table: ClassTable) -> list[Kind]:
-    """The kinds of the countable classes that points can be of: buildings, trees, then every other class by itself."""
+    """The kinds of the countable classes that points can be of: buildings, trees, then every other class by
+    itself.
+    """
     counted = [entry for entry in table if entry.surface and table.is_countable(entry)]
     trees = table.tree_codes
     roofs = tuple(entry.id for entry in counted if entry.asprs == BUILDING_CODE)

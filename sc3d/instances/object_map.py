@@ -1,5 +1,5 @@
-"""Which object each point belongs to: a map of the objects of every countable class, seen from above, in passes
-over the cloud that do not depend on the order of the points or on how many are read at a time.
+"""Which object each point belongs to: a map of the objects of every countable class, seen from above, in
+passes over the cloud that do not depend on the order of the points or on how many are read at a time.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ Chunks = Callable[[], Iterator[Chunk]]  # reads the cloud from its start
 class Tops:
     """What stands on each cell of a grid, (H, W) each, z in m, -inf = nothing.
 
-    ground: z of the ground; all: highest point; kinds: highest point of each kind, with roofs only those above the
-    ground; lows: the lowest point of each kind, inf = nothing; above, roofs: number of points above the ground, and
-    of them that are of buildings
+    ground: z of the ground; all: highest point; kinds: highest point of each kind, with roofs only those
+    above the ground; lows: the lowest point of each kind, inf = nothing; above, roofs: number of points
+    above the ground, and of them that are of buildings
     """
 
     grid: Raster
@@ -75,7 +75,8 @@ class Tops:
 
 @dataclass(frozen=True)
 class ObjectMap:
-    """regions: of each kind, (H, W) int32 number of the object in each cell, 0 = none; no number is used twice.
+    """regions: of each kind, (H, W) int32 number of the object in each cell, 0 = none; no number is used
+    twice.
     why: without a map, the reason
     """
 
@@ -126,7 +127,9 @@ def map_objects(
 
 
 def split(tops: Tops, number: int, kind: Kind) -> np.ndarray:
-    """(H, W) int32 regions from 1 of one of the kinds of `tops`; also of buildings of which only walls show."""
+    """(H, W) int32 regions from 1 of one of the kinds of `tops`; also of buildings of which only walls
+    show.
+    """
     covered, heights = cover(tops, number, kind)
     found = split_covered(covered, heights, tops.grid, kind, (MIN_HEIGHT, MIN_AREA))
     if kind.how == "roofs":
@@ -135,8 +138,8 @@ def split(tops: Tops, number: int, kind: Kind) -> np.ndarray:
 
 
 def cover(tops: Tops, number: int, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
-    """Cells that a kind covers, gaps closed, (H, W) bool, and its height there, (H, W) m: z, but of crowns above
-    the ground; NaN elsewhere.
+    """Cells that a kind covers, gaps closed, (H, W) bool, and its height there, (H, W) m: z, but of crowns
+    above the ground; NaN elsewhere.
     """
     grid, highest = tops.grid, tops.kinds[number]
     if kind.how == "roofs":
@@ -154,7 +157,9 @@ def cover(tops: Tops, number: int, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
 def split_covered(
     covered: np.ndarray, heights: np.ndarray, grid: Raster, kind: Kind, least: tuple[float, float]
 ) -> np.ndarray:
-    """(H, W) int32 regions from 1 of what `cover` returns. least: height of plants, m, and area of buildings, m2"""
+    """(H, W) int32 regions from 1 of what `cover` returns. least: height of plants, m, and area of
+    buildings, m2
+    """
     if kind.how == "roofs":
         return split_buildings(covered, heights, grid, least[1])
     return split_crowns(heights, grid, least[0]) if kind.how == "crowns" else split_parts(covered, grid)
@@ -214,8 +219,8 @@ def _lowest(chunks: Chunks, ground: list[int], grid: Raster) -> tuple[np.ndarray
 def measure(
     chunks: Chunks, kinds: Sequence[Kind], grid: Raster, ground: np.ndarray, min_height: float
 ) -> Tops:
-    """What the sure points of a cloud leave on the cells of a grid. ground: (H, W) z of the ground, m; min_height:
-    lower is not above the ground, m
+    """What the sure points of a cloud leave on the cells of a grid. ground: (H, W) z of the ground, m;
+    min_height: lower is not above the ground, m
     """
     size = grid.height * grid.width
     highest = np.full((len(kinds) + 1, size), -np.inf)

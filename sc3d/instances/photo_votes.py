@@ -1,5 +1,5 @@
-"""What the objects that a segmenter found in the photos say of the objects of a site: where two places are one
-object in most photos that show both, they are one; where they are two, they part.
+"""What the objects that a segmenter found in the photos say of the objects of a site: where two places are
+one object in most photos that show both, they are one; where they are two, they part.
 """
 
 from __future__ import annotations
@@ -77,7 +77,9 @@ class PhotoVotes:
     def _count(
         self, tops: Tops, kind: Kind, atoms: np.ndarray, edges: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(E,) int64 photos in which the two places of each edge are one object, and those in which they are two."""
+        """(E,) int64 photos in which the two places of each edge are one object, and those in which they
+        are two.
+        """
         points, places = _samples(tops, atoms)
         world = self.frame.to_world(points)
         same, differ = np.zeros(len(edges), np.int64), np.zeros(len(edges), np.int64)
@@ -151,8 +153,8 @@ def _majority(places: np.ndarray, numbers: np.ndarray, count: int) -> np.ndarray
 def _joined(
     group: np.ndarray, sizes: np.ndarray, edges: np.ndarray, weights: np.ndarray, least: float
 ) -> np.ndarray:
-    """The groups (A,) of atoms, of which those smaller than `least` m2 join the one beside them that they belong to
-    most, the smallest first. sizes: (A,) m2; edges: (E, 2); weights: (E,)
+    """The groups (A,) of atoms, of which those smaller than `least` m2 join the one beside them that they
+    belong to most, the smallest first. sizes: (A,) m2; edges: (E, 2); weights: (E,)
     """
     group = group.copy()
     while True:

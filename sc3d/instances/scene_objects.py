@@ -17,13 +17,15 @@ from sc3d.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
 
-# positions (N, 3) world, label (N,) uint8 ids, and (N,) bool, confirmed by several photos; all parts of the cloud
+# positions (N, 3) world, label (N,) uint8 ids, and (N,) bool, confirmed by several photos, of all parts
 Parts = Callable[[], Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]]
 
 
 @dataclass
 class SceneObjects:
-    """Looks up the object of each point. seen, lost: points of each kind that were asked for, and without one"""
+    """Looks up the object of each point. seen, lost: points of each kind that were asked for, and without
+    one
+    """
 
     frame: SiteFrame
     table: ClassTable

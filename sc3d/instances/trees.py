@@ -17,8 +17,8 @@ MIN_CROWN = 2.0  # m2
 def canopy_height(trees: np.ndarray, tops: np.ndarray, ground: np.ndarray, pixel: float) -> np.ndarray:
     """(H, W) float64 height of the canopy above the ground, m; NaN where nothing or something else is on top.
 
-    trees, tops: (H, W) z of the highest tree point, and of the highest point, m, -inf = none; ground: (H, W) z of
-        the ground, m; pixel: side of the cells, m
+    trees, tops: (H, W) z of the highest tree point, and of the highest point, m, -inf = none; ground: (H,
+        W) z of the ground, m; pixel: side of the cells, m
     """
     with np.errstate(invalid="ignore"):  # of cells without points
         canopy = np.isfinite(trees) & (trees >= tops - UNDER)

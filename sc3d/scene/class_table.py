@@ -110,7 +110,9 @@ class ClassTable:
         return {MEDIUM, HIGH} if {MEDIUM, HIGH} & codes else {LOW}
 
     def is_countable(self, entry: SemanticClass) -> bool:
-        """Whether objects of a class are told apart: as the table says, else buildings, trees and vehicles."""
+        """Whether objects of a class are told apart: as the table says, else buildings, trees and
+        vehicles.
+        """
         if entry.countable is not None:
             return entry.countable
         coded = entry.asprs in {BUILDING_CODE, *self.tree_codes}

@@ -119,8 +119,8 @@ def with_labels(
     votes: Votes | None = None,
     instance: np.ndarray | None = None,
 ) -> o3d.t.geometry.PointCloud:
-    """The same points, in order, with attributes label, confidence, state, num_views (and votes per class; and the
-    object (N,) uint32 of each point).
+    """The same points, in order, with attributes label, confidence, state, num_views (and votes per class;
+    and the object (N,) uint32 of each point).
     """
     result = cloud.clone()
     attributes = {
@@ -172,7 +172,9 @@ def take_labels(cloud: o3d.t.geometry.PointCloud, path: Path, made_by: str) -> L
 
 
 def instances_of(cloud: o3d.t.geometry.PointCloud, path: Path) -> np.ndarray | None:
-    """(N,) uint32 object of each point of a cloud that was read from `path`, 0 = none; None if it does not say."""
+    """(N,) uint32 object of each point of a cloud that was read from `path`, 0 = none; None if it does not
+    say.
+    """
     if INSTANCE not in cloud.point:
         return None
     return _in_range(path, INSTANCE, cloud.point[INSTANCE].cpu().numpy().ravel(), 2**32 - 1, np.uint32)

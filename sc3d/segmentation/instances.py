@@ -187,8 +187,8 @@ def write_instances(
 
 
 class ObjectImage(NamedTuple):
-    """The objects of a photo. numbers: (H, W) int32 number of the best object at each pixel, 0 = none; class_ids:
-    (K + 1,) of each number, 0 first
+    """The objects of a photo. numbers: (H, W) int32 number of the best object at each pixel, 0 = none;
+    class_ids: (K + 1,) of each number, 0 first
     """
 
     numbers: np.ndarray

@@ -40,9 +40,9 @@ class Export:
     clouds: one PLY per class; splats, spz: Gaussians with labels; orthophoto: GeoTIFFs of color, class and
     height; dtm, dsm, ndsm: GeoTIFFs of the height of the bare ground (holes interpolated, and marked in a file
     beside it), of the surface, and of the surface above the ground; contours: lines of equal height of the
-    ground as GeoPackage; objects: footprints of buildings, crowns of trees and all countable objects as GeoJSON;
-    object-clouds: one PLY per object; transforms: cameras and sparse points as nerfstudio's transforms.json;
-    colmap-text: the same as COLMAP's text files.
+    ground as GeoPackage; objects: footprints of buildings, crowns of trees and all countable objects as
+    GeoJSON; object-clouds: one PLY per object; transforms: cameras and sparse points as nerfstudio's
+    transforms.json; colmap-text: the same as COLMAP's text files.
     """
     classes: tuple[str, ...] = ()
     """Names of the classes to write; all otherwise (laz, clouds, splats, spz)."""

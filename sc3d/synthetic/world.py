@@ -66,8 +66,8 @@ class World:
         )
 
     def instances(self, triangles: np.ndarray) -> np.ndarray:
-        """(N,) uint32 object that triangles (N,) belong to, of what is counted: buildings, and plants at least
-        `COUNTED` m tall; else 0.
+        """(N,) uint32 object that triangles (N,) belong to, of what is counted: buildings, and plants at
+        least `COUNTED` m tall; else 0.
         """
         objects, heights = self.ints[:, 2], self.corners[:, :, 2]
         low, high = (np.full(objects.max() + 1, value) for value in (np.inf, -np.inf))

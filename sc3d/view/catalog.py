@@ -23,8 +23,8 @@ MISSING = "for area, height and volume: `sc3d export SCENE --format objects`"
 
 
 class Catalog:
-    """The objects of a scene by their number in the cloud; read when it is first asked, and again once a file has
-    changed.
+    """The objects of a scene by their number in the cloud; read when it is first asked, and again once a
+    file has changed.
     """
 
     def __init__(self, scene: Scene) -> None:

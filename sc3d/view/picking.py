@@ -41,7 +41,8 @@ class PickedPoint:
         `colors.STATES`
     votes: by class name, in photos of full weight, largest first; photos: names of those that see it on their
         first surface
-    object: number of the object that it belongs to, 0 = none; of_object: what is known of that, for people to read
+    object: number of the object that it belongs to, 0 = none; of_object: what is known of that, for people
+    to read
     """
 
     row: int

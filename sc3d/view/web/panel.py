@@ -188,7 +188,9 @@ class PhotoPanel:
 
 
 class PointPanel:
-    """What is known of a point that was clicked with Ctrl held, and of its object, whose points are marked."""
+    """What is known of a point that was clicked with Ctrl held, and of its object, whose points are
+    marked.
+    """
 
     def __init__(self, page: Page, panel: ShowPanel) -> None:
         self._page, self._panel, self._busy = page, panel, threading.Lock()

@@ -1,5 +1,5 @@
-"""Panoptic quality of labelled objects, by points (Kirillov et al. 2019): a segment of the truth and one that was
-found match if they have more than half of their union in common.
+"""Panoptic quality of labelled objects, by points (Kirillov et al. 2019): a segment of the truth and one
+that was found match if they have more than half of their union in common.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sc3d.instances.kinds import countable_kinds
 from sc3d.scene.class_table import ClassTable
 
 MATCH = 0.5  # intersection over union above which two segments match: at most one can
@@ -24,8 +23,8 @@ class Segments:
 
 @dataclass(frozen=True)
 class ClassQuality:
-    """Of one class. overlap: sum of the intersections over union of the matches; matched, extra, missed: segments
-    that match, found ones without a match, true ones without
+    """Of one class. overlap: sum of the intersections over union of the matches; matched, extra, missed:
+    segments that match, found ones without a match, true ones without
     """
 
     overlap: float
@@ -54,10 +53,10 @@ class ClassQuality:
 def panoptic_quality(truth: Segments, found: Segments, table: ClassTable) -> dict[int, ClassQuality]:
     """By id of each class that the truth has. Classes that are not counted are one segment each.
 
-    Points of the truth with label 0, and those of a countable class without an object, are not judged: they count
-    in no union, and what is found mostly on them is not extra.
+    Points of the truth with label 0, and those of a countable class without an object, are not judged: they
+    count in no union, and what is found mostly on them is not extra.
     """
-    things = {label for kind in countable_kinds(table) for label in kind.ids}
+    things = {entry.id for entry in table if table.is_countable(entry)}
     result = {}
     for entry in table:
         if not (truth.label == entry.id).any():
@@ -93,8 +92,10 @@ def match_segments(truth: np.ndarray, found: np.ndarray, unjudged: np.ndarray) -
 
 
 def summarize(found: dict[int, ClassQuality], table: ClassTable) -> dict[str, object]:
-    """JSON-ready: the mean over all classes, over those that are counted and over the others, and each class."""
-    things = {label for kind in countable_kinds(table) for label in kind.ids}
+    """JSON-ready: the mean over all classes, over those that are counted and over the others, and each
+    class.
+    """
+    things = {entry.id for entry in table if table.is_countable(entry)}
     groups = {
         "pq": list(found.values()),
         "pq_things": [quality for label, quality in found.items() if label in things],
