@@ -102,7 +102,9 @@ class ObjectMap:
 
 
 def map_objects(
-    chunks: Chunks, table: ClassTable, refine: Callable[[Tops, Kind, np.ndarray], np.ndarray] | None = None
+    chunks: Chunks,
+    table: ClassTable,
+    refine: Callable[[Tops, int, Kind, np.ndarray], np.ndarray] | None = None,
 ) -> ObjectMap:
     """Tell the objects of a cloud apart. refine: what photos say of the regions (H, W) of a kind, from 1."""
     kinds = countable_kinds(table)
@@ -119,7 +121,7 @@ def map_objects(
     regions, used = [], 0
     for number, kind in enumerate(kinds):
         found = split(tops, number, kind)
-        found = found if refine is None else refine(tops, kind, found)
+        found = found if refine is None else refine(tops, number, kind, found)
         regions.append(np.where(found > 0, found + used, 0).astype(np.int32))
         used += int(found.max())
     reached = [_grown(found, REACH / grid.pixel) for found in regions]

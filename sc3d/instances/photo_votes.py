@@ -4,11 +4,14 @@ one object in most photos that show both, they are one; where they are two, they
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
+from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, in_image, project
 from sc3d.instances.agglomeration import agglomerate
 from sc3d.instances.kinds import Kind
@@ -20,49 +23,50 @@ from sc3d.instances.trees import MIN_CROWN
 from sc3d.io.images import read_orientation
 from sc3d.io.orientation import inverse, turned
 from sc3d.io.progress import progress
+from sc3d.scene.object_image import ObjectImage, ReadObjects
 from sc3d.scene.scene import Scene
-from sc3d.segmentation.instances import ObjectImage, read_objects
+
+logger = logging.getLogger(__name__)
 
 BLOCK, SAMPLE = (
     1.0,
     0.33,
 )  # side of the places that photos are asked about; distance of the points looked for there, m
-PRIOR = 2  # photos that the shape of the site counts as much as
+WALL, MAX_DOWN = 1.5, 8  # distance of the points down a wall, m, and how many at most
+PRIOR = 2  # photos that the shape of the site counts as much as, at each side of a place
 SURE = 0.5  # of the points of a place that a photo shows, more are on one of its objects
 
 
 @dataclass(frozen=True)
 class PhotoVotes:
-    """views: those that have a file of objects, with the file's name; used: kinds that photos spoke of"""
+    """views: those that have a file of objects, with the file; read: reads it; broken: files that it refused"""
 
     scene: Scene
     frame: SiteFrame
-    views: list[tuple[View, str]]
-    used: list[Kind] = field(default_factory=list)
+    views: list[tuple[View, Path]]
+    read: ReadObjects
+    broken: dict[Path, str] = field(default_factory=dict)
 
     @classmethod
-    def of_scene(cls, scene: Scene, frame: SiteFrame) -> PhotoVotes | None:
+    def of_scene(cls, scene: Scene, frame: SiteFrame, read: ReadObjects) -> PhotoVotes | None:
         """None where no photo has objects."""
         if not scene.instances.is_dir():
             return None
-        names = scene.photo_names
-        found = [
-            (view, str(names.path(scene.instances, view.name, ".json")))
-            for view in scene.model.views
-            if names.path(scene.instances, view.name, ".json").exists()
+        files = [
+            (view, scene.photo_names.path(scene.instances, view.name, ".json")) for view in scene.model.views
         ]
-        return cls(scene, frame, found) if found else None
+        found = [(view, file) for view, file in files if file.exists()]
+        return cls(scene, frame, found, read) if found else None
 
-    def refine(self, tops: Tops, kind: Kind, regions: np.ndarray) -> np.ndarray:
-        """(H, W) int32 regions from 1 of a kind, parted and joined as the photos have it. regions: (H, W)"""
+    def refine(self, tops: Tops, number: int, kind: Kind, regions: np.ndarray) -> np.ndarray:
+        """(H, W) int32 regions from 1 of one of the kinds of `tops`, parted and joined as the photos have it."""
         atoms = _atoms(regions, round(BLOCK / tops.grid.pixel) or 1)
         edges = _edges(atoms)
         if not len(edges):
             return regions
-        same, differ = self._count(tops, kind, atoms, edges)
+        same, differ = self._count(tops, number, kind, atoms, edges)
         if not (same + differ).any():
             return regions
-        self.used.append(kind)
         owner = np.zeros(atoms.max() + 1, np.int64)
         owner[atoms.ravel()] = regions.ravel()
         together = owner[edges[:, 0]] == owner[edges[:, 1]]
@@ -75,12 +79,12 @@ class PhotoVotes:
         return renumbered(np.where(atoms > 0, group[atoms] + 1, 0))
 
     def _count(
-        self, tops: Tops, kind: Kind, atoms: np.ndarray, edges: np.ndarray
+        self, tops: Tops, number: int, kind: Kind, atoms: np.ndarray, edges: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """(E,) int64 photos in which the two places of each edge are one object, and those in which they
         are two.
         """
-        points, places = _samples(tops, atoms)
+        points, places = _samples(tops, number, atoms)
         world = self.frame.to_world(points)
         same, differ = np.zeros(len(edges), np.int64), np.zeros(len(edges), np.int64)
         for view, image in self._images():
@@ -98,10 +102,22 @@ class PhotoVotes:
 
     def _images(self) -> Iterator[tuple[View, ObjectImage]]:
         for view, file in progress(self.views, "objects of the photos", "photo"):
-            found = read_objects(self.scene.path / file)
+            if file in self.broken:
+                continue
+            try:
+                found = self.read(file)
+            except InputError as error:
+                self._leave_out(file, str(error))
+                continue
             photo = self.scene.photo(view.name)
             turn = inverse(read_orientation(photo)) if photo.is_file() else 1
             yield view, ObjectImage(turned(found.numbers, turn), found.class_ids)
+
+    def _leave_out(self, file: Path, why: str) -> None:
+        """The work is done by now: what photos say is left out with a word."""
+        if not self.broken:
+            logger.warning("photos whose objects cannot be read have no say, the first of them: %s", why)
+        self.broken[file] = why
 
 
 def _atoms(regions: np.ndarray, side: int) -> np.ndarray:
@@ -121,14 +137,21 @@ def _edges(atoms: np.ndarray) -> np.ndarray:
     return np.unique(pairs, axis=0)
 
 
-def _samples(tops: Tops, atoms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(K, 3) points on top of the cells of atoms, m, and the atom (K,) of each."""
+def _samples(tops: Tops, number: int, atoms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(K, 3) points of one of the kinds on the cells of atoms, m: on top and, of walls, down to the lowest; and the
+    atom (K,) of each.
+    """
     step = max(1, round(SAMPLE / tops.grid.pixel))
     chosen = np.zeros(atoms.shape, bool)
     chosen[::step, ::step] = True
-    chosen &= (atoms > 0) & np.isfinite(tops.all)
-    places = tops.grid.centers()[chosen.ravel()]
-    return np.column_stack([places, tops.all[chosen]]), atoms[chosen]
+    high, low = tops.kinds[number], tops.lows[number]
+    chosen &= (atoms > 0) & np.isfinite(high)
+    places, owners = tops.grid.centers()[chosen.ravel()], atoms[chosen]
+    high, low = high[chosen], low[chosen]
+    down = np.minimum(np.floor((high - low) / WALL), MAX_DOWN).astype(np.int64)
+    rows = np.repeat(np.arange(len(places)), down + 1)
+    steps = np.arange(len(rows)) - np.repeat(np.cumsum(down + 1) - down - 1, down + 1)
+    return np.column_stack([places[rows], high[rows] - WALL * steps]), owners[rows]
 
 
 def _look_up(image: ObjectImage, view: View, pixels: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from sc3d.instances.object_map import Chunk, ObjectMap, map_objects
 from sc3d.instances.photo_votes import PhotoVotes
 from sc3d.instances.site_frame import SiteFrame
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.object_image import ReadObjects
 from sc3d.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -34,8 +35,12 @@ class SceneObjects:
     lost: dict[int, int] = field(default_factory=dict)
 
     @classmethod
-    def tell_apart(cls, scene: Scene, parts: Parts) -> SceneObjects | None:
-        """Those of countable classes; None without a class table, or if it has no such class."""
+    def tell_apart(
+        cls, scene: Scene, parts: Parts, read_objects: ReadObjects | None = None
+    ) -> SceneObjects | None:
+        """Those of countable classes; None without a class table, or if it has no such class. read_objects: of
+        the photos, which then have a say
+        """
         if not scene.classes.exists():
             return None
         table = scene.class_table()
@@ -47,7 +52,7 @@ class SceneObjects:
             for positions, label, sure in parts():
                 yield Chunk(frame.place(positions), label, sure)
 
-        votes = PhotoVotes.of_scene(scene, frame)
+        votes = PhotoVotes.of_scene(scene, frame, read_objects) if read_objects is not None else None
         found = map_objects(chunks, table, votes.refine if votes is not None else None)
         if found.why:
             logger.warning("no objects are told apart: %s", found.why)

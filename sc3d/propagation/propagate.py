@@ -35,6 +35,7 @@ from sc3d.scene.labelled_cloud import (
     with_labels,
 )
 from sc3d.scene.labels import CORRECTED, LOCKED, PROPAGATED, SEED, UNLOCKED, UNSEEN, Labels
+from sc3d.scene.object_image import ReadObjects
 from sc3d.scene.scene import Scene
 from sc3d.scene.site_model import ModelPart, read_model
 from sc3d.settings.labels import Propagate
@@ -146,8 +147,12 @@ class PropagateSummary:
         }
 
 
-def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
-    """Complete the labels of a scene's seeds (or of `settings.seeds`) and write the labelled cloud."""
+def propagate_scene(
+    scene: Scene, settings: Propagate, read_objects: ReadObjects | None = None
+) -> PropagateSummary:
+    """Complete the labels of a scene's seeds (or of `settings.seeds`) and write the labelled cloud. read_objects:
+    as `SceneObjects.tell_apart` takes it
+    """
     saved = _saved_appearance(scene, settings)
     meters = _meters(scene) if settings.model or settings.save_model else None
     cloud, seeds, votes, path = _read_start(scene, settings)
@@ -169,7 +174,7 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     found = propagate(points, normals, settings, graph, learn)
     labels = replace(found, label=channels.to_ids(found.label))
     sure = is_confirmed(cloud)
-    objects = SceneObjects.tell_apart(scene, lambda: iter([(positions, labels.label, sure)]))
+    objects = SceneObjects.tell_apart(scene, lambda: iter([(positions, labels.label, sure)]), read_objects)
     instance = None if objects is None else objects.find(positions, labels.label)
     output = settings.output or scene.labelled
     write_geometry(output, with_labels(cloud, normals, labels, instance=instance))

@@ -12,6 +12,7 @@ import numpy as np
 from sc3d.errors import InputError
 from sc3d.io.json_files import read_json, write_json
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.object_image import ObjectImage
 from sc3d.segmentation.mask_formats.coco import decompress
 from sc3d.segmentation.mask_formats.outlines import OutlineError
 from sc3d.segmentation.rle import Window, area, bounds, encode_runs, fill_runs, iou, move_runs
@@ -184,15 +185,6 @@ def write_instances(
             "annotations": annotations,
         },
     )
-
-
-class ObjectImage(NamedTuple):
-    """The objects of a photo. numbers: (H, W) int32 number of the best object at each pixel, 0 = none;
-    class_ids: (K + 1,) of each number, 0 first
-    """
-
-    numbers: np.ndarray
-    class_ids: np.ndarray
 
 
 def read_objects(path: Path) -> ObjectImage:

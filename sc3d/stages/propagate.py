@@ -12,6 +12,7 @@ from sc3d.propagation.propagate import propagate_scene
 from sc3d.runner import MAX_SIDECAR, sidecar
 from sc3d.scene.scene import Scene
 from sc3d.scene.site_model import ModelPart, read_model, require_model_or_nothing, write_model
+from sc3d.segmentation.instances import read_objects
 from sc3d.segmentation.strokes.backend import Strokes
 from sc3d.segmentation.strokes.model_file import to_part
 from sc3d.settings.labels import Propagate
@@ -54,7 +55,7 @@ def run(scene: Scene, settings: Propagate) -> dict[str, object]:
             " or label a thinner cloud"
         )
     strokes = _strokes_part(scene) if settings.save_model else None
-    summary = (propagate_scene if fits else propagate_scene_by_tiles)(scene, settings)
+    summary = (propagate_scene if fits else propagate_scene_by_tiles)(scene, settings, read_objects)
     if settings.save_model:
         if summary.learned is None:
             raise InputError(

@@ -44,6 +44,7 @@ from sc3d.propagation.terrain import WINDOWS, GroundModel, NormalStatistics
 from sc3d.scene.corrections import Corrections
 from sc3d.scene.labelled_cloud import INSTANCE, UNCONFIRMED, VOTES, vote_channels
 from sc3d.scene.labels import CORRECTED, PROPAGATED
+from sc3d.scene.object_image import ReadObjects
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
 from sc3d.tiling.executor import Executor, open_executor
@@ -77,7 +78,9 @@ def bytes_per_point(num_channels: int) -> int:
     return max(LEAST_BYTES, BYTES + VOTE_BYTES * num_channels)
 
 
-def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
+def propagate_scene(
+    scene: Scene, settings: Propagate, read_objects: ReadObjects | None = None
+) -> PropagateSummary:
     """As `propagation.propagate.propagate_scene`, tile by tile, here or on the workers that the settings ask for."""
     cloud, output = CloudFile.open(settings.seeds or scene.seeds), settings.output or scene.labelled
     channels = vote_channels(cloud.names)
@@ -101,7 +104,8 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     job = PropagateJob(settings, statistics.extent, store, results, margin, channels, shared, up, corrections)
     with open_executor(settings) as executor:
         _solve(job, executor, cloud.path)
-    summary = _write(output, cloud, job, scene)
+    objects = SceneObjects.tell_apart(scene, partial(_parts, cloud, job), read_objects)
+    summary = _write(output, cloud, job, objects)
     folder.remove()
     return summary
 
@@ -372,8 +376,7 @@ def _parts(cloud: CloudFile, job: PropagateJob) -> Iterator[tuple[np.ndarray, np
         yield positions(records), values["label"], doubted == 0
 
 
-def _write(path: Path, cloud: CloudFile, job: PropagateJob, scene: Scene) -> PropagateSummary:
-    objects = SceneObjects.tell_apart(scene, partial(_parts, cloud, job))
+def _write(path: Path, cloud: CloudFile, job: PropagateJob, objects: SceneObjects | None) -> PropagateSummary:
     taken = {INSTANCE, *(name for name in cloud.names if name.startswith(VOTES))}
     kept = [(name, cloud.dtype[name].str[1:]) for name in cloud.names if name not in taken]
     written = kept + ([(INSTANCE, "u4")] if objects is not None else [])
