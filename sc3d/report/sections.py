@@ -40,6 +40,15 @@ _COLORING_NAMES: dict[Coloring | Literal["mesh"], str] = {
 }
 # file names of `sc3d export --format objects`, and what they hold
 _LAYERS = {"buildings": "buildings", "trees": "trees"}
+_CATALOG = "objects"
+_ROWS = 40  # objects that are listed
+# columns of the list of objects, their names in the file, and formats
+_OBJECT = {
+    "Area, m²": ("area_m2", ",.1f"),
+    "Height, m": ("height_m", ".1f"),
+    "Volume, m³": ("volume_m3", ",.0f"),
+    "Confidence": ("confidence", ".2f"),
+}
 # columns of the table of photos that were held out, their names in the summary of `train`, and formats
 _HELD_OUT = {
     "Photos": ("photos", ".0f"),
@@ -417,7 +426,7 @@ def found_section(data: ReportData) -> str:
     """Area, points and confidence of each class; number and size of the objects, where `export --format
     objects` counted them.
     """
-    return _class_table(data) + _object_table(data)
+    return _class_table(data) + _object_table(data) + _catalog(data)
 
 
 def iou_of(data: ReportData, source: str) -> dict[str, float | None]:
@@ -466,14 +475,7 @@ def _class_table(data: ReportData) -> str:
 def _object_table(data: ReportData) -> str:
     rows = []
     for stem, name in _LAYERS.items():
-        objects = next(
-            (
-                found
-                for file in (f"{stem}.geojson", f"{stem}_local.geojson")
-                if (found := read_features(data.scene.export / file)) is not None
-            ),
-            None,
-        )
+        objects = _features(data, stem)
         if objects is not None:
             area, height = (
                 np.array([number(item.get(key)) or 0.0 for item in objects])
@@ -494,6 +496,29 @@ def _object_table(data: ReportData) -> str:
         return ""
     heads = ["Objects", "Number", "Area, m²", "Median area, m²", "Median height, m", "Highest, m"]
     return "<h3>Counted</h3>" + _table(heads, rows)
+
+
+def _features(data: ReportData, stem: str) -> list[dict] | None:
+    """Properties of the objects of an exported layer; None if there is none."""
+    files = (data.scene.export / f"{stem}{where}.geojson" for where in ("", "_local"))
+    return next((found for file in files if (found := read_features(file)) is not None), None)
+
+
+def _catalog(data: ReportData) -> str:
+    """The objects one by one, the largest first."""
+    objects = _features(data, _CATALOG)
+    if not objects:
+        return ""
+    ordered = sorted(objects, key=lambda item: -(number(item.get("area_m2")) or 0.0))
+    rows = []
+    for item in ordered[:_ROWS]:
+        sizes = [formatted(number(item.get(key)), form) for key, form in _OBJECT.values()]
+        texts = [escape(str(item.get(key, ""))) for key in ("id", "class", "best_photo")]
+        rows.append([texts[0], texts[1], *sizes, texts[2]])
+    note = f"The {_ROWS} largest of {len(objects):,}; all" if len(objects) > _ROWS else "All"
+    text = f'<p class="note">{note} with outlines in <code>export/{_CATALOG}*.geojson</code>.</p>'
+    heads = ["Object", "Class", *_OBJECT, "Best photo"]
+    return "<h3>One by one</h3>" + text + _table(heads, rows)
 
 
 def _table(heads: list[str], rows: list[list[str]]) -> str:
