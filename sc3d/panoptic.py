@@ -15,7 +15,7 @@ MATCH = 0.5  # intersection over union above which two segments match: at most o
 
 @dataclass(frozen=True)
 class Segments:
-    """Class and object of the same N points. label: (N,) uint8 ids; instance: (N,) uint32, 0 = none"""
+    """Class and object of the same N points. label: (N,) uint8 ids; instance: (N,) whole numbers, 0 = none"""
 
     label: np.ndarray
     instance: np.ndarray

@@ -172,7 +172,7 @@ def _write_site(
     cloud.append(
         made.point.positions.numpy() + site.middle + OFFSET,
         **{name: made.point[name].numpy() for name in names},
-        instance=np.where(instance > 0, instance + np.uint32(objects), 0).astype(np.uint32),
+        instance=np.where(instance > 0, instance + objects, 0).astype(np.int32),
     )
     mesh.append(site.world.corners[site.own].astype(np.float64) + site.middle + OFFSET)
 

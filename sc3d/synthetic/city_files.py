@@ -29,7 +29,7 @@ CLOUD = np.dtype(
         ("green", "u1"),
         ("blue", "u1"),
         ("label", "u1"),
-        ("instance", "<u4"),
+        ("instance", "<i4"),
     ]
 )
 VERTEX = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8")])
@@ -55,7 +55,7 @@ class CloudWriter:
         instance: np.ndarray,
     ) -> None:
         """positions: (N, 3) float64; normals: (N, 3) float32; colors: (N, 3) uint8; label: (N, 1) uint8;
-        instance: (N, 1) uint32.
+        instance: (N, 1) int32.
         """
         table = np.empty(len(positions), CLOUD)
         columns = [*positions.T, *normals.T, *colors.T, label.ravel(), instance.ravel()]

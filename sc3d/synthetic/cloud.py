@@ -19,7 +19,7 @@ def truth_cloud(world: World, num_points: int, rng: np.random.Generator) -> o3d.
 
     Of a street also what shows to somebody who walks along it.
     returns: `num_points` points: positions float64 (world, m), normals float32 (outward), colors uint8, label
-        uint8 (`scene.class_table.OTHER` = cars, walls), instance uint32 (`World.instances`)
+        uint8 (`scene.class_table.OTHER` = cars, walls), instance int32 (`World.instances`)
     """
     points, triangles = sample_surface(world, num_points, rng)
     light = world.light(points.astype(np.float32), triangles, np.full(len(points), 0.1, np.float32))

@@ -66,7 +66,7 @@ class World:
         )
 
     def instances(self, triangles: np.ndarray) -> np.ndarray:
-        """(N,) uint32 object that triangles (N,) belong to, of what is counted: buildings, and plants at
+        """(N,) int32 object that triangles (N,) belong to, of what is counted: buildings, and plants at
         least `COUNTED` m tall; else 0.
         """
         objects, heights = self.ints[:, 2], self.corners[:, :, 2]
@@ -74,7 +74,7 @@ class World:
         np.minimum.at(low, objects, heights.min(axis=1))
         np.maximum.at(high, objects, heights.max(axis=1))
         counted = np.isin(self.ints[:, 1], (BUILDING, TREE)) & (high - low >= COUNTED)[objects]
-        return np.where(counted, objects, 0)[triangles].astype(np.uint32)
+        return np.where(counted, objects, 0)[triangles].astype(np.int32)
 
     def truth(self, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         """(N,) uint8 as `labels`, but other objects and sky are told from what lies outside the site, as in

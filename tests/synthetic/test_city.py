@@ -84,7 +84,10 @@ def test_cloud_and_mesh(made):
         "normals": "Float32",
         "colors": "UInt8",
         "label": "UInt8",
+        "instance": "Int32",
     }
+    instance, east = cloud.point["instance"].numpy().ravel(), points[:, 0] > middle[0]
+    assert not set(instance[east & (instance > 0)]) & set(instance[~east & (instance > 0)])  # each its own
     assert mesh.vertex.positions.dtype == o3d.core.float64 and np.array_equal(
         mesh.triangle.indices.numpy().ravel(), np.arange(3 * record["triangles"])
     )

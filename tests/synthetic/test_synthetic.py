@@ -237,6 +237,20 @@ def test_truth_cloud_agrees_with_truth_masks(world, views, photos):
     assert total > 20_000 and right / total > 0.99
 
 
+def test_true_objects_are_buildings_and_what_is_tall(world):
+    cloud = truth_cloud(world, 60_000, np.random.default_rng(0))
+    points, label, instance = (
+        cloud.point[name].numpy().squeeze() for name in ("positions", "label", "instance")
+    )
+    assert instance.dtype == np.int32 and len(set(instance[label == 1])) == len(world.buildings)
+    assert (instance[label == 1] > 0).all() and not instance[np.isin(label, [3, 4, class_table.OTHER])].any()
+    assert 0 < (instance[label == 2] == 0).mean() < 0.5  # bushes and hedges
+    for number in set(instance) - {0}:
+        corners = world.corners[world.ints[:, 2] == number]
+        assert np.ptp(corners[..., 2]) >= 2.0 and len(set(label[instance == number])) == 1
+        assert (points[instance == number] >= corners.min(axis=(0, 1)) - 1e-3).all()
+
+
 def test_truth_cloud_has_only_outer_surfaces(world):
     cloud = truth_cloud(world, 20_000, np.random.default_rng(1))
     points = cloud.point.positions.numpy()

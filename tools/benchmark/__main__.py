@@ -1,4 +1,4 @@
-"""Measurements: `python -m tools.benchmark {speed,surface,tables,fusion-speed,questions,city} --help`."""
+"""Measurements: `python -m tools.benchmark {speed,surface,tables,fusion-speed,questions,few-labels,city} --help`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ RUNS: dict[type, tuple[str, str]] = {
     settings.BenchmarkFusionSpeed: ("fusion_speed", "run_fusion_speed"),
     settings.BenchmarkSurface: ("surface_page", "run_surface"),
     settings.BenchmarkQuestions: ("questions", "run_questions"),
+    settings.BenchmarkFewLabels: ("few_labels", "run_few_labels"),
     settings.SynthesizeCity: ("city", "run_city"),
 }
 

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
+from sc3d.errors import InputError
 from sc3d.settings.common import DepthMode
 from sc3d.settings.synthesize import SynthesizeCity as SynthesizeCity
 
@@ -123,11 +124,35 @@ class BenchmarkQuestions:
     """JSON file for the figures; a Markdown table is written beside it."""
 
 
+@dataclass(frozen=True)
+class BenchmarkFewLabels:
+    """Measure what a few photos labelled by hand are worth (their truth masks are the only masks), on other photos,
+    beside the given masks of all photos; of scenes with sparse/0, cloud.ply, mesh.ply and truth masks.
+    """
+
+    scenes: Annotated[Positional[tuple[Path, ...]], arg(help="Scene folders.")]
+    truth: Path | None = None
+    """Folder of truth masks; SCENE/truth otherwise."""
+    labelled: int = 3
+    """Photos that are labelled, spread evenly over those with truth."""
+    judged: int = 7
+    """Other photos that are judged."""
+    folds: int = 1
+    """Times that this is done, with other photos to judge each time; pixels are counted together."""
+    output: Path | None = None
+    """JSON file for the figures; a Markdown table is written beside it."""
+
+    def __post_init__(self) -> None:
+        if min(self.labelled, self.judged, self.folds) < 1:
+            raise InputError("labelled, judged and folds must be at least 1")
+
+
 Benchmark = (
     Annotated[BenchmarkSpeed, subcommand("speed")]
     | Annotated[BenchmarkTables, subcommand("tables")]
     | Annotated[BenchmarkFusionSpeed, subcommand("fusion-speed")]
     | Annotated[BenchmarkSurface, subcommand("surface")]
     | Annotated[BenchmarkQuestions, subcommand("questions")]
+    | Annotated[BenchmarkFewLabels, subcommand("few-labels")]
     | Annotated[SynthesizeCity, subcommand("city")]
 )
