@@ -415,7 +415,8 @@ def judge(
         per_photo[view.name] = found
         reliabilities.append(pixels.reliability(labels.label, labels.confidence, table.num_ids))
         with_other.append(pixels.reliability(labels.label, labels.confidence, table.num_ids, other=True))
-    sources = SOURCES if mask_files else [key for key in SOURCES if key != "masks"]
+    masked = any("masks" in photo for photo in per_photo.values())
+    sources = SOURCES if masked else [key for key in SOURCES if key != "masks"]
     parts = {key: [photo[key] for photo in per_photo.values() if key in photo] for key in sources}
     totals = {key: total(found, table.num_ids).summary(table) for key, found in parts.items()}
     overall = [Reliability.merge(found) for found in (reliabilities, with_other) if found]

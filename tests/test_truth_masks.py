@@ -125,6 +125,17 @@ def test_evaluate_tells_of_other(scene):
     assert metrics["reliability_with_other"]["ece"] != metrics["reliability"]["ece"]
 
 
+def test_masks_of_other_photos_than_the_judged_ones_are_not_judged(scene):
+    for photo in ("photo_0", "photo_1"):
+        (scene.truth / f"{photo}.png").rename(scene.path / f"{photo}.png")
+    for file in scene.masks.iterdir():
+        if (scene.truth / file.name).exists():
+            file.unlink()
+    summary = execute("evaluate", scene, Evaluate())
+    assert "masks" not in json.loads(scene.metrics.read_text()) and "masks" not in summary
+    assert "labels_with_other" in summary
+
+
 def test_tiles_find_the_same(scene, tmp_path):
     whole, tiles = (
         Evaluate(truth_zero="other", margin=3, output=tmp_path / f"{name}.json")
