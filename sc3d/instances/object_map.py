@@ -31,7 +31,7 @@ BLOCKS, CELL, MIN_CELL = (
     1.5,
     0.05,
 )  # blocks along the extent, for the spacing; side of a cell in spacings, and m
-MAX_CELLS = 1 << 24  # larger sites get larger cells
+MAX_CELLS = 1 << 22  # larger sites get larger cells, so that all arrays stay below a gigabyte
 
 logger = logging.getLogger(__name__)
 

@@ -36,6 +36,7 @@ from sc3d.runner import execute
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Report
+from tests.builders import labelled_scene
 
 UTM = np.array([500_000.0, 4_500_000.0, 100.0])
 GRASS, BUILDING = 1, 2
@@ -499,3 +500,19 @@ def test_counted_objects_are_in_the_report(tmp_path):
     assert "buildings" not in table and all(
         f"<td>{value}</td>" in table for value in ("3", "180", "60", "6.0", "9.0")
     )
+
+
+def test_objects_are_listed_one_by_one_the_largest_first(tmp_path):
+    scene = labelled_scene(tmp_path / "scene")
+    scene.export.mkdir()
+    rows = [
+        {"id": number, "class": "a < b", "area_m2": float(number), "height_m": 4.25, "volume_m3": 1234.5}
+        for number in range(1, 46)
+    ]
+    features = [{"properties": row | {"confidence": 0.5, "best_photo": "photo_0.jpg"}} for row in rows]
+    (scene.export / "objects_local.geojson").write_text(json.dumps({"features": features}))
+    page = found_section(load_report_data(scene))
+    assert "The 40 largest of 45" in page and "a &lt; b" in page and "1,234" in page
+    assert page.index(">45.0<") < page.index(">44.0<") < page.index(">6.0<") and ">5.0<" not in page
+    (scene.export / "objects_local.geojson").write_text(json.dumps({"features": []}))
+    assert "One by one" not in found_section(load_report_data(scene))
