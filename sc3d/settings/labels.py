@@ -178,7 +178,7 @@ class Label(Resources):
 
 @dataclass(frozen=True)
 class Propagate(Resources):
-    """Complete the labels along the geometry."""
+    """Complete the labels along the geometry, and tell buildings, trees and other countable objects apart."""
 
     method: Literal["knn", "geometry", "map"] = "map"
     """knn: nearest labelled points vote; geometry: front along similar normals and curvature (the paper's);
@@ -222,7 +222,9 @@ class Propagate(Resources):
 
 @dataclass(frozen=True)
 class Evaluate(Resources):
-    """OA, mIoU, IoU, precision and recall per class against truth masks, through the first surface."""
+    """OA, mIoU, IoU, precision and recall per class against truth masks, through the first surface; panoptic
+    quality where truth.ply tells objects apart.
+    """
 
     truth: Path | None = None
     """Folder of truth masks; SCENE/truth otherwise. Their values are ids of classes, 254 = other: looked at,
