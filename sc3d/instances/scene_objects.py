@@ -79,6 +79,7 @@ class SceneObjects:
         ]
         if left:
             logger.info(
-                "points of no object, as what they are of is too low or too small: %s", ", ".join(left)
+                "points of no object, as it is too low or too small, or no second photo confirms it: %s",
+                ", ".join(left),
             )
         return self.map.counts(self.table)

@@ -143,8 +143,12 @@ class PropagateSummary:
             "propagated": f"{self.propagated / self.num_points:.1%}",
             "mean_confidence": round(self.confidence / max(self.labelled, 1), 3),
             **({"corrected": self.corrected} if self.corrected else {}),
-            **({"objects": self.objects} if self.objects else {}),
+            **({"objects": _listed(self.objects)} if self.objects else {}),
         }
+
+
+def _listed(objects: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count:,}" for name, count in objects.items())
 
 
 def propagate_scene(
