@@ -22,16 +22,18 @@ from sc3d.geometry.graph import Graph
 from sc3d.propagation.labelled_points import MIN_EXAMPLES, LabelledPoints
 from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.terrain import relief_features
+from sc3d.propagation.trust import BINS, Trust, bins_of, measure_trust
+from sc3d.propagation.vote_evidence import count_disagreement, evidence_of, softmax
 from sc3d.settings.labels import Propagate
 
 COLOR_BINS, RELIEF_BINS = 24, 12  # per feature; 24^3 and 12^4 cells
 COLOR_BLUR, RELIEF_BLUR = 1.0, 0.7  # standard deviation, bins
 PRIOR_WEIGHT = 2.0  # points of the overall mixture added to each cell
 UNKNOWN = np.log(0.05)  # their probability of a class they do not know
-MIN_SKILL = 0.5  # share of the errors of "always the commonest class" that they must avoid on points held out
+MIN_HALF = 100  # examples of a class in each half of space, so that they can be judged by one another
 FOLD_BLOCKS = 8  # blocks along the longest side of the cloud; every other one is held out, as on a chessboard
-
-IMPLAUSIBLE = np.log(0.5)  # a seed whose class the model gives less is a conflict
+IMPLAUSIBLE = 0.5  # a seed whose class is less likely is a conflict
+MAX_OVERRULED = 0.5  # share of a class's seeds without a vote against them that looks may overrule
 
 logger = logging.getLogger(__name__)
 
@@ -115,37 +117,77 @@ class AppearanceModel:
         """What the examples (N,) bool of label (N,) uint8 teach."""
         return tuple(group.count(label, examples, num_classes) for group in self.groups)
 
-    def log_likelihood(self, statistics: AppearanceStatistics, label: np.ndarray) -> np.ndarray | None:
-        """(N, C) float32 log-probability of the classes as color and relief see them; None where there is
-        too little to learn from.
-
-        label: (N,) uint8. Points of a class without enough examples get zeros: the model does not contradict
-            what it does not know.
+    def tables(self, statistics: AppearanceStatistics, known: np.ndarray) -> list[np.ndarray]:
+        """Per group, (cells, C) float32 log-likelihood of each class, up to a number per cell; known: (C,)
+        bool classes to look at.
         """
-        counts = statistics[0].sum(axis=0)
-        known = counts >= MIN_EXAMPLES
-        if known.sum() < 2:
+        counts = np.where(known, statistics[0].sum(axis=0), 0)
+        shares = np.log(np.maximum(counts, 1) / max(counts.sum(), 1))
+        return [
+            (group.table(examples * known) - shares).astype(np.float32)
+            for group, examples in zip(self.groups, statistics, strict=True)
+        ]
+
+    def contrasts(self, statistics: AppearanceStatistics, label: np.ndarray, asked: np.ndarray) -> np.ndarray:
+        """(C, C, BINS per group) int64 points asked (N,) bool of each class (first axis), by how much more
+        they look like another (second axis) than like their own, as the statistics of other points tell.
+        """
+        known = statistics[0].sum(axis=0) >= MIN_HALF
+        size, shape = len(known), (BINS,) * len(self.groups)
+        rows = np.flatnonzero(asked & np.append(False, known)[label])
+        own, tables = label[rows].astype(np.int64) - 1, self.tables(statistics, known)
+        result = np.zeros((size, size, *shape), np.int64)
+        for other in np.flatnonzero(known):
+            place = own
+            for group, table in zip(self.groups, tables, strict=True):
+                cells = group.cell[rows]
+                place = place * BINS + bins_of(table[cells, other] - table[cells, own])
+            counts = np.bincount(place, minlength=size * int(np.prod(shape)))
+            result[:, other] = counts.reshape(size, *shape)
+        return result
+
+    def log_likelihood(
+        self, statistics: AppearanceStatistics, trust: Trust, label: np.ndarray
+    ) -> np.ndarray | None:
+        """(N, C) float32 log-probability of the classes as color and relief see them; None where no two
+        looks are known.
+
+        label: (N,) uint8. Points of a class whose look is not known get zeros: the model does not
+            contradict what it does not know.
+        """
+        if not tells_apart(statistics, trust):
             return None
-        shares = np.log(np.maximum(counts, 1) / counts[known].sum())
+        counts, known = statistics[0].sum(axis=0), known_looks(statistics, trust)
         result = np.zeros((len(label), len(counts)), np.float32)
-        for group, examples in zip(self.groups, statistics, strict=True):
-            table = group.table(examples * known)
-            # one by one: as a whole it would be copied, with millions of points
-            for column in range(len(counts)):
-                result[:, column] += table[:, column].astype(np.float32)[group.cell]
-        result -= ((len(self.groups) - 1) * shares).astype(np.float32)
+        for look in np.unique(trust.look[known]):
+            members = np.flatnonzero(known & (trust.look == look))
+            number = counts[members].sum()
+            # of classes that look alike none is likelier beforehand
+            rating = np.full(len(label), np.log(number / len(members) / counts[known].sum()), np.float32)
+            for group, table, weight in zip(
+                self.groups, self.tables(statistics, known), trust.weights, strict=True
+            ):
+                mixed = np.logaddexp.reduce(table[:, members] + np.log(counts[members] / number), axis=1)
+                rating += np.float32(weight) * mixed.astype(np.float32)[group.cell]
+            result[:, members] = rating[:, None]
         result[:, ~known] = -np.inf
-        result -= np.logaddexp.reduce(result, axis=1, keepdims=True)
+        result = softmax(result)
+        result *= 1 - np.float32(trust.failures)
+        result += np.float32(trust.failures / known.sum())
+        np.log(result, out=result)
         result[:, ~known] = UNKNOWN
         result[np.append(False, ~known)[label]] = 0
-        return np.maximum(result, np.float32(np.log(1e-4)), out=result)
+        return result
 
-    def errors(self, statistics: AppearanceStatistics, label: np.ndarray, asked: np.ndarray) -> int | None:
-        """How many of the points asked (N,) bool, whose label is taken for true, the statistics get wrong; None
-        if it is too short.
-        """
-        rating = self.log_likelihood(statistics, label)
-        return None if rating is None else int((rating[asked].argmax(axis=1) + 1 != label[asked]).sum())
+
+def known_looks(statistics: AppearanceStatistics, trust: Trust) -> np.ndarray:
+    """(C,) bool classes whose look can be judged and of which there are enough examples."""
+    return trust.known & (statistics[0].sum(axis=0) >= MIN_EXAMPLES)
+
+
+def tells_apart(statistics: AppearanceStatistics, trust: Trust) -> bool:
+    """Whether there are examples of two looks."""
+    return len(np.unique(trust.look[known_looks(statistics, trust)])) >= 2
 
 
 def feature_counts(relief: np.ndarray, colors: np.ndarray | None) -> list[QuantileSketch]:
@@ -164,43 +206,88 @@ def folds_of(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarra
     return cells.sum(axis=1) % 2
 
 
-def skill_score(wrong: list[int | None], counts: np.ndarray) -> float:
-    """Share of the errors of the best constant answer that the model avoids on blocks held out; 0 where it
-    cannot learn.
-
-    wrong: errors of each fold, asked about points that it has not seen; counts: (C,) examples of each class
-    """
-    errors = [number for number in wrong if number is not None]
-    if len(errors) < len(wrong):
-        return 0.0
-    return 1 - sum(errors) / max(int(counts.sum() - counts.max()), 1)
-
-
 def sum_statistics(parts: list[AppearanceStatistics]) -> AppearanceStatistics:
     """The statistics of all parts."""
     return tuple(np.sum(group, axis=0) for group in zip(*parts, strict=True))
 
 
-def is_skillful(wrong: list[int | None], statistics: AppearanceStatistics) -> bool:
-    """Whether the model does well enough; wrong: its errors on each fold held out."""
-    skill = skill_score(wrong, statistics[0].sum(axis=0))
-    logger.info(
-        "color and relief avoid %.0f%% of errors on held-out agreed points%s",
-        100 * skill,
-        "" if skill >= MIN_SKILL else ": not used",
-    )
-    return skill >= MIN_SKILL
-
-
-def plausible(start: np.ndarray, rating: np.ndarray | None) -> np.ndarray:
-    """The seeds (N,) without those that look like another class: conflicts that all views share.
-
-    rating: (N, C) log-likelihood of the classes; None = nothing is known
+def held_out(
+    model: AppearanceModel,
+    halves: list[AppearanceStatistics],
+    known: LabelledPoints,
+    folds: np.ndarray,
+    core: np.ndarray | bool = True,
+) -> np.ndarray:
+    """`AppearanceModel.contrasts` of the seeds, each looked at by what the other fold (N,) teaches; core: (N,) bool
+    points to count
     """
+    first, second = (
+        model.contrasts(halves[1 - fold], known.seed_labels, core & (folds == fold)) for fold in (0, 1)
+    )
+    return first + second
+
+
+def trust_of(
+    halves: list[AppearanceStatistics], contrasts: np.ndarray, disagreement: np.ndarray
+) -> Trust | None:
+    """What was measured (see `measure_trust`); halves: statistics of the folds."""
+    counts = np.stack([half[0].sum(axis=0) for half in halves])
+    known = (counts.sum(axis=0) >= MIN_EXAMPLES) & (counts >= MIN_HALF).all(axis=0)
+    trust = measure_trust(contrasts, known, disagreement) if known.sum() >= 2 else None
+    if trust is None:
+        logger.info("color and relief tell no two classes apart on seeds held out: not used")
+    else:
+        logger.info(
+            "color and relief tell apart %d looks of %d classes on seeds held out; their weights %s, failures %.4f, of the votes %.2f",
+            len(np.unique(trust.look[trust.known])),
+            trust.known.sum(),
+            ", ".join(f"{weight:.1f}" for weight in trust.weights),
+            trust.failures,
+            trust.votes,
+        )
+    return trust
+
+
+def count_overruled(known: LabelledPoints, label: np.ndarray, core: np.ndarray | None = None) -> np.ndarray:
+    """(2, C) int64 seeds of each class without a vote against them that nobody has corrected: all, and those
+    that are not of that class by label (N,). core: (N,) bool points to count, None = all.
+    """
+    asked = known.sure & ~known.corrected & (True if core is None else core)
+    seeds, size = known.seed_labels, known.num_classes + 1
+    return np.stack(
+        [np.bincount(seeds[rows], minlength=size)[1:] for rows in (asked, asked & (label != seeds))]
+    )
+
+
+def overruled(counts: np.ndarray, trust: Trust) -> np.ndarray:
+    """(C,) bool classes that must be left to the votes, and are not yet, by `count_overruled`; said in a line."""
+    too_many = trust.known & (counts[1] > MAX_OVERRULED * counts[0])
+    if too_many.any():
+        logger.info(
+            "color and relief contradict most of the seeds of %d classes that no view contradicts: left to the votes",
+            too_many.sum(),
+        )
+    return too_many
+
+
+def plausible_seeds(known: LabelledPoints, rating: np.ndarray | None, trust: Trust) -> np.ndarray:
+    """(N,) uint8 seeds without those likelier of another class: conflicts that all views share. What people
+    have corrected stays.
+
+    rating: (N, C) log-likelihood of the classes by their looks; None = nothing is known
+    """
+    seeds = known.seed_labels
     if rating is None:
-        return start
-    given = rating[np.arange(len(start)), np.maximum(start, 1).astype(np.int64) - 1]
-    return np.where((start > 0) & (given < IMPLAUSIBLE), 0, start).astype(np.uint8)
+        return seeds
+    posterior = softmax(rating + np.float32(trust.votes) * evidence_of(known))
+    own = posterior[np.arange(len(seeds)), np.maximum(seeds, 1).astype(np.int64) - 1]
+    return np.where(known.corrected | (own >= IMPLAUSIBLE), seeds, 0).astype(np.uint8)
+
+
+def limited(known: LabelledPoints, kept: np.ndarray, too_many: np.ndarray) -> np.ndarray:
+    """The seeds kept (N,), and those without a vote against them of classes (C,) bool of which too many would go."""
+    back = known.sure & np.append(False, too_many)[known.seed_labels]
+    return np.where(back, known.seed_labels, kept)
 
 
 def uses_appearance(settings: Propagate) -> bool:
@@ -209,18 +296,20 @@ def uses_appearance(settings: Propagate) -> bool:
 
 @dataclass(frozen=True)
 class LearnedAppearance:
-    """A model of a cloud, and what its examples teach."""
+    """A model of a cloud, what its examples teach, and how far that is believed."""
 
     model: AppearanceModel
     statistics: AppearanceStatistics
+    trust: Trust
 
     def log_likelihood(self, label: np.ndarray) -> np.ndarray | None:
         """As `AppearanceModel.log_likelihood`."""
-        return self.model.log_likelihood(self.statistics, label)
+        return self.model.log_likelihood(self.statistics, self.trust, label)
 
 
 def learn_appearance(graph: Graph, known: LabelledPoints) -> LearnedAppearance | None:
-    """Color and relief of the classes from the agreed points, if that does well on agreed points that it has not seen.
+    """Color and relief of the classes from the agreed points, if that tells classes apart on seeds that it
+    has not seen.
 
     known: in the order of the graph
     """
@@ -228,6 +317,11 @@ def learn_appearance(graph: Graph, known: LabelledPoints) -> LearnedAppearance |
     start, examples = known.seed_labels, known.agreed
     folds = folds_of(known.points, known.points.min(axis=0), known.points.max(axis=0))
     halves = [model.statistics(start, examples & (folds == fold), known.num_classes) for fold in (0, 1)]
-    wrong = [model.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1)]
-    statistics = sum_statistics(halves)
-    return LearnedAppearance(model, statistics) if is_skillful(wrong, statistics) else None
+    trust = trust_of(halves, held_out(model, halves, known, folds), count_disagreement(known))
+    return None if trust is None else LearnedAppearance(model, sum_statistics(halves), trust)
+
+
+def plausible(known: LabelledPoints, appearance: LearnedAppearance) -> np.ndarray:
+    """(N,) uint8 seeds that look like their class, or of which too many would go."""
+    kept = plausible_seeds(known, appearance.log_likelihood(known.seed_labels), appearance.trust)
+    return limited(known, kept, overruled(count_overruled(known, kept), appearance.trust))

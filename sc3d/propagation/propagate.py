@@ -47,8 +47,7 @@ def propagate(
         label = np.where(reachable(graph, seeds), label, 0).astype(np.uint8)
     else:
         if appearance is not None:
-            kept = plausible(seeds, appearance.log_likelihood(seeds))
-            seeds = np.where(known.corrected, seeds, kept)
+            seeds = plausible(known, appearance)
         label, confidence = spread(graph, known.points, seeds, settings)  # eq. 9
     if settings.fill:
         label, confidence = fill_from_nearest(known.points, label, confidence)
