@@ -23,7 +23,7 @@ from sc3d.propagation.labelled_points import MIN_EXAMPLES, LabelledPoints
 from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.terrain import relief_features
 from sc3d.propagation.trust import BINS, Trust, bins_of, measure_trust
-from sc3d.propagation.vote_evidence import count_disagreement, evidence_of, softmax
+from sc3d.propagation.vote_evidence import count_disagreement, one_view_evidence, softmax
 from sc3d.settings.labels import Propagate
 
 COLOR_BINS, RELIEF_BINS = 24, 12  # per feature; 24^3 and 12^4 cells
@@ -238,12 +238,12 @@ def trust_of(
         logger.info("color and relief tell no two classes apart on seeds held out: not used")
     else:
         logger.info(
-            "color and relief tell apart %d looks of %d classes on seeds held out; their weights %s, failures %.4f, of the votes %.2f",
+            "color and relief tell apart %d looks of %d classes on seeds held out; their weights %s, failures %.4f; one view's votes of full, half, and an eighth of the weight are worth %.1f, %.1f and %.1f nats",
             len(np.unique(trust.look[trust.known])),
             trust.known.sum(),
             ", ".join(f"{weight:.1f}" for weight in trust.weights),
             trust.failures,
-            trust.votes,
+            *trust.worth[[0, 2, 6]],
         )
     return trust
 
@@ -279,7 +279,7 @@ def plausible_seeds(known: LabelledPoints, rating: np.ndarray | None, trust: Tru
     seeds = known.seed_labels
     if rating is None:
         return seeds
-    posterior = softmax(rating + np.float32(trust.votes) * evidence_of(known))
+    posterior = softmax(rating + one_view_evidence(known, trust.worth))
     own = posterior[np.arange(len(seeds)), np.maximum(seeds, 1).astype(np.int64) - 1]
     return np.where(known.corrected | (own >= IMPLAUSIBLE), seeds, 0).astype(np.uint8)
 

@@ -12,7 +12,7 @@ from sc3d.propagation.appearance import LearnedAppearance, count_overruled, over
 from sc3d.propagation.labelled_points import LabelledPoints
 from sc3d.propagation.region_growing import grow_regions
 from sc3d.propagation.trust import Trust
-from sc3d.propagation.vote_evidence import evidence_of, softmax
+from sc3d.propagation.vote_evidence import evidence_of, one_view_evidence, softmax
 from sc3d.settings.labels import Propagate
 
 SURE = 0.95  # later rounds learn from points of this probability
@@ -90,7 +90,7 @@ def appearance_marginals(
     settings: Propagate,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same from votes and appearance; rating: (N, C) of the appearance, overwritten."""
-    rating += np.float32(trust.votes) * evidence_of(known)
+    rating += one_view_evidence(known, trust.worth)
     rating[:, ~offered] = -np.inf
     hold_corrected(rating, known)
     start = softmax(rating)  # afresh: sure marginals would not move

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sc3d.propagation.vote_evidence import error_of, weight_of
+from sc3d.propagation.vote_evidence import error_of, worth_of
 
 # of the log-ratio of two classes' densities, per group of features; beyond: the last bin
 BINS, REACH = 17, 6.0
@@ -24,12 +24,12 @@ FAILURES = np.geomspace(1e-4, 0.64, 13)  # tried shares of points whose looks sa
 class Trust:
     """What was measured, of C classes.
 
-    votes: weight of the votes' evidence; weights: (G,) of the groups of features, 1 = as if their
+    worth: of a view, as `vote_evidence.worth_of`; weights: (G,) of the groups of features, 1 = as if their
         log-likelihoods were right; failures: share of the points whose looks say nothing; look: (C,) int, the same for classes that are not told apart, -1 = left
         to the votes
     """
 
-    votes: float
+    worth: np.ndarray
     weights: np.ndarray
     failures: float
     look: np.ndarray
@@ -70,7 +70,7 @@ def measure_trust(contrasts: np.ndarray, known: np.ndarray, disagreement: np.nda
         look[look == look[first]] = look[second]
     if len(np.unique(look[known])) < 2:
         return None
-    return Trust(weight_of(error), *_fit(contrasts, apart, error), look)
+    return Trust(worth_of(disagreement), *_fit(contrasts, apart, error), look)
 
 
 def _shares(contrasts: np.ndarray, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
