@@ -8,6 +8,7 @@ are (`one_view_evidence`).
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
 from sc3d.propagation.labelled_points import LabelledPoints
 
@@ -119,11 +120,11 @@ def worth_of(disagreement: np.ndarray) -> np.ndarray:
     surer.
     """
     points, differing = disagreement
-    error = error_of(disagreement)
-    prior = 2 * error * (1 - error)
-    error = _wrong((differing / FIXED + PRIOR_POINTS * prior) / (points + PRIOR_POINTS))
-    worth = np.log((1 - error) / error)
-    return np.maximum.accumulate(np.maximum(worth, 0)[::-1])[::-1]
+    overall = error_of(disagreement)
+    prior = PRIOR_POINTS * 2 * overall * (1 - overall)
+    rates = (differing / FIXED + prior) / (points + PRIOR_POINTS)
+    error = _wrong(isotonic_regression(rates, weights=points + 1).x)
+    return np.log((1 - error) / error)
 
 
 def softmax(values: np.ndarray) -> np.ndarray:
