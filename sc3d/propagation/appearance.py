@@ -171,13 +171,10 @@ class AppearanceModel:
                 rating += np.float32(weight) * mixed.astype(np.float32)[group.cell]
             result[:, members] = rating[:, None]
         result[:, ~known] = -np.inf
-        result = softmax(result)
-        result *= 1 - np.float32(trust.failures)
-        result += np.float32(trust.failures / known.sum())
-        np.log(result, out=result)
+        result -= np.logaddexp.reduce(result, axis=1, keepdims=True)
         result[:, ~known] = UNKNOWN
         result[np.append(False, ~known)[label]] = 0
-        return result
+        return np.maximum(result, np.float32(np.log(1e-4)), out=result)
 
 
 def known_looks(statistics: AppearanceStatistics, trust: Trust) -> np.ndarray:
@@ -237,14 +234,7 @@ def trust_of(
     if trust is None:
         logger.info("color and relief tell no two classes apart on seeds held out: not used")
     else:
-        logger.info(
-            "color and relief tell apart %d looks of %d classes on seeds held out; their weights %s, failures %.4f; one view's votes of full, half, and an eighth of the weight are worth %.1f, %.1f and %.1f nats",
-            len(np.unique(trust.look[trust.known])),
-            trust.known.sum(),
-            ", ".join(f"{weight:.1f}" for weight in trust.weights),
-            trust.failures,
-            *trust.worth[[0, 2, 6]],
-        )
+        logger.info("color and relief on seeds held out: %s", trust.describe())
     return trust
 
 
@@ -279,7 +269,7 @@ def plausible_seeds(known: LabelledPoints, rating: np.ndarray | None, trust: Tru
     seeds = known.seed_labels
     if rating is None:
         return seeds
-    posterior = softmax(rating + one_view_evidence(known, trust.worth))
+    posterior = softmax(rating + one_view_evidence(known, trust.error))
     own = posterior[np.arange(len(seeds)), np.maximum(seeds, 1).astype(np.int64) - 1]
     return np.where(known.corrected | (own >= IMPLAUSIBLE), seeds, 0).astype(np.uint8)
 

@@ -55,9 +55,9 @@ class NoneRates:
         0 without votes.
         """
         total = votes[:, 1:].sum(axis=1)
-        return np.minimum(total, np.float32(MAX_EVIDENCE)) * self.log_odds_of_share(votes)
+        return np.minimum(total, np.float32(MAX_EVIDENCE)) * self.log_odds_of_one(votes)
 
-    def log_odds_of_share(self, votes: np.ndarray) -> np.ndarray:
+    def log_odds_of_one(self, votes: np.ndarray) -> np.ndarray:
         """The same of a single vote, divided among the classes and none as the votes are; 0 without votes."""
         share = none_share(votes)
         missed, silent = self.missed[best_class(votes)], self.silent

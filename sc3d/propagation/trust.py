@@ -11,27 +11,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sc3d.propagation.vote_evidence import error_of, worth_of
+from sc3d.propagation.vote_evidence import error_of
 
 # of the log-ratio of two classes' densities, per group of features; beyond: the last bin
 BINS, REACH = 17, 6.0
 MIN_SKILL = 0.5  # share of the errors of guessing that looks must avoid on points held out, of two classes alike in number
 WEIGHTS = np.linspace(0.0, 1.0, 11)  # tried for each group of features
-FAILURES = np.geomspace(1e-4, 0.64, 13)  # tried shares of points whose looks say nothing
 
 
 @dataclass(frozen=True)
 class Trust:
     """What was measured, of C classes.
 
-    worth: of a view, as `vote_evidence.worth_of`; weights: (G,) of the groups of features, 1 = as if their
-        log-likelihoods were right; failures: share of the points whose looks say nothing; look: (C,) int, the same for classes that are not told apart, -1 = left
+    error: share of the views that are wrong; weights: (G,) of the groups of features, 1 = as if their
+        log-likelihoods were right; look: (C,) int, the same for classes that are not told apart, -1 = left
         to the votes
     """
 
-    worth: np.ndarray
+    error: float
     weights: np.ndarray
-    failures: float
     look: np.ndarray
 
     @property
@@ -43,6 +41,14 @@ class Trust:
     def shared(self) -> np.ndarray:
         """(C,) bool classes that look like another."""
         return self.known & ((self.look[:, None] == self.look).sum(axis=1) > 1)
+
+    def describe(self) -> str:
+        """In one line."""
+        weights, looks = (
+            ", ".join(f"{weight:.1f}" for weight in self.weights),
+            len(np.unique(self.look[self.known])),
+        )
+        return f"{looks} looks of {self.known.sum()} classes told apart, weights {weights}; views are wrong in {100 * self.error:.1f} %"
 
     def without(self, classes: np.ndarray) -> Trust:
         """classes: (C,) bool, to be left to the votes."""
@@ -62,15 +68,15 @@ def measure_trust(contrasts: np.ndarray, known: np.ndarray, disagreement: np.nda
     """
     error, ids = error_of(disagreement), np.flatnonzero(known).tolist()
     pairs = [(first, second) for first in ids for second in ids if second < first]
-    weights, _ = _fit(contrasts, pairs, error)
+    weights = _fit_weights(contrasts, pairs, error)
     alike = [pair for pair in pairs if _skill(contrasts, pair, weights) < MIN_SKILL]
-    apart = [pair for pair in pairs if pair not in alike]
     look = np.where(known, np.arange(len(known)), -1)
     for first, second in alike:
         look[look == look[first]] = look[second]
     if len(np.unique(look[known])) < 2:
         return None
-    return Trust(worth_of(disagreement), *_fit(contrasts, apart, error), look)
+    apart = [pair for pair in pairs if pair not in alike]
+    return Trust(error, _fit_weights(contrasts, apart, error), look)
 
 
 def _shares(contrasts: np.ndarray, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -91,21 +97,17 @@ def _skill(contrasts: np.ndarray, pair: tuple[int, int], weights: np.ndarray) ->
     return float(((other - own) * np.sign(np.round(_scores(weights), 9))).sum() / 2)
 
 
-def _fit(contrasts: np.ndarray, pairs: list[tuple[int, int]], error: float) -> tuple[np.ndarray, float]:
-    """Weights of the groups and share of failures under which the held-out points of all pairs are
-    likeliest, if the share `error` of the points has the label of the other class.
+def _fit_weights(contrasts: np.ndarray, pairs: list[tuple[int, int]], error: float) -> np.ndarray:
+    """Weights of the groups under which the held-out points of all pairs are likeliest, if the share `error` of
+    them has the label of the other class.
     """
     groups = contrasts.ndim - 2
     options = np.stack(np.meshgrid(*[WEIGHTS] * groups, indexing="ij"), axis=-1).reshape(-1, groups)
-    failures = FAILURES.reshape(-1, *[1] * groups)
-    losses = np.zeros((len(options), len(FAILURES)))
-    for number, option in enumerate(options):
-        score = _scores(option)
+    losses = np.zeros(len(options))
+    for number, score in enumerate(map(_scores, options)):
         for first, second in (order for pair in pairs for order in (pair, pair[::-1])):
             counts = contrasts[first, second]
             odds = np.log((contrasts[second, first].sum() + 1) / (counts.sum() + 1))
-            right = failures / 2 + (1 - failures) / (1 + np.exp(score + odds))
-            loss = -counts * np.log(error + (1 - 2 * error) * right)
-            losses[number] += loss.reshape(len(FAILURES), -1).sum(axis=1)
-    best, share = np.unravel_index(np.argmin(losses), losses.shape)
-    return options[best], float(FAILURES[share])
+            right = 1 / (1 + np.exp(score + odds))
+            losses[number] -= (counts * np.log(error + (1 - 2 * error) * right)).sum()
+    return options[int(np.argmin(losses))]

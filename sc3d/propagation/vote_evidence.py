@@ -8,13 +8,11 @@ are (`one_view_evidence`).
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import isotonic_regression
 
 from sc3d.propagation.labelled_points import LabelledPoints
 
 MAX_EVIDENCE = 5.0  # a point's votes count as at most this many
 SMOOTHING = 0.25  # added to the votes of each class
-LEVELS = 13  # of a view's weight: 1 and more, then half an octave less each
 FIXED = 4096  # shares are summed in these parts, so that no order matters
 PRIOR_POINTS, PRIOR_ERROR = 100.0, 0.15  # what is believed of views that no other view checks
 
@@ -43,88 +41,45 @@ def vote_likelihood(votes: np.ndarray) -> np.ndarray:
     return result.astype(np.float32, copy=False)
 
 
-def one_view_evidence(known: LabelledPoints, worth: np.ndarray) -> np.ndarray:
-    """(N, C) float32, as `evidence_of`, of one view that is as sure as the mean of the point's views and says what
-    they say on average. worth: of `worth_of`
+def one_view_evidence(known: LabelledPoints, error: float) -> np.ndarray:
+    """(N, C) float32, as `evidence_of`, of one view that says what the views of the point say on average, and is
+    wrong in this share of the points. Without votes a seed has one view.
     """
-    votes = votes_or_seeds(known)
+    votes = known.votes
+    if votes is None:
+        votes = np.eye(known.num_classes + 1, dtype=np.float32)[known.seed_labels]
     classes = votes[:, 1 : -1 if known.none else None]
-    total = classes.sum(axis=1, keepdims=True)
-    nats = np.interp(_levels(*class_views(known)), np.arange(LEVELS), worth).astype(np.float32)
-    result = nats[:, None] * classes / np.maximum(total, np.float32(1e-9))
+    worth = np.float32(np.log((1 - error) / error))
+    result = worth * classes / np.maximum(classes.sum(axis=1, keepdims=True), np.float32(1e-9))
     result -= result.max(axis=1, keepdims=True)
-    if not known.none:
+    if known.rates is None:
         return result
-    none = (
-        known.rates.log_odds_of_share(votes) if known.rates is not None else np.zeros(len(votes), np.float32)
-    )
-    return np.concatenate([result, none[:, None]], axis=1)
-
-
-def votes_or_seeds(known: LabelledPoints) -> np.ndarray:
-    """(N, C + 1) float32 votes; without, each seed has one, of its confidence."""
-    if known.votes is not None:
-        return known.votes
-    seeds = known.seed_labels
-    own = np.eye(known.num_classes + 1, dtype=np.float32)[seeds]
-    return own * (known.seeds.confidence * (seeds > 0))[:, None]
-
-
-def class_views(known: LabelledPoints) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) float64 weight of the votes for classes, and how many views gave them."""
-    votes = votes_or_seeds(known)[:, 1:]
-    every = votes.sum(axis=1, dtype=np.float64)
-    total = every - votes[:, -1] if known.none else every
-    return total, known.seeds.num_views * total / np.maximum(every, 1e-9)
-
-
-def _levels(total: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """(N,) float64 level of the mean weight of a view."""
-    weight = total / np.maximum(views, 1)
-    return np.clip(-2 * np.log2(np.maximum(weight, 1e-9)), 0, LEVELS - 1)
+    return np.concatenate([result, known.rates.log_odds_of_one(votes)[:, None]], axis=1)
 
 
 def count_disagreement(known: LabelledPoints, core: np.ndarray | None = None) -> np.ndarray:
-    """(2, LEVELS) int64 points that several views gave a class, and sum of the shares of pairs of their views that
-    disagree, in fixed point, by the views' weight. core: (N,) bool points to count, None = all.
+    """(2,) int64 points that several views gave a class, and how many of those the views of a pair disagree on, in
+    fixed point. core: (N,) bool points to count, None = all.
 
     The views of a point are taken to weigh the same.
     """
-    total, views = class_views(known)
-    several = np.flatnonzero((views > 1.5) & (True if core is None else core))
-    total, views = total[several], views[several]
-    shares = votes_or_seeds(known)[several, 1 : -1 if known.none else None] / total[:, None]
-    agreeing = (shares * np.clip(shares - 1 / views[:, None], 0, None)).sum(axis=1) / (1 - 1 / views)
-    level = np.rint(_levels(total, views)).astype(np.int64)
-    differing = np.rint(FIXED * np.clip(1 - agreeing, 0, 1)).astype(np.int64)
-    result = np.zeros((2, LEVELS), np.int64)
-    np.add.at(result[0], level, 1)
-    np.add.at(result[1], level, differing)
-    return result
+    if known.votes is None:
+        return np.zeros(2, np.int64)
+    votes = known.votes[:, 1 : -1 if known.none else None].astype(np.float64)
+    every, total = known.votes[:, 1:].sum(axis=1, dtype=np.float64), votes.sum(axis=1)
+    views = known.seeds.num_views * total / np.maximum(every, 1e-9)
+    several = (views > 1.5) & (True if core is None else core)
+    shares, views = votes[several] / total[several, None], views[several]
+    agreeing = (shares * np.maximum(shares - 1 / views[:, None], 0)).sum(axis=1) / (1 - 1 / views)
+    return np.array([FIXED * len(views), np.rint(FIXED * np.maximum(1 - agreeing, 0)).sum()], np.int64)
 
 
 def error_of(disagreement: np.ndarray) -> float:
-    """Share of views that are wrong, by `count_disagreement`."""
-    points, differing = disagreement.sum(axis=1).tolist()
+    """Share of the views that are wrong, by `count_disagreement`: two disagree in 2 e (1 - e) of two classes."""
+    points, differing = (disagreement / FIXED).tolist()
     prior = 2 * PRIOR_ERROR * (1 - PRIOR_ERROR)
-    return float(_wrong((differing / FIXED + PRIOR_POINTS * prior) / (points + PRIOR_POINTS)))
-
-
-def _wrong(differing: np.ndarray | float) -> np.ndarray:
-    """How often one view is wrong, if two disagree so often: 2 e (1 - e), of two classes."""
-    return (1 - np.sqrt(np.maximum(1 - 2 * np.asarray(differing), 0))) / 2
-
-
-def worth_of(disagreement: np.ndarray) -> np.ndarray:
-    """(LEVELS,) nats by which one view prefers its class: log-odds that it is right; not less for a view that is
-    surer.
-    """
-    points, differing = disagreement
-    overall = error_of(disagreement)
-    prior = PRIOR_POINTS * 2 * overall * (1 - overall)
-    rates = (differing / FIXED + prior) / (points + PRIOR_POINTS)
-    error = _wrong(isotonic_regression(rates, weights=points + 1).x)
-    return np.log((1 - error) / error)
+    rate = (differing + PRIOR_POINTS * prior) / (points + PRIOR_POINTS)
+    return float((1 - np.sqrt(max(1 - 2 * rate, 0))) / 2)
 
 
 def softmax(values: np.ndarray) -> np.ndarray:
