@@ -269,7 +269,7 @@ def plausible_seeds(known: LabelledPoints, rating: np.ndarray | None, trust: Tru
     seeds = known.seed_labels
     if rating is None:
         return seeds
-    posterior = softmax(rating + one_view_evidence(known, trust.error))
+    posterior = softmax(rating + one_view_evidence(known, trust.errors))
     own = posterior[np.arange(len(seeds)), np.maximum(seeds, 1).astype(np.int64) - 1]
     return np.where(known.corrected | (own >= IMPLAUSIBLE), seeds, 0).astype(np.uint8)
 

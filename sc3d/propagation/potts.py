@@ -90,7 +90,7 @@ def appearance_marginals(
     settings: Propagate,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same from votes and appearance; rating: (N, C) of the appearance, overwritten."""
-    rating += one_view_evidence(known, trust.error)
+    rating += one_view_evidence(known, trust.errors)
     rating[:, ~offered] = -np.inf
     hold_corrected(rating, known)
     start = softmax(rating)  # afresh: sure marginals would not move

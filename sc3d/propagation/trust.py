@@ -1,8 +1,12 @@
 """How far looks and votes are believed, as measured in each scene.
 
-Votes are judged by one another: how often views disagree. Looks are judged on blocks of space that they
-were not learned from, class against class: two classes that they do not tell apart share one look and are
-left to the votes; the groups of features are weighted so that the held-out points are likeliest.
+Looks are judged on blocks of space that they were not learned from, class against class: two classes that they do
+not tell apart share one look and are left to the votes; color and relief are weighted so that the held-out seeds are
+likeliest. Votes are judged by how often views disagree, and, where all views err together, by the looks: if part of
+the points voted k are in truth c, their looks are a mixture. The share of c in it is at most the smallest ratio of
+the two densities (mixture proportion estimation: Blanchard, Lee, Scott, JMLR 11, 2010). As a class may look in part
+like another one, that counts only as far as color and relief, which hardly depend on one another within a class,
+both say c of the same points.
 """
 
 from __future__ import annotations
@@ -16,6 +20,9 @@ from sc3d.propagation.vote_evidence import error_of
 # of the log-ratio of two classes' densities, per group of features; beyond: the last bin
 BINS, REACH = 17, 6.0
 MIN_SKILL = 0.5  # share of the errors of guessing that looks must avoid on points held out, of two classes alike in number
+MIN_GAP = 0.25  # between the rates at which color, or relief, says c of points voted c and of points voted k
+TAIL = 0.1  # densities are compared on at least this share of a class's points
+MAX_ERROR = 0.5  # of a class's votes: believed no less than not at all
 WEIGHTS = np.linspace(0.0, 1.0, 11)  # tried for each group of features
 
 
@@ -23,12 +30,12 @@ WEIGHTS = np.linspace(0.0, 1.0, 11)  # tried for each group of features
 class Trust:
     """What was measured, of C classes.
 
-    error: share of the views that are wrong; weights: (G,) of the groups of features, 1 = as if their
+    errors: (C,) share of the views' votes for each class that are wrong; weights: (G,) of the groups of features, 1 = as if their
         log-likelihoods were right; look: (C,) int, the same for classes that are not told apart, -1 = left
         to the votes
     """
 
-    error: float
+    errors: np.ndarray
     weights: np.ndarray
     look: np.ndarray
 
@@ -48,7 +55,7 @@ class Trust:
             ", ".join(f"{weight:.1f}" for weight in self.weights),
             len(np.unique(self.look[self.known])),
         )
-        return f"{looks} looks of {self.known.sum()} classes told apart, weights {weights}; views are wrong in {100 * self.error:.1f} %"
+        return f"{looks} looks of {self.known.sum()} classes told apart, weights {weights}; {100 * self.errors.min():.1f} to {100 * self.errors.max():.1f} % of the votes for a class are wrong"
 
     def without(self, classes: np.ndarray) -> Trust:
         """classes: (C,) bool, to be left to the votes."""
@@ -76,7 +83,8 @@ def measure_trust(contrasts: np.ndarray, known: np.ndarray, disagreement: np.nda
     if len(np.unique(look[known])) < 2:
         return None
     apart = [pair for pair in pairs if pair not in alike]
-    return Trust(error, _fit_weights(contrasts, apart, error), look)
+    weights = _fit_weights(contrasts, apart, error)
+    return Trust(np.maximum(error, _shared_errors(contrasts, apart, weights)), weights, look)
 
 
 def _shares(contrasts: np.ndarray, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -111,3 +119,43 @@ def _fit_weights(contrasts: np.ndarray, pairs: list[tuple[int, int]], error: flo
             right = 1 / (1 + np.exp(score + odds))
             losses[number] -= (counts * np.log(error + (1 - 2 * error) * right)).sum()
     return options[int(np.argmin(losses))]
+
+
+def _shared_errors(contrasts: np.ndarray, pairs: list[tuple[int, int]], weights: np.ndarray) -> np.ndarray:
+    """(C,) shares of the votes for each class that all views get wrong together: of each pair, what both the
+    densities and the joint answers of color and relief allow.
+    """
+    result = np.zeros(len(contrasts))
+    for own, other in (order for pair in pairs for order in (pair, pair[::-1])):
+        share = min(_corroborated(contrasts, (own, other)), _largest_share(contrasts, (own, other), weights))
+        # to half an octave: no better is known, and noise in the last bits of the features changes nothing
+        result[own] += 2.0 ** (np.rint(2 * np.log2(share)) / 2) if share > 0 else 0
+    return np.minimum(result, MAX_ERROR)
+
+
+def _largest_share(contrasts: np.ndarray, pair: tuple[int, int], weights: np.ndarray) -> float:
+    """Largest share of c among points voted k, pair (k, c), that their looks allow: the smallest ratio of the two
+    densities (mixture proportion estimation: Blanchard, Lee, Scott, JMLR 11, 2010).
+    """
+    voted, other = _shares(contrasts, pair)
+    order = np.argsort(-_scores(weights), axis=None, kind="stable")
+    voted, other = np.cumsum(voted.ravel()[order]), np.cumsum(other.ravel()[order])
+    enough = other >= TAIL
+    return float(np.min(voted[enough] / other[enough], initial=1.0))
+
+
+def _corroborated(contrasts: np.ndarray, pair: tuple[int, int]) -> float:
+    """Share of c among points voted k, pair (k, c), if the groups' joint answers come from mixing two
+    classes within which they are independent; 0 with one group, or where a group does not tell the two apart.
+    """
+    if contrasts.ndim - 2 < 2:
+        return 0.0
+    says = np.arange(BINS) > BINS // 2
+    voted, other = _shares(contrasts, pair)
+    both = voted[np.ix_(says, says)].sum()
+    rates = np.array([[part[says].sum(), part[:, says].sum()] for part in (voted, other)])
+    gaps = rates[1] - rates[0]
+    if (gaps < MIN_GAP).any():
+        return 0.0
+    odds = max(both - rates[0].prod(), 0.0) / gaps.prod()
+    return float(odds / (1 + odds))

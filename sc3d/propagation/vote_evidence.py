@@ -41,15 +41,15 @@ def vote_likelihood(votes: np.ndarray) -> np.ndarray:
     return result.astype(np.float32, copy=False)
 
 
-def one_view_evidence(known: LabelledPoints, error: float) -> np.ndarray:
-    """(N, C) float32, as `evidence_of`, of one view that says what the views of the point say on average, and is
-    wrong in this share of the points. Without votes a seed has one view.
+def one_view_evidence(known: LabelledPoints, errors: np.ndarray) -> np.ndarray:
+    """(N, C) float32, as `evidence_of`, of one view that says what the views of the point say on average; errors:
+    (C,) share of the votes for each class that are wrong. Without votes a seed has one view.
     """
     votes = known.votes
     if votes is None:
         votes = np.eye(known.num_classes + 1, dtype=np.float32)[known.seed_labels]
     classes = votes[:, 1 : -1 if known.none else None]
-    worth = np.float32(np.log((1 - error) / error))
+    worth = np.log((1 - errors) / errors).astype(np.float32)[: classes.shape[1]]
     result = worth * classes / np.maximum(classes.sum(axis=1, keepdims=True), np.float32(1e-9))
     result -= result.max(axis=1, keepdims=True)
     if known.rates is None:
