@@ -158,17 +158,15 @@ class AppearanceModel:
         if not tells_apart(statistics, trust):
             return None
         counts, known = statistics[0].sum(axis=0), known_looks(statistics, trust)
-        result = np.zeros((len(label), len(counts)), np.float32)
+        result, tables = np.zeros((len(label), len(counts)), np.float32), self.tables(statistics, known)
         for look in np.unique(trust.look[known]):
             members = np.flatnonzero(known & (trust.look == look))
             number = counts[members].sum()
             # of classes that look alike none is likelier beforehand
             rating = np.full(len(label), np.log(number / len(members) / counts[known].sum()), np.float32)
-            for group, table, weight in zip(
-                self.groups, self.tables(statistics, known), trust.weights, strict=True
-            ):
+            for group, table, weight in zip(self.groups, tables, trust.weights, strict=True):
                 mixed = np.logaddexp.reduce(table[:, members] + np.log(counts[members] / number), axis=1)
-                rating += np.float32(weight) * mixed.astype(np.float32)[group.cell]
+                rating += (weight * mixed).astype(np.float32)[group.cell]
             result[:, members] = rating[:, None]
         result[:, ~known] = -np.inf
         result -= np.logaddexp.reduce(result, axis=1, keepdims=True)
