@@ -209,16 +209,12 @@ def sum_statistics(parts: list[AppearanceStatistics]) -> AppearanceStatistics:
 def held_out(
     model: AppearanceModel,
     halves: list[AppearanceStatistics],
-    known: LabelledPoints,
+    label: np.ndarray,
+    examples: np.ndarray,
     folds: np.ndarray,
-    core: np.ndarray | bool = True,
 ) -> np.ndarray:
-    """`AppearanceModel.contrasts` of the seeds, each looked at by what the other fold (N,) teaches; core: (N,) bool
-    points to count
-    """
-    first, second = (
-        model.contrasts(halves[1 - fold], known.seed_labels, core & (folds == fold)) for fold in (0, 1)
-    )
+    """`AppearanceModel.contrasts` of the examples (N,) bool, each looked at by what the other fold (N,) teaches."""
+    first, second = (model.contrasts(halves[1 - fold], label, examples & (folds == fold)) for fold in (0, 1))
     return first + second
 
 
@@ -230,9 +226,9 @@ def trust_of(
     known = (counts.sum(axis=0) >= MIN_EXAMPLES) & (counts >= MIN_HALF).all(axis=0)
     trust = measure_trust(contrasts, known, disagreement) if known.sum() >= 2 else None
     if trust is None:
-        logger.info("color and relief tell no two classes apart on seeds held out: not used")
+        logger.info("color and relief tell no two classes apart on agreed points held out: not used")
     else:
-        logger.info("color and relief on seeds held out: %s", trust.describe())
+        logger.info("color and relief on agreed points held out: %s", trust.describe())
     return trust
 
 
@@ -295,8 +291,8 @@ class LearnedAppearance:
 
 
 def learn_appearance(graph: Graph, known: LabelledPoints) -> LearnedAppearance | None:
-    """Color and relief of the classes from the agreed points, if that tells classes apart on seeds that it
-    has not seen.
+    """Color and relief of the classes from the agreed points, if that tells classes apart on agreed points
+    that it has not seen.
 
     known: in the order of the graph
     """
@@ -304,7 +300,7 @@ def learn_appearance(graph: Graph, known: LabelledPoints) -> LearnedAppearance |
     start, examples = known.seed_labels, known.agreed
     folds = folds_of(known.points, known.points.min(axis=0), known.points.max(axis=0))
     halves = [model.statistics(start, examples & (folds == fold), known.num_classes) for fold in (0, 1)]
-    trust = trust_of(halves, held_out(model, halves, known, folds), count_disagreement(known))
+    trust = trust_of(halves, held_out(model, halves, start, examples, folds), count_disagreement(known))
     return None if trust is None else LearnedAppearance(model, sum_statistics(halves), trust)
 
 

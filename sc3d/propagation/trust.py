@@ -1,7 +1,7 @@
 """How far looks and votes are believed, as measured in each scene.
 
 Looks are judged on blocks of space that they were not learned from, class against class: two classes that they do
-not tell apart share one look and are left to the votes; color and relief are weighted so that the held-out seeds are
+not tell apart share one look and are left to the votes; color and relief are weighted so that the held-out points are
 likeliest. Votes are judged by how often views disagree, and, where all views err together, by the looks: if part of
 the points voted k are in truth c, their looks are a mixture. The share of c in it is at most the smallest ratio of
 the two densities (mixture proportion estimation: Blanchard, Lee, Scott, JMLR 11, 2010). As a class may look in part
@@ -19,7 +19,7 @@ from sc3d.propagation.vote_evidence import error_of
 
 # of the log-ratio of two classes' densities, per group of features; beyond: the last bin
 BINS, REACH = 17, 6.0
-MIN_SKILL = 0.5  # share of the errors of guessing that looks must avoid on points held out, of two classes alike in number
+MIN_SKILL = 0.25  # share of the errors of guessing that looks must avoid on points held out, of two classes alike in number
 MIN_GAP = 0.25  # between the rates at which color, or relief, says c of points voted c and of points voted k
 TAIL = 0.1  # densities are compared on at least this share of a class's points
 MAX_ERROR = 0.5  # of a class's votes: believed no less than not at all

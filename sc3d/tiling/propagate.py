@@ -201,7 +201,7 @@ def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
 def _learn(
     job: PropagateJob, executor: Executor, summaries: list[TileSummary], least: int
 ) -> LearnedFromTiles | None:
-    """What the agreed points of all tiles teach, if that tells classes apart on seeds held out."""
+    """What the agreed points of all tiles teach, if that tells classes apart on points held out."""
     tiles = job.store.tiles
     lean = NormalStatistics.merge([summary.lean for summary in summaries])
     terrain = GroundModel.from_statistics(lean, job.extent.low, job.extent.high, job.up)
@@ -221,7 +221,7 @@ def _learn(
             *executor.run("examples", partial(_statistics_task, job, counts, least), tiles), strict=True
         )
     ]
-    contrasts = sum(executor.run("held-out looks", partial(_held_out_task, job, halves), tiles))
+    contrasts = sum(executor.run("held-out looks", partial(_held_out_task, job, halves, least), tiles))
     trust = trust_of(halves, contrasts, np.sum([summary.disagreement for summary in summaries], axis=0))
     return None if trust is None else LearnedFromTiles(sum_statistics(halves), trust)
 
@@ -279,10 +279,13 @@ def _statistics_task(
     return even, odd
 
 
-def _held_out_task(job: PropagateJob, halves: list[AppearanceStatistics], tile: int) -> np.ndarray:
+def _held_out_task(
+    job: PropagateJob, halves: list[AppearanceStatistics], least: int, tile: int
+) -> np.ndarray:
     part = TileGraph.load(job, tile)
+    examples = part.known.agreed_by(least) & part.core
     folds = folds_of(part.known.points, job.extent.low, job.extent.high)
-    return held_out(part.appearance(job), halves, part.known, folds, part.core)
+    return held_out(part.appearance(job), halves, part.known.seed_labels, examples, folds)
 
 
 def _turn_task(
