@@ -23,7 +23,7 @@ from sc3d.propagation.labelled_points import MIN_EXAMPLES, LabelledPoints
 from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.terrain import relief_features
 from sc3d.propagation.trust import BINS, Trust, bins_of, measure_trust
-from sc3d.propagation.vote_evidence import count_disagreement
+from sc3d.propagation.vote_evidence import count_disagreement, one_view_evidence, softmax
 from sc3d.settings.labels import Propagate
 
 COLOR_BINS, RELIEF_BINS = 24, 12  # per feature; 24^3 and 12^4 cells
@@ -32,8 +32,8 @@ PRIOR_WEIGHT = 2.0  # points of the overall mixture added to each cell
 UNKNOWN = np.log(0.05)  # their probability of a class they do not know
 MIN_HALF = 100  # examples of a class in each half of space, so that they can be judged by one another
 FOLD_BLOCKS = 8  # blocks along the longest side of the cloud; every other one is held out, as on a chessboard
-IMPLAUSIBLE = np.log(0.5)  # a seed whose class is less likely by its looks is a conflict
-MAX_OVERRULED = 0.5  # share of a class's seeds without a vote against them that looks may overrule
+IMPLAUSIBLE = 0.5  # a seed whose class is less likely is a conflict
+MAX_OVERRULED = 0.5  # share of a class's seeds that many views agree on that looks may overrule
 
 logger = logging.getLogger(__name__)
 
@@ -236,7 +236,7 @@ def count_overruled(known: LabelledPoints, label: np.ndarray, core: np.ndarray |
     """(2, C) int64 seeds of each class without a vote against them that nobody has corrected: all, and those
     that are not of that class by label (N,). core: (N,) bool points to count, None = all.
     """
-    asked = known.sure & ~known.corrected & (True if core is None else core)
+    asked = known.agreed & ~known.corrected & (True if core is None else core)
     seeds, size = known.seed_labels, known.num_classes + 1
     return np.stack(
         [np.bincount(seeds[rows], minlength=size)[1:] for rows in (asked, asked & (label != seeds))]
@@ -254,16 +254,17 @@ def overruled(counts: np.ndarray, trust: Trust) -> np.ndarray:
     return too_many
 
 
-def plausible_seeds(known: LabelledPoints, rating: np.ndarray | None) -> np.ndarray:
-    """(N,) uint8 seeds that their looks do not make less likely than the votes alone do; without the others, which
-    are conflicts that all views share, their neighbors decide. What people have corrected stays.
+def plausible_seeds(known: LabelledPoints, rating: np.ndarray | None, trust: Trust) -> np.ndarray:
+    """(N,) uint8 seeds without those likelier of another class, by looks and votes: conflicts that all views share.
+    What people have corrected stays.
 
     rating: (N, C) log-likelihood of the classes by their looks; None = nothing is known
     """
     seeds = known.seed_labels
     if rating is None:
         return seeds
-    own = rating[np.arange(len(seeds)), np.maximum(seeds, 1).astype(np.int64) - 1]
+    posterior = softmax(rating + one_view_evidence(known, trust.errors))
+    own = posterior[np.arange(len(seeds)), np.maximum(seeds, 1).astype(np.int64) - 1]
     return np.where(known.corrected | (own >= IMPLAUSIBLE), seeds, 0).astype(np.uint8)
 
 
@@ -306,5 +307,5 @@ def learn_appearance(graph: Graph, known: LabelledPoints) -> LearnedAppearance |
 
 def plausible(known: LabelledPoints, appearance: LearnedAppearance) -> np.ndarray:
     """(N,) uint8 seeds that look like their class, or of which too many would go."""
-    kept = plausible_seeds(known, appearance.log_likelihood(known.seed_labels))
+    kept = plausible_seeds(known, appearance.log_likelihood(known.seed_labels), appearance.trust)
     return limited(known, kept, overruled(count_overruled(known, kept), appearance.trust))

@@ -336,7 +336,7 @@ def _start(job: PropagateJob, part: TileGraph, learned: LearnedFromTiles | None)
     if learned is None or job.settings.method == "map":
         return seeds
     rating = learned.of(part.appearance(job)).log_likelihood(seeds)
-    kept = plausible_seeds(part.known, rating)
+    kept = plausible_seeds(part.known, rating, learned.trust)
     return kept if learned.too_many is None else limited(part.known, kept, learned.too_many)
 
 
