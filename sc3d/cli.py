@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> None:
             )
         )
     start_logging()
-    with ending_with_reader():
+    with ending_with_reader(), reporting_errors():
         command, messages = parse(name, current(arguments[1:]))
     with reporting_errors():
         start_logging(messages.quiet, messages.verbose, messages.log)

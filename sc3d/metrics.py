@@ -322,7 +322,7 @@ def evaluate_scene(scene: Scene, settings: Evaluate) -> EvaluationSummary:
     with the same signature: `tiling.evaluate`.
     """
     cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
-    return judge(scene, settings, LabelledSurface.build(cloud, scene.model.views, scene.mesh), labels)
+    return judge(scene, settings, LabelledSurface.build(cloud, scene.model.views, scene.surface), labels)
 
 
 def judge(scene: Scene, settings: Evaluate, surface: SeenCloud, labels: Labels) -> EvaluationSummary:

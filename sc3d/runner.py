@@ -4,7 +4,8 @@ A stage module `sc3d/stages/<name>.py` offers three functions of (scene, setting
     inputs   -> what decides whether the stage must run again: the content of paths, or `PhotoFrames`
     outputs  -> paths that it writes
     run      -> does the work; returns the figures for the summary and the sidecar
-and, where that is not all, one more:
+and, where that is not all, two more:
+    begin    -> writes what of its inputs is missing and can be made up, such as a class table to start from
     besides  -> files, and folders, that it writes without being known by them
 Stages never import one another; `execute` below is what they share: skip finished work, time it, write the
 sidecars.
@@ -82,6 +83,8 @@ def _record(name: str, scene: Scene, settings: object) -> dict[str, Any]:
 
 def _execute(name: str, scene: Scene, settings: object, overwrite: bool) -> dict[str, object]:
     stage = importlib.import_module(f"sc3d.stages.{name}")
+    if hasattr(stage, "begin"):
+        stage.begin(scene, settings)
     record = _record(name, scene, settings)
     outputs = stage.outputs(scene, settings)
     previous = _finished(record, outputs, scene, settings)

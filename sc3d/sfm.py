@@ -6,23 +6,32 @@ import logging
 import sqlite3
 import tempfile
 from contextlib import AbstractContextManager, closing, suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 
 from sc3d.errors import InputError, Sc3dError, left_out
+from sc3d.geometry.shortlist import neighbors_by_look, neighbors_in_order
 from sc3d.georeferencing.gps import Flight, read_flight
 from sc3d.io.atomic import require_room, telling_of_full_disk, temporary_name
 from sc3d.io.colmap import registered_images, write_model
+from sc3d.io.limits import FARTHEST
 from sc3d.io.progress import Progress, polled
 from sc3d.io.readable_photos import readable_photos, transparent_photos
-from sc3d.settings.reconstruction import Mapping
+from sc3d.settings.reconstruction import Mapping, Matching
 
 logger = logging.getLogger(__name__)
 
 # in the database: of a keypoint with its descriptor, of the matches of two photos
 FEATURE_BYTES, PAIR_BYTES = 160, 20_000
+MATCH_ALL = 100  # photos up to which auto matches every pair
+IN_ORDER, ALIKE = 10, 30  # partners of each photo by name and by look
+# photos that each is matched with
+PARTNERS: dict[Matching, int] = {"sequential": 10, "spatial": 50, "vocabulary": IN_ORDER + ALIKE}
+DESCRIPTORS = 1000  # of each photo, that its look is made of
 
 
 def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) -> dict[str, object]:
@@ -37,8 +46,9 @@ def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) 
             f"unknown camera model {settings.camera_model!r}: one of {', '.join(list(pycolmap.CameraModelId.__members__)[1:])}"
         )
     flight = read_flight(images, names) if settings.gps else None
-    if settings.matching == "spatial" and flight is None:
-        raise InputError("--matching spatial needs GPS in the photos' EXIF: use exhaustive or sequential")
+    settings = replace(settings, matching=choose_matching(settings.matching, names, flight))
+    if settings.matching == "spatial":
+        _check_spatial(names, flight)
     output.parent.mkdir(parents=True, exist_ok=True)
     require_room(output, _database_size(len(names), settings))  # COLMAP's threads would end the process
     with tempfile.TemporaryDirectory(prefix=temporary_name("work"), dir=output.parent) as folder:
@@ -49,7 +59,7 @@ def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) 
             _extract(database, images, names, settings, readable, masks)
             _write_priors(database, flight)
             _match(database, len(names), settings)
-            model, parts = _map(database, readable, work, settings, len(names), flight is not None)
+            model, parts = map_database(database, readable, work, settings, len(names), flight is not None)
             reasons = _reasons(database, names, model, parts)
             clear = transparent_photos({name: images / name for name in reasons})
             reasons |= dict.fromkeys(clear, "wholly transparent")
@@ -83,10 +93,8 @@ def _database_size(num_photos: int, settings: Mapping) -> int:
     """Bytes that the database may take: keypoints with descriptors, matches, and the journal of what is being
     written.
     """
-    partners = {"exhaustive": num_photos / 2, "sequential": 10, "spatial": 50}[settings.matching]
-    return int(
-        num_photos * (2 * FEATURE_BYTES * settings.max_features + PAIR_BYTES * min(partners, num_photos))
-    )
+    pairs = num_pairs(num_photos, settings.matching)
+    return int(num_photos * 2 * FEATURE_BYTES * settings.max_features + PAIR_BYTES * pairs)
 
 
 def _write_priors(database: Path, flight: Flight | None) -> None:
@@ -114,23 +122,101 @@ def _write_priors(database: Path, flight: Flight | None) -> None:
                 opened.write_pose_prior(prior)
 
 
+def choose_matching(matching: Matching, names: list[str], flight: Flight | None) -> Matching:
+    """What auto stands for with these photos; anything else as it is."""
+    if matching != "auto":
+        return matching
+    if len(names) <= MATCH_ALL:
+        return "exhaustive"
+    return "vocabulary" if _without_place(names, flight) else "spatial"
+
+
+def _without_place(names: list[str], flight: Flight | None) -> list[str]:
+    """Photos without GPS that can be used; all without a flight."""
+    return [name for name in names if not flight or name not in flight.tags or name in flight.astray]
+
+
+def _check_spatial(names: list[str], flight: Flight | None) -> None:
+    without = _without_place(names, flight)
+    if flight is None:
+        raise InputError(
+            "--matching spatial needs GPS in the photos' EXIF: use auto, exhaustive, vocabulary or sequential"
+        )
+    if without:
+        logger.warning(
+            left_out(
+                without,
+                len(names),
+                "photos have no GPS and are matched with no other (--matching vocabulary)",
+            )
+        )
+
+
+def num_pairs(num_photos: int, matching: Matching) -> float:
+    """Photo pairs that are matched, about; auto as for photos with GPS."""
+    if matching == "auto":
+        matching = "exhaustive" if num_photos <= MATCH_ALL else "spatial"
+    partners = PARTNERS.get(matching, num_photos)
+    return num_photos * min(partners, num_photos - 1) / (2 if partners == num_photos else 1)
+
+
 def _match(database: Path, num_photos: int, settings: Mapping) -> None:
-    match = {
-        "exhaustive": pycolmap.match_exhaustive,
-        "sequential": pycolmap.match_sequential,
-        "spatial": pycolmap.match_spatial,
-    }
-    num_pairs = num_photos * (num_photos - 1) // 2 if settings.matching == "exhaustive" else None
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = settings.seed  # for each pair, whichever thread it falls to
-    with _polled(database, "two_view_geometries", num_pairs, "matching", "pair"):
-        match[settings.matching](database, verification_options=verification, device=pycolmap.Device.cpu)
+    given = {"verification_options": verification, "device": pycolmap.Device.cpu}
+    total = num_photos * (num_photos - 1) // 2 if settings.matching == "exhaustive" else None
+    with _polled(database, "two_view_geometries", total, "matching", "pair"):
+        if settings.matching == "vocabulary":
+            _match_alike(database, given)
+        elif settings.matching == "spatial":
+            nearest = pycolmap.SpatialPairingOptions()
+            nearest.max_num_neighbors, nearest.max_distance = PARTNERS["spatial"], FARTHEST
+            pycolmap.match_spatial(database, pairing_options=nearest, **given)
+        elif settings.matching == "sequential":
+            pycolmap.match_sequential(database, **given)
+        else:
+            pycolmap.match_exhaustive(database, **given)
 
 
-def _map(
+def _match_alike(database: Path, given: dict[str, Any]) -> None:
+    """Match photos with those most alike, and with neighbors in name order."""
+    with pycolmap.Database.open(database) as opened:
+        images = sorted(opened.read_all_images(), key=lambda image: image.name)
+        pairs = neighbors_in_order(len(images), IN_ORDER) | neighbors_by_look(
+            [_some_descriptors(opened, image.image_id) for image in images], ALIKE
+        )
+    listed = database.with_name("pairs.txt")
+    # by id, as COLMAP splits its lists of names at blanks
+    lines = [f"{images[first].image_id} {images[second].image_id}" for first, second in sorted(pairs)]
+    listed.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    names = {image.image_id: image.name for image in images}
+    _rename(database, {image_id: str(image_id) for image_id in names})
+    try:
+        options = pycolmap.ImportedPairingOptions()
+        options.match_list_path = listed
+        pycolmap.match_image_pairs(database, pairing_options=options, **given)
+    finally:
+        _rename(database, names)
+
+
+def _rename(database: Path, names: dict[int, str]) -> None:
+    with pycolmap.Database.open(database) as opened:
+        for image in opened.read_all_images():
+            image.name = names[image.image_id]
+            opened.update_image(image)
+
+
+def _some_descriptors(database: pycolmap.Database, image_id: int) -> np.ndarray:
+    """(K, 128) float32 unit vectors, evenly from all features of a photo."""
+    found = np.asarray(database.read_descriptors(image_id).data, np.float32)
+    some = found[:: max(1, len(found) // DESCRIPTORS)]
+    return some / np.maximum(np.linalg.norm(some, axis=1, keepdims=True), 1e-9)
+
+
+def map_database(
     database: Path, images: Path, work: Path, settings: Mapping, num_photos: int, has_gps: bool
 ) -> tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction]]:
-    """The largest model, and the others."""
+    """The largest model of what a COLMAP database holds, and the others; Sc3dError if there is none."""
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = settings.seed
     options.num_threads = 1  # with more, sums of larger scenes are rounded otherwise in each run

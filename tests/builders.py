@@ -156,7 +156,7 @@ def labelled_scene(path: Path) -> Scene:
 def inspector_of(scene: Scene) -> Inspector:
     """What the viewer looks points up in."""
     return Inspector(
-        o3d.t.io.read_point_cloud(str(scene.labelled)), scene.model.views, scene.class_table(), scene.mesh
+        o3d.t.io.read_point_cloud(str(scene.labelled)), scene.model.views, scene.class_table(), scene.surface
     )
 
 

@@ -59,8 +59,9 @@ def test_run_makes_masks_first_where_depth_takes_sky_from_them(scene, monkeypatc
     stages: list[str] = []
     table = [{"id": 1, "name": "road", "color": [1, 1, 1]}, {"id": 3, "name": name, "color": [9, 9, 9]}]
     (scene / "classes.json").write_text(json.dumps(table))
-    for step in ("check", "prepare", "tell_plan"):
+    for step in ("check", "tell_plan"):
         monkeypatch.setattr(run, step, lambda *arguments: None)
+    monkeypatch.setattr(run, "prepare", lambda photos, scene, settings: settings)
     monkeypatch.setattr(run, "execute", lambda stage, *arguments: stages.append(stage))
     main(["run", "photos", str(scene), *options])
     others = [stage for stage in stages if stage != "segment"]
@@ -356,3 +357,16 @@ def test_a_log_gets_the_messages_and_the_error(scene, tmp_path, capsys):
     message = fails(capsys, "propagate", scene, "--quiet", "--log", log)
     assert log.read_text().endswith(f" {message}\n")
     assert "cannot write" in fails(capsys, "propagate", scene, "--log", tmp_path / "nowhere" / "file.log")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("label", "--prior-weight", "nan"),
+        ("propagate", "--method", "geometry", "--save-model", "m.npz"),
+        ("extract", "--crop", "2", "--from", "centers"),
+    ],
+)
+def test_settings_that_do_not_go_together_are_one_line(scene, capsys, options):
+    name, *rest = options
+    fails(capsys, name, scene, *rest)

@@ -1,24 +1,15 @@
 // The page: classes, photos, tools and keys around the canvas.
 
+import { $, ask } from "/ask.js";
 import { Canvas } from "/canvas.js";
 import { Drawing } from "/drawing.js";
 
-const $ = id => document.getElementById(id);
-const token = document.querySelector("meta[name=token]").content;
 const state = { tool: "brush", label: "", width: 12, colors: new Map(), opacity: 0.55, maskShown: true };
 const photos = []; // {stem, name, width, height, strokes, drawing, image, mask}
 let classes = [], current = null, busy = false;
 const canvas = new Canvas($("canvas"), state, refresh);
 
 // ---- talking to the server
-
-async function ask(path, content) {
-  const headers = { "Content-Type": "application/json", "X-Token": token };
-  const options = content === undefined ? {} : { method: "POST", headers, body: JSON.stringify(content) };
-  const answer = await fetch(path, options).catch(() => { throw new Error("the server does not answer: is `sc3d annotate` still running?"); });
-  if (!answer.ok) throw new Error((await answer.json().catch(() => ({}))).error || `the server answers ${answer.status}`);
-  return answer.headers.get("Content-Type").startsWith("image/") ? createImageBitmap(await answer.blob()) : answer.json();
-}
 
 const address = (kind, photo) => `/${kind}/${encodeURIComponent(photo.stem)}`;
 

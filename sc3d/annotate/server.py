@@ -2,8 +2,7 @@
 
 What keeps others out: requests under another name or from another page are refused (`sc3d.io.local_page`),
 and whatever writes or computes must come from the page's own origin and carry the token that only this page
-was given. Photos are found by
-their names in a list, never by a path.
+was given. Photos are found by their names in a list, never by a path.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 
 from sc3d.annotate.session import BusyError, Session
+from sc3d.annotate.suggestions import StaleError, Suggestions
 from sc3d.errors import InputError
 from sc3d.io.local_page import LocalPage
 
@@ -32,6 +32,7 @@ PORTS_TRIED = 20
 STATIC = {
     "/": ("page.html", "text/html"),
     "/page.js": ("page.js", "text/javascript"),
+    "/ask.js": ("ask.js", "text/javascript"),
     "/canvas.js": ("canvas.js", "text/javascript"),
     "/drawing.js": ("drawing.js", "text/javascript"),
     "/style.css": ("style.css", "text/css"),
@@ -68,13 +69,13 @@ class AnnotationServer(ThreadingHTTPServer):
     daemon_threads = True
     allow_reuse_address = False  # two servers on one port would share its requests
 
-    def __init__(self, session: Session, port: int) -> None:
+    def __init__(self, session: Session, port: int, handler: type[Handler] | None = None) -> None:
         """Bind to the port or one of the next; 0 = any. Raises InputError if none is free."""
         self.session = session
         self.token = secrets.token_urlsafe(32)
         for candidate in range(port, port + PORTS_TRIED) if port else (0,):
             try:
-                super().__init__((ADDRESS, candidate), Handler)
+                super().__init__((ADDRESS, candidate), handler or Handler)
                 break
             except (OSError, OverflowError):
                 continue
@@ -102,6 +103,7 @@ class Handler(BaseHTTPRequestHandler):
     """One request: checked, looked up, answered."""
 
     server: AnnotationServer
+    static = STATIC
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "sc3d", ""
     timeout = 60  # s that a connection may stay silent
@@ -118,7 +120,7 @@ class Handler(BaseHTTPRequestHandler):
             found, status = answer(urlsplit(self.path).path), HTTPStatus.OK
         except Refusal as refusal:
             found, status = _to_json({"error": str(refusal)}), refusal.status
-        except BusyError as error:
+        except (BusyError, StaleError) as error:
             found, status = _to_json({"error": str(error)}), HTTPStatus.CONFLICT
         except InputError as error:
             found, status = _to_json({"error": str(error)}), HTTPStatus.UNPROCESSABLE_ENTITY
@@ -132,8 +134,8 @@ class Handler(BaseHTTPRequestHandler):
 
     def _get(self, path: str) -> Answer:
         session = self.server.session
-        if path in STATIC:
-            return self._static(*STATIC[path])
+        if path in self.static:
+            return self._static(*self.static[path])
         if path == "/scene":
             return _to_json(session.describe())
         kind, stem = self._split(path, ("photo", "strokes"))
@@ -202,6 +204,40 @@ class Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *values: object) -> None:
         logger.debug(format, *values)
+
+
+class SuggestHandler(Handler):
+    """The same for the page that asks."""
+
+    static = {
+        "/": ("suggest.html", "text/html"),
+        "/suggest.js": ("suggest.js", "text/javascript"),
+        "/ask.js": STATIC["/ask.js"],
+        "/style.css": STATIC["/style.css"],
+    }
+
+    def _get(self, path: str) -> Answer:
+        return _to_json(self._suggestions.question()) if path == "/question" else super()._get(path)
+
+    def _post(self, path: str) -> Answer:
+        self._check_token()
+        content = self._body()
+        if not isinstance(content, dict):
+            raise Refusal(HTTPStatus.BAD_REQUEST, "a JSON object is expected")
+        if path == "/answer" and "class" in content:
+            return _to_json(self._suggestions.answer(content.get("place"), content["class"]))
+        if path == "/skip":
+            return _to_json(self._suggestions.skip(content.get("place")))
+        if path == "/undo":
+            return _to_json(self._suggestions.undo())
+        raise Refusal(HTTPStatus.NOT_FOUND, "there is no such page")
+
+    @property
+    def _suggestions(self) -> Suggestions:
+        session = self.server.session
+        if not isinstance(session, Suggestions):
+            raise TypeError("this handler needs suggestions")
+        return session
 
 
 def _to_json(content: object) -> Answer:

@@ -90,6 +90,14 @@ class Session:
             "photos": photos,
         }
 
+    def key_of(self, name: str) -> str:
+        """The key of a photo of that name, under which the page knows it."""
+        return self._names.key(name)
+
+    def has(self, name: str) -> bool:
+        """Whether there is a photo of that name."""
+        return name in self._names.names
+
     def file(self, key: str) -> Path:
         """Where the strokes of a photo are kept; KeyError for an unknown photo, so that no name leads out of
         the folder.

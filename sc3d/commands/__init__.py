@@ -23,6 +23,7 @@ COMMANDS: dict[str, type] = {
     "reconstruct": reconstruction.ReconstructCommand,
     "import": reconstruction.ImportCommand,
     "run": outputs.Run,
+    "check": outputs.Check,
     "compare": outputs.Compare,
     "view": outputs.ViewCommand,
     "annotate": labels.Annotate,

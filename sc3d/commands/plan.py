@@ -14,27 +14,35 @@ from typing import Any
 from sc3d.io.progress import duration
 from sc3d.runner import files, up_to_date
 from sc3d.scene.scene import Scene
+from sc3d.sfm import num_pairs
 
 logger = logging.getLogger(__name__)
 
 Stage = tuple[str, Any]  # name and settings
 Sizes = Sequence[tuple[int, int]]  # width and height of every photo, px
-PARTNERS = {"sequential": 10, "spatial": 50}  # photos that each is matched with
 ROUND = 5  # s
+SLOW = 3600  # s that a stage takes to be warned of
+FASTER = {  # what makes stages faster, and coarser
+    "map_photos": "less with --matching auto, a smaller --max-size or --max-features",
+    "depth": "less with a smaller --max-size or --num-sources",
+    "train": "less with fewer --iterations, a smaller --max-size, or a GPU",
+    "extract": "less with a smaller --max-size",
+}
 
-# seconds on two cores, of scenes of 18 and 24 photos: rough, and too little where time grows faster than the
-# number of photos
+# seconds on two idle cores. Each rule lies between what the sidecars of two scenes recorded, 18 photos of
+# 1600x900 and 24 of 640x427, and at most 1.5 times off either; compared with these alone. Too little where time
+# grows faster than the number of photos.
 EXPECTED: dict[str, Callable[[Any, Sizes], float | None]] = {
     "map_photos": lambda settings, sizes: (
         1.7 * megapixels(sizes, settings.max_size) + 0.05 * num_pairs(len(sizes), settings.matching)
     ),
-    "reconstruct": lambda settings, sizes: 0.1 * len(sizes),
+    "reconstruct": lambda settings, sizes: 0.03 * len(sizes),
     "depth": lambda settings, sizes: 1.5 * settings.num_sources * megapixels(sizes, settings.max_size),
     "train": lambda settings, sizes: _training(settings.training, sizes),
-    "extract": lambda settings, sizes: 8 * megapixels(sizes, settings.max_size),
+    "extract": lambda settings, sizes: 8.7 * megapixels(sizes, settings.max_size),
     "segment": lambda settings, sizes: _segmenting(settings, sizes),
-    "label": lambda settings, sizes: 0.4 * len(sizes) + 0.25 * megapixels(sizes),
-    "propagate": lambda settings, sizes: 1.8 * megapixels(sizes, 800),
+    "label": lambda settings, sizes: 0.32 * len(sizes) + 0.16 * megapixels(sizes),
+    "propagate": lambda settings, sizes: 1.5 * megapixels(sizes, 800),
     "evaluate": lambda settings, sizes: 0.4 * len(sizes),
     "report": lambda settings, sizes: 20.0,
 }
@@ -46,12 +54,6 @@ def megapixels(sizes: Sizes, longest: int | None = None) -> float:
     return sum(width * height * scale**2 for (width, height), scale in zip(sizes, scales, strict=True)) / 1e6
 
 
-def num_pairs(num_photos: int, matching: str) -> float:
-    """Photo pairs that are matched."""
-    partners = PARTNERS.get(matching, num_photos)
-    return num_photos * min(partners, num_photos - 1) / (2 if partners == num_photos else 1)
-
-
 def _training(settings: Any, sizes: Sizes) -> float | None:
     """None: on a GPU nothing was measured."""
     if settings.device == "cuda":
@@ -61,11 +63,13 @@ def _training(settings: Any, sizes: Sizes) -> float | None:
         width * height * (settings.size(side) / side) ** 2 / 1e6
         for (width, height), side in zip(sizes, longest, strict=True)
     ]
-    return 0.42 * settings.for_photos(len(sizes)).iterations * sum(pixels) / len(pixels)
+    return 0.49 * settings.for_photos(len(sizes)).iterations * sum(pixels) / len(pixels)
 
 
 def _segmenting(settings: Any, sizes: Sizes) -> float | None:
     """None: how long models and strokes take was not measured."""
+    if settings.backend == "geometry":
+        return 10 + 3.0 * megapixels(sizes, 1600)
     if settings.backend != "files":
         return None
     return (0.5 * len(sizes) if settings.refine else 0.0) + 0.1 * megapixels(sizes)
@@ -85,12 +89,22 @@ def pending(scene: Scene, stages: Sequence[Stage], overwrite: bool) -> list[bool
     return runs
 
 
-def plan(stages: Sequence[Stage], runs: Sequence[bool], sizes: Sizes) -> str:
-    """A line per stage with the time that it may take; sizes: at least one."""
-    seconds = [EXPECTED[name](settings, sizes) if run else 0.0 for (name, settings), run in zip(stages, runs)]
+def expected_seconds(stages: Sequence[Stage], runs: Sequence[bool], sizes: Sizes) -> list[float | None]:
+    """How long each stage may take: 0 for those that will not run, None where it is not known."""
+    return [
+        EXPECTED[name](settings, sizes) if run else 0.0
+        for (name, settings), run in zip(stages, runs, strict=True)
+    ]
+
+
+def plan(stages: Sequence[Stage], runs: Sequence[bool], sizes: Sizes, finished: str = "up to date") -> str:
+    """A line per stage with the time that it may take; sizes: at least one; finished: said of stages that will
+    not run.
+    """
+    seconds = expected_seconds(stages, runs, sizes)
     known = [value for value in seconds if value is not None]
     rows = [
-        f"  {name:12s} {_told(value) if run else 'up to date'}"
+        f"  {name:12s} {_told(value) if run else finished}"
         for (name, _), run, value in zip(stages, runs, seconds, strict=True)
     ]
     more = " and what is not known" if len(known) < len(seconds) else ""
@@ -102,6 +116,18 @@ def plan(stages: Sequence[Stage], runs: Sequence[bool], sizes: Sizes) -> str:
             f"  in all       {_told(sum(known))}{more}; rough estimates for two cores, here are {os.cpu_count()}",
         ]
     )
+
+
+def warn_of_slow(stages: Sequence[Stage], runs: Sequence[bool], sizes: Sizes) -> None:
+    """Warn of the stages that may take hours, and say which option makes them faster."""
+    seconds = expected_seconds(stages, runs, sizes)
+    slow = [
+        f"{name} {_told(value)}{f' ({FASTER[name]})' if name in FASTER else ''}"
+        for (name, _), value in zip(stages, seconds, strict=True)
+        if value is not None and value > SLOW
+    ]
+    if slow:
+        logger.warning("slow on %d photos: %s", len(sizes), "; ".join(slow))
 
 
 def _told(seconds: float | None) -> str:

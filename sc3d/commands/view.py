@@ -98,7 +98,7 @@ def _picture(command: ViewCommand, scene: Scene, views: list[View], photo: View 
         pixels = None if photo is None else scene.read_photo(photo.name)
         return screenshot_splats(splats, photo, pixels, command.size, style)
     table = scene.class_table() if scene.classes.exists() else None
-    cloud = load_cloud(scene, command.file, votes=command.by == "disagreement")
+    cloud = load_cloud(scene, command.file, command.by == "disagreement", command.unconfirmed)
     cloud = only_classes(cloud, class_ids(table, command.classes))
     return screenshot(cloud, photo, command.size, style, table)
 
@@ -111,7 +111,9 @@ def _open_window(command: ViewCommand, scene: Scene, views: list[View]) -> None:
     from sc3d.view.picking import Inspector
     from sc3d.view.window import show
 
-    cloud = load_cloud(scene, command.file, votes=True if command.by == "disagreement" else None)
+    cloud = load_cloud(
+        scene, command.file, True if command.by == "disagreement" else None, command.unconfirmed
+    )
     inspector = Inspector.from_scene(scene, cloud, views)
     classes = class_ids(inspector.class_table, command.classes)
     show(inspector, views if command.cameras else [], command.by, classes)
@@ -130,7 +132,11 @@ def _show_page(command: ViewCommand, scene: Scene, views: list[View]) -> None:
     splats_first = command.splats or not has_cloud
     splats = best_splats(scene) if splats_first else None
     votes = True if by == "disagreement" else None
-    cloud = load_cloud(scene, command.file, votes) if splats is None or has_cloud else splats.centers()
+    cloud = (
+        load_cloud(scene, command.file, votes, command.unconfirmed)
+        if splats is None or has_cloud
+        else splats.centers()
+    )
     inspector = Inspector.from_scene(scene, cloud, views)
     if splats_first and not can_color(cloud, by):
         by = "photo"

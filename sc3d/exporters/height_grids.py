@@ -14,7 +14,8 @@ from scipy import ndimage
 
 from sc3d.errors import InputError
 from sc3d.exporters.projected_cloud import MapProjection, projected_chunks
-from sc3d.exporters.terrain import CELL, ground_height, low_objects, require_ground
+from sc3d.exporters.terrain import CELL, ground_height, require_ground
+from sc3d.geometry.ground_filter import low_objects
 from sc3d.geometry.raster import Raster, close_gaps, highest_points, interpolate
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.scene import Scene

@@ -15,6 +15,7 @@ from sc3d.exporters.projected_cloud import ProjectedCloud, chosen_classes, proje
 from sc3d.exporters.terrain import require_ground
 from sc3d.io.atomic import atomic_path
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.labelled_cloud import is_confirmed
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
 
@@ -111,6 +112,7 @@ def point_record(
     record.x, record.y, record.z = projected.points[rows].T
     labels = projected.labels
     record.classification = codes[labels.label[rows]]
+    record.synthetic = ~is_confirmed(projected.cloud)[rows]
     record.return_number = record.number_of_returns = np.ones(len(rows), np.uint8)
     if projected.colors is not None:
         # 255 becomes 65535

@@ -33,7 +33,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """
     cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
     views = scene.model.views
-    surface = LabelledSurface.build(cloud, views, scene.mesh)
+    surface = LabelledSurface.build(cloud, views, scene.surface)
     covered = []
     masks, confidences, sheet = outputs(scene, settings)
     with atomic_path(masks) as mask_folder, atomic_path(confidences) as confidence_folder:

@@ -27,7 +27,7 @@ from sc3d.georeferencing.georeference import (
 from sc3d.georeferencing.up_direction import tell_tilt
 from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.labelled_cloud import read_labelled, take_labels
+from sc3d.scene.labelled_cloud import UNCONFIRMED, confirmed_only, is_confirmed, read_labelled, take_labels
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.common import Resources
@@ -149,10 +149,30 @@ class ProjectedCloud:
 
 def read_projected_cloud(scene: Scene, settings: Export) -> ProjectedCloud:
     """Read the labelled cloud, check its labels against the class table and move it into the CRS."""
-    cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
-    _require_known(scene.class_table(), labels, settings.labelled or scene.labelled, scene)
+    path = settings.labelled or scene.labelled
+    cloud, labels = read_labelled(path, "propagate")
+    if not settings.unconfirmed:
+        kept = is_confirmed(cloud)
+        _tell_unconfirmed(path, int((~kept).sum()), len(kept))
+        cloud, labels = confirmed_only(cloud), labels[kept]
+    _require_known(scene.class_table(), labels, path, scene)
     projection = find_projection(scene, settings)
     return ProjectedCloud(cloud, labels, projection.to_crs(cloud.point.positions.numpy()), projection)
+
+
+@lru_cache(maxsize=8)
+def _tell_unconfirmed(path: Path, count: int, total: int) -> None:
+    """Once per cloud, not once per format."""
+    if count == total:
+        raise InputError(
+            f"no second photo confirms any point of {path}: pass --unconfirmed to write them all the same"
+        )
+    if count:
+        logger.info(
+            "%d of %d points are left out, as no second photo confirms them; `sc3d export --unconfirmed` writes them",
+            count,
+            total,
+        )
 
 
 def _require_known(table: ClassTable, labels: Labels, path: Path, scene: Scene) -> None:
@@ -169,10 +189,18 @@ def projected_chunks(scene: Scene, settings: Export) -> Iterator[ProjectedCloud]
         yield read_projected_cloud(scene, settings)
         return
     projection, table = find_projection(scene, settings), scene.class_table()
+    left = 0
     for _, records in CloudFile.open(path).chunks():
+        names = records.dtype.names or ()
+        if UNCONFIRMED in names and not settings.unconfirmed:
+            kept = records[UNCONFIRMED] == 0
+            left += int((~kept).sum())
+            records = records[kept]
+        if not len(records):
+            continue
         cloud = o3d.t.geometry.PointCloud(positions(records))
-        for name in ("label", "confidence", "state", "num_views"):
-            if name in (records.dtype.names or ()):
+        for name in ("label", "confidence", "state", "num_views", UNCONFIRMED):
+            if name in names:
                 cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(records[name])[:, None])
         colors = columns(records, ("red", "green", "blue"))
         if colors is not None:
@@ -180,6 +208,8 @@ def projected_chunks(scene: Scene, settings: Export) -> Iterator[ProjectedCloud]
         labels = take_labels(cloud, path, "propagate")
         _require_known(table, labels, path, scene)
         yield ProjectedCloud(cloud, labels, projection.to_crs(positions(records)), projection)
+    if left:
+        _tell_unconfirmed(path, left, count)
 
 
 def chosen_classes(scene: Scene, settings: Export) -> set[int]:

@@ -50,7 +50,7 @@ def label_splats(scene: Scene, settings: Export) -> DisplaySplats:
         raise InputError(f"{source} has class id {unknown[0]}, which is not in {scene.classes}: add it there")
     channels = table.channels
     gaussians, origin = load_gaussians(scene)
-    surface = LabelledSurface.build(cloud, scene.model.views, scene.mesh)
+    surface = LabelledSurface.build(cloud, scene.model.views, scene.surface)
     views = [undistorted(view.shifted(origin), LIFTED_SIZE) for view in scene.model.views]
     evidence = lift(
         gaussians,

@@ -6,6 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from sc3d.errors import InputError
+from sc3d.geometry.ground_filter import opened
 from sc3d.geometry.raster import Raster, interpolate
 from sc3d.scene.class_table import ClassTable
 
@@ -15,8 +16,6 @@ CELL = 2.0  # side of the blocks whose median is the ground, m
 # ground that stands out of the lowest of this surrounding by more than STEP is a mislabelled roof or crown, m
 WINDOW = 15.0
 STEP = 1.5
-RADII = (1.0, 2.0, 4.0, 8.0, 15.0)  # of what may stand on the ground, from small to large, m
-SLOPE, BUMP = 0.05, 0.2  # of the ground itself: m per m, beside the slope around; m
 SUPPORT = 0.25  # blocks with less than this share of the usual number of ground points rest on strays
 
 
@@ -75,47 +74,12 @@ def block_medians(blocks: np.ndarray, values: np.ndarray, count: int) -> np.ndar
     return medians
 
 
-def low_objects(heights: np.ndarray, pixel: float) -> np.ndarray:
-    """(H, W) bool: cells that stand on the ground, as cars, hedges and roofs that were labelled as ground
-    do: the simple morphological filter of Pingel et al. (2013), which allows for the slope around.
-
-    heights: (H, W) m, NaN = none; pixel: side of the cells, m
-    """
-    left = heights.copy()
-    for radius in RADII:
-        opened = _opened(left, 2 * round(radius / pixel) + 1)
-        allowed = SLOPE + _steepest(opened, radius, pixel)
-        left[left > opened + BUMP + radius * allowed] = np.nan
-    return np.isfinite(heights) & np.isnan(left)
-
-
-def _steepest(opened: np.ndarray, radius: float, pixel: float) -> np.ndarray:
-    """(H, W) steepest slope of an opened surface (H, W), m per m, within reach of the flat tops that an
-    opening by `radius`, m, leaves.
-    """
-    if min(opened.shape) < 2:
-        return np.zeros(opened.shape)
-    filled = interpolate(opened, np.isfinite(opened))
-    smooth = ndimage.gaussian_filter(filled, min(radius / 2, CELL) / pixel, mode="nearest")
-    slope = np.hypot(*np.gradient(smooth, pixel))
-    return ndimage.maximum_filter(slope, 4 * round(radius / pixel) + 1, mode="nearest")
-
-
-def _opened(heights: np.ndarray, size: int) -> np.ndarray:
-    """(H, W) the opening by a square of `size` cells; NaN counts nowhere, and stays where all around is
-    NaN.
-    """
-    low = ndimage.grey_erosion(np.where(np.isfinite(heights), heights, np.inf), (size, size), mode="nearest")
-    high = ndimage.grey_dilation(np.where(np.isfinite(low), low, -np.inf), (size, size), mode="nearest")
-    return np.where(np.isfinite(high), high, np.nan)
-
-
 def _stands_out(medians: np.ndarray, known: np.ndarray) -> np.ndarray:
     """(H, W) bool blocks higher above an opening of the ground than STEP; the opening flattens hills by
     less.
     """
     size = round(WINDOW / CELL) | 1
-    return known & (medians > _opened(np.where(known, medians, np.nan), size) + STEP)
+    return known & (medians > opened(np.where(known, medians, np.nan), size) + STEP)
 
 
 def _corners(grid: Raster) -> np.ndarray:

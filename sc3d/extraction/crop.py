@@ -15,29 +15,39 @@ POINTS = 1 << 20  # looked at a time: bounds memory, not results
 
 
 def cropped(
-    part: Part, surface: Surface, data: DepthViews, store: EvidenceStore, voxel_size: float, min_photos: int
-) -> tuple[Part, float]:
+    parts: tuple[Part, Part],
+    surface: Surface,
+    data: DepthViews,
+    store: EvidenceStore,
+    voxel_size: float,
+    min_photos: int,
+) -> tuple[tuple[Part, Part], float]:
     """The triangles and points that at least `min_photos` views see (`count_views`), a triangle by its middle;
-    share of the mesh's area that is left out.
+    share of the area that is left out.
 
-    part: mesh and cloud in the views' world; surface: the mesh, which hides what lies behind it
-    Raises Sc3dError where nothing is left.
+    parts: mesh and cloud of what is confirmed, and of what is not, in the views' world; surface: of both
+        meshes, which hide what lies behind them
+    Raises Sc3dError where nothing confirmed is left.
     """
-    mesh, cloud = part
-    corners = mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy()].astype(np.float64)
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas = np.linalg.norm(across, axis=1)
-    points = np.concatenate([corners.mean(axis=1), cloud.point.positions.numpy()])
-    normals = np.concatenate([across / np.maximum(areas, 1e-30)[:, None], cloud.point.normals.numpy()])
-    kept = count_views(data, store, surface, points, normals, voxel_size) >= min_photos
-    triangles, rows = np.split(kept, [len(areas)])
-    if not (triangles.any() and rows.any()):
+    kept, area, left_out = list[Part](), 0.0, 0.0
+    for mesh, cloud in parts:
+        corners = mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy()].astype(np.float64)
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.linalg.norm(across, axis=1)
+        if len(areas):
+            points = np.concatenate([corners.mean(axis=1), cloud.point.positions.numpy()])
+            normals = np.concatenate(
+                [across / np.maximum(areas, 1e-30)[:, None], cloud.point.normals.numpy()]
+            )
+            enough = count_views(data, store, surface, points, normals, voxel_size) >= min_photos
+            triangles, rows = np.split(enough, [len(areas)])
+            area, left_out = area + areas.sum(), left_out + areas[~triangles].sum()
+            mesh = mesh.select_faces_by_mask(o3d.core.Tensor(triangles))
+            cloud = cloud.select_by_mask(o3d.core.Tensor(rows))
+        kept.append((mesh, cloud))
+    if not (len(kept[0][0].triangle.indices) and len(kept[0][1].point.positions)):
         raise Sc3dError(f"no surface is seen by {min_photos} photos at once: lower --crop")
-    smaller = (
-        mesh.select_faces_by_mask(o3d.core.Tensor(triangles)),
-        cloud.select_by_mask(o3d.core.Tensor(rows)),
-    )
-    return smaller, float(areas[~triangles].sum() / areas.sum())
+    return (kept[0], kept[1]), float(left_out / area)
 
 
 def count_views(

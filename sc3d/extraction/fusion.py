@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,6 +14,7 @@ from sc3d.errors import Sc3dError
 from sc3d.extraction.crop import cropped
 from sc3d.extraction.evidence import DepthViews, EvidenceStore
 from sc3d.extraction.free_space import MARGIN, count_opposed, farthest_free
+from sc3d.extraction.photo_support import find_supported
 from sc3d.geometry.cameras import View
 from sc3d.geometry.raycast import Surface, first_surface
 from sc3d.geometry.tsdf import DepthFusion, Part, cloud_in_order, drop_small_parts, near_mesh, pixel_squares
@@ -40,16 +41,21 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Surfaces:
-    """mesh, cloud: in the views' local world; voxel_size: world units.
+    """In the views' local world; voxel_size: world units.
+
+    mesh: what several views confirm, with normals and colors
+    unconfirmed: what one view only shows, positions and triangles
+    cloud: of both, with uint8 `unconfirmed` (0 or 1)
 
     Shares of all pixels. confirmed: depth confirmed by other views; continued: added as it continues
     confirmed surface; occluders: added before it at the farthest depth that no other view looks through; sky;
-    coverage: ray hits the mesh
+    coverage: ray hits the mesh; covered: ray hits any of it
 
-    cropped: share of the mesh's area that too few views see and that is left out
+    cropped: share of the area that too few views see and that is left out
     """
 
     mesh: o3d.t.geometry.TriangleMesh
+    unconfirmed: o3d.t.geometry.TriangleMesh
     cloud: o3d.t.geometry.PointCloud
     voxel_size: float
     confirmed: float
@@ -57,6 +63,7 @@ class Surfaces:
     occluders: float
     sky: float
     coverage: float
+    covered: float
     cropped: float = 0.0
 
 
@@ -69,25 +76,76 @@ def fuse_views(
     voxel_size: world units. Raises Sc3dError where nothing is confirmed.
     """
     part, confirmed = _fused(data, store, voxel_size)
-    parts = [part]
-    _see(data, store, parts[0][0])
+    sure, unsure = [part], list[Part]()
+    _see(data, store, part)
     shares = {"continued": 0.0, "occluders": 0.0}
     steps = {"continued": _continued, "occluders": _occluding}
     for name in list(steps)[: FILLS.index(fill)]:
         with Progress(len(data.views), name, "view") as bar:
             for turn in range(min(ROUNDS, len(data.views))):
-                surface = _surface(_joined(parts)[0])
+                surface = _surface([*sure, *unsure])
                 for row in range(turn, len(data.views), ROUNDS):
-                    part, share = _added(data, store, surface, row, steps[name], voxel_size)
-                    parts.append(part)
+                    view_sure, view_unsure, share = _added(data, store, surface, row, steps[name], voxel_size)
+                    sure.append(view_sure)
+                    unsure.append(view_unsure)
                     shares[name] += share / len(data.views)
                     bar.update()
-    (mesh, cloud), left_out = _joined(parts), 0.0
-    if crop:
-        (mesh, cloud), left_out = cropped((mesh, cloud), _surface(mesh), data, store, voxel_size, crop)
+                del surface  # two at once would need twice the memory
     shares["sky"] = float(np.mean([store.read(row, "sky").mean() for row in range(len(data.views))]))
-    coverage = _coverage(mesh, data.views)
-    return Surfaces(mesh, cloud, voxel_size, confirmed, **shares, coverage=coverage, cropped=left_out)
+    return _surfaces(
+        data, store, (_joined(sure), _joined(unsure)), voxel_size, crop, {"confirmed": confirmed} | shares
+    )
+
+
+def _surfaces(
+    data: DepthViews,
+    store: EvidenceStore,
+    parts: tuple[Part, Part],
+    voxel_size: float,
+    crop: int,
+    shares: dict[str, float],
+) -> Surfaces:
+    """Of what is sure, as far as the photos support it, and what is not."""
+    left_out = 0.0
+    parts = _split(*parts, find_supported(parts[0], data, store, voxel_size))
+    if crop:
+        parts, left_out = cropped(parts, _surface(list(parts)), data, store, voxel_size, crop)
+    (mesh, cloud), (other, other_cloud) = parts
+    for points, flag in ((cloud, 0), (other_cloud, 1)):
+        points.point.unconfirmed = o3d.core.Tensor(np.full((len(points.point.positions), 1), flag, np.uint8))
+    coverage, covered = (_coverage(_surface(meshes), data.views) for meshes in (parts[:1], parts))
+    return Surfaces(
+        mesh,
+        other,
+        _joined_clouds([cloud, other_cloud]),
+        voxel_size,
+        **shares,
+        coverage=coverage,
+        covered=covered,
+        cropped=left_out,
+    )
+
+
+def _split(sure: Part, unsure: Part, supported: tuple[np.ndarray, np.ndarray]) -> tuple[Part, Part]:
+    """What is not supported goes to what is not sure. supported: (T,) triangles and (N,) points of `sure`"""
+    (mesh, cloud), (triangles, points) = sure, supported
+    if triangles.all() and points.all():
+        return sure, unsure
+    if not (triangles.any() and points.any()):
+        logger.warning(
+            "the photos correlate nowhere on the surface of the Gaussians: none of it is sure, and all is kept"
+        )
+        return sure, unsure
+    kept, others = (
+        (mesh.select_faces_by_mask(o3d.core.Tensor(rows)), cloud.select_by_mask(o3d.core.Tensor(chosen)))
+        for rows, chosen in (supported, (~triangles, ~points))
+    )
+    return kept, _joined([(_bare(others[0]), others[1]), unsure])
+
+
+def _bare(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleMesh:
+    """Positions and triangles only."""
+    return o3d.t.geometry.TriangleMesh(mesh.vertex.positions, mesh.triangle.indices)
 
 
 def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[Part, float]:
@@ -105,7 +163,13 @@ def _fused(data: DepthViews, store: EvidenceStore, voxel_size: float) -> tuple[P
     if few := hardly_confirmed([view.name for view in data.views], shares):
         logger.warning(few)
     sizes = [view.width * view.height for view in data.views]
-    return _part(fusion), float(np.average(shares, weights=sizes))
+    part = _part(fusion)
+    if not len(part[0].vertex.positions):
+        raise Sc3dError(
+            f"all confirmed surface is in loose parts of fewer than {MIN_PART} triangles: "
+            "more overlap is needed, or longer training, or a smaller --voxel-size"
+        )
+    return part, float(np.average(shares, weights=sizes))
 
 
 def _part(fusion: DepthFusion) -> Part:
@@ -124,9 +188,9 @@ def _part(fusion: DepthFusion) -> Part:
     )
 
 
-def _see(data: DepthViews, store: EvidenceStore, mesh: o3d.t.geometry.TriangleMesh) -> None:
+def _see(data: DepthViews, store: EvidenceStore, part: Part) -> None:
     """Keep what every view knows behind a point: the mesh, or sky (inf), 0 = nothing; and the mesh's colors."""
-    surface = _surface(mesh)
+    surface, mesh = _surface([part]), part[0]
     for row, view in enumerate(progress(data.views, "looking", "view")):
         first = first_surface(surface, view)
         hit = np.isfinite(first.range)
@@ -151,9 +215,9 @@ def _others(data: DepthViews, store: EvidenceStore, row: int) -> tuple[list[np.n
 
 def _added(
     data: DepthViews, store: EvidenceStore, surface: Surface, row: int, step: Step, voxel_size: float
-) -> tuple[Part, float]:
-    """Squares where a view has a depth by `step` and sees nothing of the surface there; their share of its
-    pixels.
+) -> tuple[Part, Part, float]:
+    """Squares where a view has a depth by `step` and sees nothing of the surface there: of confirmed depth,
+    and of other; their share of its pixels.
 
     Each view's own: where views disagree, as in tree crowns, their average would be no surface at all.
     """
@@ -162,10 +226,15 @@ def _added(
     hit = np.where(np.isfinite(first.range), first.range * first.ray_z, np.inf).astype(np.float32)
     depth, normals = step(data, store, row, hit)
     wanted = (depth > 0) & (depth < (1 - MARGIN) * hit) & ~store.read(row, "sky")
-    squares, centers = pixel_squares(view, depth, data.image(row), wanted, normals)
-    if len(centers.point.positions):
-        centers = cloud_in_order(centers.voxel_down_sample(voxel_size))
-    return (squares, centers), float(wanted.mean())
+    confirmed = depth == store.read(row, "confirmed")
+    image, parts = data.image(row), list[Part]()
+    for chosen in (wanted & confirmed, wanted & ~confirmed):
+        squares, centers = pixel_squares(view, depth, image, chosen, normals)
+        if len(centers.point.positions):
+            centers = cloud_in_order(centers.voxel_down_sample(voxel_size))
+        parts.append((squares, centers))
+    (sure, unsure) = parts
+    return sure, (_bare(unsure[0]), unsure[1]), float(wanted.mean())
 
 
 def _continued(data: DepthViews, store: EvidenceStore, row: int, hit: np.ndarray) -> Filled:
@@ -242,30 +311,38 @@ def _large(region: np.ndarray) -> np.ndarray:
 
 
 def _joined(parts: list[Part]) -> Part:
-    meshes, clouds = zip(*parts, strict=True)
-    mesh = o3d.t.geometry.TriangleMesh()
-    starts = np.cumsum([0, *(len(each.vertex.positions) for each in meshes[:-1])])
-    for name in ("positions", "normals", "colors"):
-        mesh.vertex[name] = o3d.core.Tensor(np.concatenate([each.vertex[name].numpy() for each in meshes]))
-    mesh.triangle.indices = o3d.core.Tensor(
-        np.concatenate(
-            [each.triangle.indices.numpy() + start for each, start in zip(meshes, starts, strict=True)]
-        )
+    """One mesh and one cloud of several; empty without any."""
+    meshes = [mesh for mesh, _ in parts if len(mesh.triangle.indices)]
+    joined = o3d.t.geometry.TriangleMesh(
+        o3d.core.Tensor.zeros((0, 3)), o3d.core.Tensor.zeros((0, 3), o3d.core.int32)
     )
-    cloud = o3d.t.geometry.PointCloud()
-    for name in ("positions", "normals", "colors"):
-        cloud.point[name] = o3d.core.Tensor(np.concatenate([each.point[name].numpy() for each in clouds]))
-    return mesh, cloud
+    if meshes:
+        starts = np.cumsum([0, *(len(mesh.vertex.positions) for mesh in meshes[:-1])])
+        for name in meshes[0].vertex:
+            joined.vertex[name] = o3d.core.Tensor(
+                np.concatenate([mesh.vertex[name].numpy() for mesh in meshes])
+            )
+        corners = [mesh.triangle.indices.numpy() + start for mesh, start in zip(meshes, starts, strict=True)]
+        joined.triangle.indices = o3d.core.Tensor(np.concatenate(corners))
+    return joined, _joined_clouds([cloud for _, cloud in parts])
 
 
-def _coverage(mesh: o3d.t.geometry.TriangleMesh, views: list[View]) -> float:
-    """Share of the views' pixels whose ray hits the mesh."""
-    surface = _surface(mesh)
+def _joined_clouds(clouds: list[o3d.t.geometry.PointCloud]) -> o3d.t.geometry.PointCloud:
+    clouds = [cloud for cloud in clouds if len(cloud.point.positions)]
+    joined = o3d.t.geometry.PointCloud(o3d.core.Tensor.zeros((0, 3)))
+    for name in clouds[0].point if clouds else ():
+        joined.point[name] = o3d.core.Tensor(np.concatenate([cloud.point[name].numpy() for cloud in clouds]))
+    return joined
+
+
+def _coverage(surface: Surface, views: list[View]) -> float:
+    """Share of the views' pixels whose ray hits a surface."""
     return float(np.mean([np.isfinite(first_surface(surface, view).range).mean() for view in views]))
 
 
-def _surface(mesh: o3d.t.geometry.TriangleMesh) -> Surface:
-    return Surface.from_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), np.zeros(3))
+def _surface(parts: Sequence[Part]) -> Surface:
+    meshes = [(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy()) for mesh, _ in parts]
+    return Surface.from_meshes([mesh for mesh in meshes if len(mesh[1])], np.zeros(3))
 
 
 def default_voxel_size(points: np.ndarray, footprint: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 
+import cv2
 import numba
 import numpy as np
 
@@ -14,9 +15,12 @@ from sc3d.settings.common import DepthMode
 from sc3d.splatting.consistency import consistent
 from sc3d.splatting.evaluation import facing_depth
 from sc3d.splatting.gaussians import Gaussians
+from sc3d.stereo.multi_view import patch_costs, planes_of
+from sc3d.stereo.pinhole_pairs import GrayView
 
 MAX_ANGLE = 80.0  # degrees between ray and normal
 NUM_NEIGHBORS = 6
+MAX_COST = 0.8  # 1 - NCC of the photos; with more they support no depth
 LOOSE = 4.0  # px; how far two views may disagree where nothing better is known
 COHERENT = 0.03  # of the depth, from pixel to pixel of one surface
 
@@ -43,6 +47,7 @@ def _render(gaussians: Gaussians, data: DepthViews, store: EvidenceStore, mode: 
             data.depth_range,
         )
         depth[(depth <= nearest) | (depth >= farthest)] = 0
+        store.save(row, "gray", cv2.cvtColor(data.image(row), cv2.COLOR_RGB2GRAY))
         opaque = data.opaque(row)
         if opaque is not None:
             depth[~opaque] = 0
@@ -71,6 +76,8 @@ def _evidence(data: DepthViews, store: EvidenceStore, row: int, min_views: int) 
         given, continued, sky = (store.read(row, name) for name in ("confirmed", "continued", "sky"))
         towards = store.read(row, "normals")
         confirmed = np.where(sky, 0, np.where(given > 0, given, confirmed))
+    costs = patch_costs(*_photos(data, store, row), planes_of(data.views[row], rendered, normals))
+    store.save(row, "supported", np.where((costs < MAX_COST) | (confirmed != rendered), confirmed, 0))
     goes_on = (loosely | reached(rendered, confirmed > 0)) & (rendered > 0) & ~sky
     return ViewEvidence(
         confirmed,
@@ -78,6 +85,15 @@ def _evidence(data: DepthViews, store: EvidenceStore, row: int, min_views: int) 
         np.where(goes_on[..., None], normals, towards),
         sky,
     )
+
+
+def _photos(data: DepthViews, store: EvidenceStore, row: int) -> tuple[GrayView, list[GrayView]]:
+    """The gray photo of a view, and those of its neighbors."""
+    several = [
+        GrayView(data.views[each], store.read(each, "gray").astype(np.float32) / np.float32(255))
+        for each in (row, *data.neighbors[row][:NUM_NEIGHBORS])
+    ]
+    return several[0], several[1:]
 
 
 @numba.njit(cache=True)

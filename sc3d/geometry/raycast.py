@@ -47,11 +47,17 @@ class Surface:
     @classmethod
     def from_mesh(cls, vertices: np.ndarray, triangles: np.ndarray, origin: np.ndarray) -> Surface:
         """vertices: (V, 3) world; triangles: (T, 3) rows of vertices."""
+        return cls.from_meshes([(vertices, triangles)], origin)
+
+    @classmethod
+    def from_meshes(cls, parts: list[tuple[np.ndarray, np.ndarray]], origin: np.ndarray) -> Surface:
+        """Several meshes, each vertices and triangles as in `from_mesh`."""
         scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(
-            o3d.core.Tensor(np.ascontiguousarray(vertices - origin, np.float32)),
-            o3d.core.Tensor(np.ascontiguousarray(triangles, np.uint32)),
-        )
+        for vertices, triangles in parts:
+            scene.add_triangles(
+                o3d.core.Tensor(np.ascontiguousarray(vertices - origin, np.float32)),
+                o3d.core.Tensor(np.ascontiguousarray(triangles, np.uint32)),
+            )
         return cls(scene, np.asarray(origin, np.float64))
 
     @classmethod

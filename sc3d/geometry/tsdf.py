@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 import open3d as o3d
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from sc3d.geometry.cameras import View
 
@@ -169,9 +171,18 @@ def pixel_squares(
 
 
 def drop_small_parts(mesh: o3d.t.geometry.TriangleMesh, min_triangles: int) -> o3d.t.geometry.TriangleMesh:
-    """Remove connected components of fewer than `min_triangles` triangles (floaters)."""
-    labels, counts, _ = mesh.to_legacy().cluster_connected_triangles()
-    keep = np.asarray(counts)[np.asarray(labels)] >= min_triangles
+    """Remove connected components of fewer than `min_triangles` triangles (floaters); those that share a
+    vertex are connected.
+    """
+    if not len(mesh.vertex.positions):
+        return mesh  # Open3D cannot choose from nothing
+    triangles = mesh.triangle.indices.numpy()
+    ends, num_vertices = triangles[:, [1, 2]].ravel(), len(mesh.vertex.positions)
+    edges = coo_array(
+        (np.ones(len(ends), bool), (triangles[:, [0, 0]].ravel(), ends)), (num_vertices, num_vertices)
+    )
+    labels = connected_components(edges, directed=False)[1][triangles[:, 0]]
+    keep = np.bincount(labels)[labels] >= min_triangles
     return mesh.select_faces_by_mask(o3d.core.Tensor(keep))
 
 

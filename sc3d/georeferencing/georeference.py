@@ -70,6 +70,13 @@ class Georeference:
         return float(self.crs.axis_info[0].unit_conversion_factor)
 
     @property
+    def meters(self) -> float:
+        """Meters per unit of the world."""
+        matrix = np.asarray(self.local_from_world, np.float64)
+        scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
+        return scale * (self.unit if self.origin is None else 1.0)
+
+    @property
     def is_moved(self) -> bool:
         """Whether a similarity lies between the world and ENU (or the CRS)."""
         return self.local_from_world != IDENTITY

@@ -197,9 +197,7 @@ def agree(flight: Flight, centers: dict[str, np.ndarray]) -> Flight | None:
     if len(names) < MIN_GPS:
         logger.warning("only %d registered photos have GPS: it is not used", len(names))
         return None
-    source = np.array([centers[name] for name in names])
-    target = np.array([flight.positions[name] for name in names])
-    fit, kept = fit_similarity_robust(source, target, _tolerance(flight, names))
+    source, distance, kept = _fitted(flight, names, centers)
     exchanged = 0.0 if kept.all() else _share_exchanged(flight, names, source)
     if kept.sum() < max(MIN_GPS, len(names) / 2) or exchanged > kept.mean():
         logger.warning(
@@ -217,7 +215,7 @@ def agree(flight: Flight, centers: dict[str, np.ndarray]) -> Flight | None:
             "GPS of %d of %d photos is wrong, by up to %s, and left out: %s",
             len(wrong),
             len(names),
-            _far(float(np.linalg.norm(fit.apply(source) - target, axis=1)[~kept].max())),
+            told_distance(float(distance[~kept].max())),
             examples(wrong),
         )
     agreed = flight.without(frozenset(wrong) | {name for name in flight.astray if name not in centers})
@@ -227,7 +225,36 @@ def agree(flight: Flight, centers: dict[str, np.ndarray]) -> Flight | None:
     return agreed
 
 
-def _far(meters: float) -> str:
+def _fitted(
+    flight: Flight, names: list[str], centers: dict[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Camera centers (N, 3), how far each lies from its GPS when most fit, m, and (N,) bool: which fit."""
+    source = np.array([centers[name] for name in names])
+    target = np.array([flight.positions[name] for name in names])
+    fit, kept = fit_similarity_robust(source, target, _tolerance(flight, names))
+    return source, np.linalg.norm(fit.apply(source) - target, axis=1), kept
+
+
+def distances(
+    flight: Flight, centers: dict[str, np.ndarray]
+) -> tuple[dict[str, float], dict[str, float]] | None:
+    """How far, m, each camera lies from its GPS, by photo name, and those of them that GPS does not explain;
+    None where it fits too few cameras to say that of the others.
+
+    centers: camera center (3,) by photo name, in any frame
+    """
+    names = [name for name in flight.tags if name in centers]
+    if len(names) <= MIN_GPS:
+        return None
+    _, distance, kept = _fitted(flight, names, centers)
+    if kept.sum() <= max(MIN_GPS, len(names) / 2):
+        return None
+    told = dict(zip(names, distance.tolist(), strict=True))
+    return told, {name: told[name] for name, fits in zip(names, kept, strict=True) if not fits}
+
+
+def told_distance(meters: float) -> str:
+    """A distance as it is told."""
     return f"{meters:.0f} m" if meters < 10_000 else f"{meters / 1000:.0f} km"
 
 

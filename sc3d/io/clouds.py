@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 import re
 from collections.abc import Callable, Collection
 from contextlib import redirect_stdout
@@ -19,8 +20,12 @@ from sc3d.io.pcd import check_pcd, read_fields
 from sc3d.io.ply import (
     RESERVED,
     TOGETHER,
+    Element,
     Header,
+    Property,
     check_ply,
+    format_header,
+    num_triangles,
     read_columns,
     read_header,
     read_positions,
@@ -33,6 +38,12 @@ COARSE = 0.005  # steps of positions that are told, world units
 PCD_NORMALS = ["normal_x", "normal_y", "normal_z"]
 MAX_NAME = 200  # characters of an attribute
 TAKEN = {name for group in TOGETHER for name in group}  # columns of what Open3D reads together
+NO_MESH = format_header(
+    [
+        Element("vertex", 0, tuple(Property(axis, "f8") for axis in "xyz")),
+        Element("face", 0, (Property("vertex_indices", "u4", "u1"),)),
+    ]
+)
 CHECKS: dict[str, Callable[[Path], object]] = {".ply": check_ply, ".pcd": check_pcd}
 
 
@@ -61,6 +72,8 @@ def read_mesh(path: Path):  # -> o3d.t.geometry.TriangleMesh
     """
     if path.is_file() and _has_capitals(read_header(path)):
         raise InputError(f"{path} has its positions as X Y Z: name these properties of the mesh x y z")
+    if path.is_file() and path.suffix.lower() == ".ply" and not num_triangles([path]):
+        raise InputError(f"{path} holds no triangles")
     mesh = _read_geometry(path, "read_triangle_mesh", {".ply"})
     if "positions" not in mesh.vertex or "indices" not in mesh.triangle or not len(mesh.triangle.indices):
         raise InputError(f"{path} holds no triangles")
@@ -235,7 +248,7 @@ def _storable(geometry):
     columns: dict[str, np.ndarray] = {}
     for name in table:
         values = table[name].numpy()
-        values = values.reshape(len(values), -1)
+        values = values.reshape(len(values), math.prod(values.shape[1:]))  # also of no rows
         if name in RESERVED:
             columns[name] = values
         elif values.shape[1] == 1:
@@ -281,12 +294,12 @@ def write_geometry(path: Path, geometry) -> None:
     import open3d as o3d
 
     geometry = _storable(geometry)
-    write = (
-        o3d.t.io.write_point_cloud
-        if isinstance(geometry, o3d.t.geometry.PointCloud)
-        else o3d.t.io.write_triangle_mesh
-    )
+    is_cloud = isinstance(geometry, o3d.t.geometry.PointCloud)
+    write = o3d.t.io.write_point_cloud if is_cloud else o3d.t.io.write_triangle_mesh
     with atomic_path(path) as temporary:
+        if not is_cloud and not len(geometry.vertex.positions):  # Open3D refuses it
+            temporary.write_bytes(NO_MESH)
+            return
         if not write(str(temporary), geometry):
             raise OSError(f"could not write {path}: is the disk full?")
         try:

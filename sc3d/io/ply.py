@@ -437,3 +437,9 @@ def format_header(elements: Iterable[Element], comments: Sequence[str] = (), siz
     if _parse(lines, len(header)).elements != elements or len(header) > MAX_HEADER:
         raise ValueError("a PLY cannot have these names, or so long a header")
     return header
+
+
+def num_triangles(files: Iterable[Path]) -> int:
+    """Triangles of mesh files; those that do not exist have none."""
+    faces = [read_header(path).element("face") for path in files if path.is_file()]
+    return sum(face.rows for face in faces if face is not None)

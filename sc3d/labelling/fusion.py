@@ -16,6 +16,7 @@ from sc3d.geometry.voxels import LabelGrid
 from sc3d.io.progress import progress
 from sc3d.labelling.cloud import Cloud
 from sc3d.labelling.observation import ReadMask, observations
+from sc3d.labelling.prior_cloud import PriorVotes
 from sc3d.labelling.voting import SCALE, VoteAccumulator, VoteWeighting
 from sc3d.scene.labels import LOCKED, SEED, UNLOCKED, UNSEEN, Labels
 from sc3d.settings.labels import Label
@@ -47,13 +48,14 @@ def fuse(
     num_channels: int,
     settings: Label,
     none: bool = False,
+    prior: PriorVotes | None = None,
 ) -> Fusion:
     """Fuse the masks of all views into labels of the cloud.
 
     read_mask: mask of a view, any size of the photo's aspect; masks are streamed
     surface: what blocks the view; None (or settings.depth_filter off) = labels penetrate
     num_channels: as masks and labels hold channels, see `sc3d.scene.channels`, of which with `none` the last
-        stands for "looked at, none of the classes"; settings.voxel_size must be set
+        stands for "looked at, none of the classes"; settings.voxel_size must be set; prior: more votes
     """
     settings = settings.resolved
     last = num_channels - 1 if none else 0
@@ -68,6 +70,8 @@ def fuse(
     seen = observations(views, read_mask, surface if settings.depth_filter else None, settings)
     for view, observation in progress(seen, "voting", "view", total=len(views)):
         accumulator.add_view(view, observation, weighting)
+    if prior is not None:
+        accumulator.add_prior(prior.label, prior.weight)
     if settings.method == "direct":
         return _fusion(_last_photo_wins(accumulator), accumulator)
     winner, share = most_voted(accumulator.votes, last)

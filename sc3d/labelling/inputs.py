@@ -52,15 +52,23 @@ class Masks:
 
     @classmethod
     def load(
-        cls, scene: Scene, confidence: Path | None, unlabelled: Literal["evidence", "ignore"] = "ignore"
+        cls,
+        scene: Scene,
+        confidence: Path | None,
+        unlabelled: Literal["evidence", "ignore"] = "ignore",
+        *,
+        needed: bool = True,
     ) -> Masks:
         """Masks of a scene, and confidence maps in a folder if it exists, all checked; InputError for what
-        does not fit. unlabelled: as `Label.unlabelled`
+        does not fit. unlabelled: as `Label.unlabelled`; needed: without a folder of masks, nothing votes
         """
         scene.require(
             scene.classes,
             hint="pass --classes FILE to `sc3d run`, or copy data/classes.json of the sc3d repository there and edit it",
         )
+        if not needed and not scene.masks.exists():
+            names = tuple(view.name for view in scene.model.views)
+            return cls({}, {}, [], scene, scene.class_table(), names)
         scene.require(scene.masks, hint="run `sc3d segment SCENE` first, with --masks if you have some")
         table = scene.class_table()
         files = scene.mask_files(scene.masks, table)
@@ -137,12 +145,12 @@ def read_given_cloud(scene: Scene, file: Path | None) -> o3d.t.geometry.PointClo
 
 
 def require_in_view(path: Path, box: Box, masks: Masks, sparse_points: np.ndarray) -> None:
-    """InputError if no photo with a mask looks at the box around a cloud; a warning if the cloud lies
-    elsewhere than the scene.
+    """InputError if there are masks, but no photo with one looks at the box around a cloud; a warning if the cloud
+    lies elsewhere than the scene.
 
     box: world; sparse_points: (P, 3) world
     """
-    if any(may_see(view, *box) for view in masks.views):
+    if not masks.files or any(may_see(view, *box) for view in masks.views):
         check_frame(path, np.array(box), masks.views, sparse_points)
         return
     cameras = box_of(np.array([view.center for view in masks.views]))
@@ -158,14 +166,14 @@ def default_voxel_size(points: np.ndarray, masks: Masks) -> float:
 
 
 def voxel_size_for(spacing: float, sample: np.ndarray, masks: Masks) -> float:
-    """2 point spacings, at least 1.5 times the median size of a mask pixel on the cloud, of which `sample`
+    """2 point spacings, at least 1.5 times the median size of a mask pixel, if there are any, on the cloud, of which `sample`
     (S, 3) are some points.
     """
     footprints = []
     for view in masks.views:
         focal = view.focal * masks.size(view)[0] / view.width
         footprints.append(np.median(np.linalg.norm(sample - view.center, axis=1)) / focal)
-    return max(2 * spacing, 1.5 * float(np.median(footprints)))
+    return max(2 * spacing, 1.5 * float(np.median(footprints)) if footprints else 0.0)
 
 
 def point_density(

@@ -26,6 +26,7 @@ from sc3d.labelling.inputs import (
     require_in_view,
 )
 from sc3d.labelling.normal_sides import judge_sides, sample_step, with_sides
+from sc3d.labelling.prior_cloud import read_prior
 from sc3d.scene.frame_check import Box, box_of, describe
 from sc3d.scene.labelled_cloud import Votes, point_arrays, read_surface, usable_normals, with_labels
 from sc3d.scene.labels import STATE_NAMES, UNSEEN
@@ -89,29 +90,41 @@ def summarize(
     return LabelSummary(counts, voxel_size, len(views), num_turned, num_none)
 
 
-def label_scene(scene: Scene, settings: Label) -> LabelSummary:
-    """Fuse the masks of a scene on its cloud (or `settings.cloud`) and write seeds and votes."""
+def label_scene(scene: Scene, settings: Label, prior_name: Path | None = None) -> LabelSummary:
+    """Fuse the masks of a scene on its cloud (or `settings.cloud`) and write seeds and votes. prior_name: how
+    the user calls `settings.prior`, which is in the world of the scene
+    """
     settings = settings.resolved
     masks = Masks.load(
-        scene, best_confidence(scene) if settings.use_confidence else None, settings.unlabelled
+        scene,
+        best_confidence(scene) if settings.use_confidence else None,
+        settings.unlabelled,
+        needed=settings.prior is None,
     )
+    views = masks.views or scene.model.views  # without masks, all of them say where the outside is
     given = read_given_cloud(scene, settings.cloud)
     path, positions = given_cloud_path(scene, settings.cloud), given.point.positions.numpy()
     box = positions.min(axis=0), positions.max(axis=0)
     require_in_view(path, box, masks, scene.model.points)
-    points, normals = point_arrays(given, np.array([view.center for view in masks.views]))
-    normals, num_turned = _on_the_right_side(given, points, normals, masks.views, path)
+    points, normals = point_arrays(given, np.array([view.center for view in views]))
+    normals, num_turned = _on_the_right_side(given, points, normals, views, path)
     masks.tell_of_left_out(*box)
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=default_voxel_size(points, masks))
     surface, density = None, None
     if settings.depth_filter:
-        surface = read_surface(scene.mesh, points, normals, local_origin(masks.views), settings.surface)
+        surface = read_surface(scene.surface, points, normals, local_origin(views), settings.surface)
     if settings.mechanisms.density:
         density = point_density(scene, points, settings.voxel_size)
     channels = masks.channels
     cloud = Cloud(points, normals, density)
-    fusion = fuse(cloud, masks.views, masks.read, surface, channels.count, settings, channels.none)
+    prior = None
+    if settings.prior is not None:
+        size, weight = settings.voxel_size, settings.prior_weight
+        prior = read_prior(
+            settings.prior, prior_name or settings.prior, masks.table, channels, points, size, weight
+        )
+    fusion = fuse(cloud, masks.views, masks.read, surface, channels.count, settings, channels.none, prior)
     with atomic_path(scene.votes_of(settings.output)) as temporary:
         fusion.grid.save(temporary, channels.ids)
     labels = replace(fusion.labels, label=channels.to_ids(fusion.labels.label))

@@ -172,6 +172,23 @@ class VoteAccumulator:
         cast_votes(self.cloud, camera, observation, weighting, *counts, view_votes)
         self.log.append(*view_votes)
 
+    def add_prior(self, label: np.ndarray, weight: float) -> None:
+        """Add what another program says of each point, as so many views that agree would: label (N,) uint8 channels in
+        the order of the given cloud, 0 = nothing.
+        """
+        cell = np.repeat(np.arange(len(self.cloud.rows)), np.diff(self.cloud.cells))
+        said, channels = label[self.order], self.grid.votes.shape[1]
+        flat = np.bincount(cell * channels + said, minlength=len(self.cloud.rows) * channels)
+        counts = flat.reshape(-1, channels)
+        counts[:, 0] = 0
+        total = counts.sum(axis=1)
+        shares = int(weight * SCALE + 0.5) * counts // np.maximum(total, 1)[:, None]
+        heard, views = total > 0, max(1, round(weight))
+        self.grid.votes[self.cloud.rows[heard]] += shares[heard].astype(np.int32)
+        self.grid.votes[self.cloud.rows[heard], 0] += views
+        self.looked[heard] += views
+        self.log.append(shares.argmax(axis=1).astype(np.uint8), shares.max(axis=1).astype(np.uint16))
+
     @property
     def votes(self) -> np.ndarray:
         """(K, num_channels) int32 copy of the votes of all cells."""

@@ -117,6 +117,10 @@ class AppearanceModel:
         """What the examples (N,) bool of label (N,) uint8 teach."""
         return tuple(group.count(label, examples, num_classes) for group in self.groups)
 
+    def offers(self, num_classes: int) -> np.ndarray:
+        """(C,) bool classes that points may get without a single seed of them."""
+        return np.zeros(num_classes, bool)
+
     def tables(self, statistics: AppearanceStatistics, known: np.ndarray) -> list[np.ndarray]:
         """Per group, (cells, C) float32 log-likelihood of each class, up to a number per cell; known: (C,)
         bool classes to look at.

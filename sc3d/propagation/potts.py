@@ -31,6 +31,8 @@ def minimize_energy(
         to the votes.
     """
     offered = np.bincount(known.seed_labels, minlength=known.num_classes + 1)[1:] > 0
+    if appearance is not None:
+        offered |= appearance.model.offers(known.num_classes)
     while appearance is not None:
         found = learning_marginals(graph, known, offered, appearance, settings)
         if found is None:

@@ -4,47 +4,61 @@ method, in the paper's order. By tiles, with the same signature: `tiling.propaga
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import open3d as o3d
 
 from sc3d.errors import InputError
 from sc3d.geometry.graph import Graph, build_graph
+from sc3d.georeferencing.georeference import read_georeference
 from sc3d.georeferencing.up_direction import scene_up
-from sc3d.io.clouds import write_geometry
-from sc3d.propagation.appearance import learn_appearance, plausible, uses_appearance
+from sc3d.io.clouds import read_cloud, write_geometry
+from sc3d.propagation.appearance import LearnedAppearance, learn_appearance, plausible, uses_appearance
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
 from sc3d.propagation.none_evidence import NoneRates, count_votes
 from sc3d.propagation.potts import minimize_energy
 from sc3d.propagation.region_growing import grow_regions, reachable, vote_nearest
+from sc3d.propagation.saved_appearance import SavedAppearance
 from sc3d.scene.channels import Channels
 from sc3d.scene.corrections import Corrections
-from sc3d.scene.labelled_cloud import read_labelled, read_votes, with_labels
-from sc3d.scene.labels import CORRECTED, LOCKED, PROPAGATED, SEED, UNLOCKED, Labels
+from sc3d.scene.labelled_cloud import Votes, point_arrays, read_labelled, read_votes, with_labels
+from sc3d.scene.labels import CORRECTED, LOCKED, PROPAGATED, SEED, UNLOCKED, UNSEEN, Labels
 from sc3d.scene.scene import Scene
+from sc3d.scene.site_model import ModelPart, read_model
 from sc3d.settings.labels import Propagate
+
+Learner = Callable[[Graph, LabelledPoints], LearnedAppearance | None]
 
 
 def propagate(
-    points: LabelledPoints, normals: np.ndarray | None, settings: Propagate, graph: Graph | None = None
+    points: LabelledPoints,
+    normals: np.ndarray | None,
+    settings: Propagate,
+    graph: Graph | None = None,
+    learn: Learner = learn_appearance,
 ) -> Labels:
     """Label the points that have none; all arrays, given and returned, in the order of the cloud.
 
     normals: (N, 3) unit, oriented, or None = estimated; graph: of these points, if it is there already
+    learn: how the appearance is learned; where another site taught it, points get a label without a seed, too
     geometry, knn: seeds keep their label (with verify_seeds: those that look like their class); map: needs votes
     """
     graph = graph or neighbor_graph(points, normals, settings)  # normals, curvature, similarity (eq. 5 to 7)
     if points.none:  # how often views find nothing, where there is something
         points = replace(points, rates=NoneRates.from_counts(count_votes(points.known_votes)))
     known = points.ordered(graph.order)
-    appearance = learn_appearance(graph, known) if uses_appearance(settings) else None
+    appearance = learn(graph, known) if uses_appearance(settings) else None
     seeds = known.seed_labels
     if settings.method == "map":
         label, confidence = minimize_energy(
             graph, known, appearance, settings
         )  # eq. 8, with the sign of Potts
-        label = np.where(reachable(graph, seeds), label, 0).astype(np.uint8)
+        if learn is learn_appearance:
+            label = np.where(reachable(graph, seeds), label, 0).astype(np.uint8)
     else:
         if appearance is not None:
             seeds = plausible(known, appearance)
@@ -99,7 +113,7 @@ def with_states(
 @dataclass(frozen=True)
 class PropagateSummary:
     """Of a finished cloud: points, those with a label, those that got it here, the sum of the labelled
-    points' confidences, and those that people corrected.
+    points' confidences, and those that people corrected. learned: what `--save-model` keeps, if it is asked for.
     """
 
     num_points: int
@@ -107,6 +121,7 @@ class PropagateSummary:
     propagated: int
     confidence: float
     corrected: int = 0
+    learned: ModelPart | None = None
 
     def figures(self) -> dict[str, object]:
         """What the stage reports."""
@@ -120,18 +135,14 @@ class PropagateSummary:
 
 def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     """Complete the labels of a scene's seeds (or of `settings.seeds`) and write the labelled cloud."""
-    path = settings.seeds or scene.seeds
-    cloud, seeds = read_labelled(path, "label")
-    votes = read_votes(cloud)
-    if settings.method == "map" and votes is None:
-        raise InputError(
-            f"{path} has no votes, which --method map needs: run `sc3d label` again, or choose --method geometry"
-        )
+    saved = _saved_appearance(scene, settings)
+    meters = _meters(scene) if settings.model or settings.save_model else None
+    cloud, seeds, votes, path = _read_start(scene, settings)
     positions = cloud.point.positions.numpy().astype(np.float64)
     corrections = Corrections.of_scene(scene)
     seeds, counts = corrections.apply(seeds, positions)
     corrections.warn_of_missing(counts, path)
-    if not (seeds.label > 0).any():  # none of the classes alone is no start
+    if saved is None and not (seeds.label > 0).any():  # none of the classes alone is no start
         raise no_seeds(path, corrections)
     colors = cloud.point.colors.numpy() if "colors" in cloud.point else None
     channels = Channels.of_classes(np.unique(seeds.label).tolist()) if votes is None else votes.channels
@@ -139,14 +150,61 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     values = None if votes is None else votes.values
     points = LabelledPoints(positions, seeds, values, colors, scene_up(scene), channels.none)
     normals = cloud.point.normals.numpy()
-    labels = propagate(points, normals, settings)
-    labels = replace(labels, label=channels.to_ids(labels.label))
+    graph, learn = neighbor_graph(points, normals, settings), learn_appearance
+    if saved is not None and settings.model is not None:
+        learn = partial(saved.on, channels=channels, meters=meters, origin=settings.model)
+    found = propagate(points, normals, settings, graph, learn)
+    labels = replace(found, label=channels.to_ids(found.label))
     write_geometry(settings.output or scene.labelled, with_labels(cloud, normals, labels))
+    learned = None
+    if settings.save_model is not None:
+        kept = SavedAppearance.learn(graph, points, found, channels, meters)
+        learned = None if kept is None else kept.to_part()
     labelled, sure = labels.label > 0, labels.confidence
     propagated = int((labelled & (labels.state == PROPAGATED)).sum())
     total = float(sure[labelled].sum(dtype=np.float64))
     corrected = int((labels.state == CORRECTED).sum())
-    return PropagateSummary(len(labelled), int(labelled.sum()), propagated, total, corrected)
+    return PropagateSummary(len(labelled), int(labelled.sum()), propagated, total, corrected, learned)
+
+
+def _read_start(
+    scene: Scene, settings: Propagate
+) -> tuple[o3d.t.geometry.PointCloud, Labels, Votes | None, Path]:
+    """Cloud, labels (ids) and votes to start from, and their file: what `sc3d label` wrote or, with a model, the
+    cloud of the scene, of which nothing is known.
+    """
+    path = settings.seeds or scene.seeds
+    if settings.model is None or settings.seeds is not None or path.exists():
+        cloud, seeds = read_labelled(path, "label")
+        votes = read_votes(cloud)
+        if settings.method == "map" and votes is None:
+            raise InputError(
+                f"{path} has no votes, which --method map needs: run `sc3d label` again, or choose --method geometry"
+            )
+        return cloud, seeds, votes, path
+    scene.require(scene.cloud, hint="run `sc3d extract SCENE` first, or `sc3d import` a cloud")
+    cloud = read_cloud(scene.cloud)
+    points, normals = point_arrays(cloud, np.array([view.center for view in scene.model.views]))
+    channels, empty = scene.class_table().channels, np.zeros(len(points), np.uint8)
+    cloud.point.normals = o3d.core.Tensor(normals)
+    seeds = Labels(empty, empty.astype(np.float32), empty + np.uint8(UNSEEN), empty.astype(np.int32))
+    return cloud, seeds, Votes(np.zeros((len(points), channels.count), np.float32), channels), scene.cloud
+
+
+def _saved_appearance(scene: Scene, settings: Propagate) -> SavedAppearance | None:
+    """What `--model` holds, checked against the scene before anything else."""
+    if settings.model is None:
+        return None
+    part = read_model(settings.model, scene.class_table(), "appearance")
+    saved = SavedAppearance.from_part(part, settings.model)
+    saved.require_unit(_meters(scene), settings.model)
+    return saved
+
+
+def _meters(scene: Scene) -> float | None:
+    """Meters per unit of the world of a scene; None where nobody says."""
+    found = read_georeference(scene)
+    return None if found is None else found.meters
 
 
 def seeds_in_channels(seeds: Labels, channels: Channels, origin: Path | str) -> Labels:

@@ -4,7 +4,7 @@ what the whole would.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import map_coordinates, minimum_filter
@@ -63,10 +63,15 @@ class GroundModel:
 
     @classmethod
     def from_statistics(
-        cls, lean: NormalStatistics, low: np.ndarray, high: np.ndarray, camera_up: np.ndarray | None = None
+        cls,
+        lean: NormalStatistics,
+        low: np.ndarray,
+        high: np.ndarray,
+        camera_up: np.ndarray | None = None,
+        cell: float | None = None,
     ) -> GroundModel:
         """low, high: (3,) corners of the whole cloud, world; camera_up: (3,) unit, None = not known: then the
-        main direction of the normals is taken
+        main direction of the normals is taken; cell: of the raster, world units, None = by the spacing
         """
         axes = np.linalg.eigh(lean.products.astype(np.float64))[1][:, ::-1]
         up = axes[:, 0]
@@ -82,7 +87,7 @@ class GroundModel:
         )
         spacing = float(lean.spacings.quantiles(np.array([0.5]))[0])
         extent = corners.max(axis=0) - corners.min(axis=0)
-        cell = max(CELL * spacing, float(extent.max()) / MAX_CELLS, 1e-12)
+        cell = max(CELL * spacing if cell is None else cell, float(extent.max()) / MAX_CELLS, 1e-12)
         return cls(
             low,
             up,
@@ -136,14 +141,38 @@ class GroundModel:
         return features
 
 
-def relief_features(graph: Graph, points: np.ndarray, camera_up: np.ndarray | None = None) -> np.ndarray:
-    """(N, 4) float32 features of a whole cloud; points: (N, 3) world, in the order of the graph; camera_up:
-    (3,), None = not known
+@dataclass(frozen=True)
+class Scale:
+    """Sizes that another site's relief was measured with. cell: of the ground raster; unit: of heights; both in
+    world units.
     """
-    terrain = GroundModel.from_statistics(
+
+    cell: float
+    unit: float
+
+
+def terrain_of(
+    graph: Graph, points: np.ndarray, camera_up: np.ndarray | None = None, cell: float | None = None
+) -> GroundModel:
+    """The frame and raster of a whole cloud; points: (N, 3) world, in the order of the graph; camera_up: (3,),
+    None = not known; cell: of the raster, world units, None = by the spacing of the points
+    """
+    return GroundModel.from_statistics(
         NormalStatistics.from_normals(graph.normals, graph.spacings),
         points.min(axis=0),
         points.max(axis=0),
         camera_up,
+        cell,
     )
+
+
+def relief_features(
+    graph: Graph, points: np.ndarray, camera_up: np.ndarray | None = None, scale: Scale | None = None
+) -> np.ndarray:
+    """(N, 4) float32 features of a whole cloud, as `terrain_of` takes it; scale: None = the cloud's own, with
+    heights in point spacings
+    """
+    terrain = terrain_of(graph, points, camera_up, None if scale is None else scale.cell)
+    if scale is not None:
+        terrain = replace(terrain, spacing=scale.unit)
     return terrain.features(graph, points, terrain.grounds([terrain.lowest(points)]))

@@ -49,6 +49,12 @@ class Trust:
         """(C,) bool classes that look like another."""
         return self.known & ((self.look[:, None] == self.look).sum(axis=1) > 1)
 
+    @classmethod
+    def unmeasured(cls, known: np.ndarray, num_groups: int, disagreement: np.ndarray) -> Trust:
+        """Of looks that another site taught: full weight, each of the known classes (C,) bool a look of its own."""
+        errors = np.full(len(known), error_of(disagreement))
+        return cls(errors, np.ones(num_groups), np.where(known, np.arange(len(known)), -1))
+
     def describe(self) -> str:
         """In one line."""
         weights, looks = (

@@ -177,6 +177,18 @@ def flight_map(
     return f'<svg class="map" viewBox="0 0 {width:.1f} {height + 28:.1f}" role="img" aria-label="Camera positions">{"".join(parts)}</svg>'
 
 
+def count_map(counts: np.ndarray) -> str:
+    """(H, W) int numbers as a map of squares, darker for more, up to ten."""
+    side = 600 / max(counts.shape)
+    parts = [
+        f'<rect x="{column * side:.1f}" y="{row * side:.1f}" width="{side:.1f}" height="{side:.1f}" '
+        f'fill="#2a6f97" fill-opacity="{min(int(counts[row, column]), 10) / 10:g}"><title>{counts[row, column]} photos</title></rect>'
+        for row, column in np.argwhere(counts > 0)
+    ]
+    height, width = np.array(counts.shape) * side
+    return f'<svg class="map" viewBox="0 0 {width:.1f} {height:.1f}" role="img" aria-label="Photos per place">{"".join(parts)}</svg>'
+
+
 def _round_length(length: float) -> float:
     power = 10.0 ** np.floor(np.log10(length))
     return float(max(step * power for step in (1, 2, 5) if step * power <= length * 1.0001))

@@ -48,7 +48,7 @@ class ReportData:
     """Everything a report may show.
 
     cloud: the labelled cloud, else the seeds, else the bare cloud; mesh: the surface
-    views: cameras by name order; metrics: content of metrics.json; records: sidecars in the order of the
+    views: cameras by name order; metrics, check: content of metrics.json and check.json; records: sidecars in the order of the
         stages
     """
 
@@ -58,6 +58,7 @@ class ReportData:
     mesh: o3d.t.geometry.TriangleMesh | None = None
     views: list[View] = field(default_factory=list)
     metrics: dict = field(default_factory=dict)
+    check: dict = field(default_factory=dict)
     records: list[dict] = field(default_factory=list)
 
     def values(self, name: str) -> np.ndarray | None:
@@ -113,9 +114,11 @@ class ReportData:
 
 def load_report_data(scene: Scene) -> ReportData:
     """Read whatever of a scene exists; InputError for files that exist and are broken."""
-    metrics = read_json(scene.metrics) if scene.metrics.exists() else {}
+    metrics, check = (read_json(file) if file.exists() else {} for file in (scene.metrics, scene.check))
     if not isinstance(metrics, dict):
         raise InputError(f"{scene.metrics} must hold an object: run `sc3d evaluate {scene.path} --overwrite`")
+    if not isinstance(check, dict):
+        raise InputError(f"{scene.check} must hold an object: run `sc3d check {scene.path}`")
     return ReportData(
         scene=scene,
         class_table=scene.class_table() if scene.classes.exists() else None,
@@ -123,6 +126,7 @@ def load_report_data(scene: Scene) -> ReportData:
         mesh=read_mesh(scene.mesh) if scene.mesh.exists() else None,
         views=scene.model.views if scene.sparse.is_dir() else [],
         metrics=metrics,
+        check=check,
         records=_read_sidecars(scene.path),
     )
 

@@ -13,7 +13,7 @@ from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View
 from sc3d.io.images import data_uri
 from sc3d.report.data import ReportData
-from sc3d.scene.labelled_cloud import LabelledSurface
+from sc3d.scene.labelled_cloud import LabelledSurface, is_confirmed
 from sc3d.view.colors import COLORINGS, color_points
 from sc3d.view.screenshot import Style, draw_points, screenshot
 
@@ -36,9 +36,12 @@ def cloud_pictures(data: ReportData) -> dict[tuple[str, str], tuple[str, float]]
                 from_above=direction == "above", legend=False, background=BACKGROUND, max_points=_MAX_POINTS
             )
             if data.cloud is not None:
-                point_image = draw_points(data.points, None, size, style)
+                shown = is_confirmed(data.cloud)
+                point_image = draw_points(data.points[shown], None, size, style)
                 for by, colors in _colorings(data).items():
-                    painted = point_image.paint(colors, replace(style, shading=0.0 if by == "photo" else 0.6))
+                    painted = point_image.paint(
+                        colors[shown], replace(style, shading=0.0 if by == "photo" else 0.6)
+                    )
                     pictures[by, direction] = _picture(painted)
             if data.mesh is not None:
                 pictures["mesh", direction] = _picture(screenshot(data.mesh, None, size, style))

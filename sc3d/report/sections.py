@@ -10,8 +10,10 @@ from typing import Literal
 
 import numpy as np
 
+from sc3d.errors import examples
 from sc3d.io.images import data_uri, read_image
 from sc3d.report.charts import (
+    count_map,
     css_color,
     flight_map,
     formatted,
@@ -65,6 +67,7 @@ def sections(data: ReportData) -> Iterator[tuple[str, str, str]]:
     yield "certainty", "Certainty", certainty_section(data)
     yield "flight", "Flight", flight_section(data)
     yield "training", "Gaussians", training_section(data)
+    yield "check", "Before the work", check_section(data.check)
     yield "processing", "Processing", processing_section(data)
 
 
@@ -217,7 +220,7 @@ def photo_section(data: ReportData) -> str:
     chosen, rows = _choose_views(data), []
     labelled = None
     if chosen and data.label_counts is not None:
-        labelled = LabelledSurface.build(data.cloud, data.views, data.scene.mesh)
+        labelled = LabelledSurface.build(data.cloud, data.views, data.scene.surface)
     for view in chosen:
         panels = comparison(data, view, labelled)
         if len(panels) > 1:
@@ -243,6 +246,41 @@ def flight_section(data: ReportData) -> str:
     lowest, highest = centers[:, 2].min(), centers[:, 2].max()
     note = f"{_count(len(centers), 'camera')} at heights (z) of {lowest:,.1f} to {highest:,.1f} m. The line shows where each looks."
     return f'<p class="note">{note}</p>{flight_map(centers[:, :2], headings, [view.name for view in data.views], ground)}'
+
+
+def check_section(check: dict) -> str:
+    """What `sc3d check` found, and how many photos show each place. Content of other kinds is left out."""
+    if not check:
+        return ""
+    found = [finding for finding in check.get("findings") or [] if isinstance(finding, dict)]
+    items = "".join(f"<li>{_finding(finding)}</li>" for finding in found)
+    verdict = "Ready." if check.get("ready") is True else "Not ready."
+    note = f'<p class="note">{verdict} {_count(len(found), "finding")}.</p><ul>{items}</ul>'
+    coverage = check.get("coverage")
+    counts = number_grid(coverage.get("photos")) if isinstance(coverage, dict) else None
+    if counts is None:
+        return note
+    text = "How many photos show each place, from above"
+    return f'{note}<figure>{count_map(counts)}<figcaption class="note">{text}</figcaption></figure>'
+
+
+def number_grid(content: object) -> np.ndarray | None:
+    """(H, W) int of a list of lists of whole numbers of one length; None for anything else."""
+    try:
+        grid = np.array(content)
+    except ValueError:
+        return None
+    return grid if grid.ndim == 2 and grid.size and np.issubdtype(grid.dtype, np.integer) else None
+
+
+def _finding(finding: dict) -> str:
+    named = finding.get("told") or finding.get("photos")
+    names = [str(name) for name in named] if isinstance(named, list) else []
+    listed = f": {examples(names)}" if names else ""
+    kind = "strong" if finding.get("problem") is True else "span"
+    return (
+        f"<{kind}>{escape(str(finding.get('text')) + listed)}</{kind}>; {escape(str(finding.get('advice')))}"
+    )
 
 
 def training_section(data: ReportData) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,6 +17,7 @@ from sc3d.geometry.neighbors import NeighborIndex, estimate_normals, orient_norm
 from sc3d.geometry.raycast import FirstSurface, RayTarget, Surface, first_surface, nearest_points
 from sc3d.geometry.voxel_traversal import VoxelSurface
 from sc3d.io.clouds import read_cloud, read_mesh
+from sc3d.io.ply import num_triangles
 from sc3d.scene.channels import Channels
 from sc3d.scene.frame_check import check_together
 from sc3d.scene.labels import STATE_NAMES, Labels
@@ -28,6 +29,7 @@ SPACING_SAMPLE, SPACING_NEIGHBORS = 100_000, 8
 SURFACE_VOXEL = 2.5  # of the grid that blocks rays where there is no mesh, in point spacings
 # a pixel shows the label of a cloud point at most this many point spacings away from the surface that it sees
 REACH = 4.0
+UNCONFIRMED = "unconfirmed"  # attribute: 1 where one photo only shows the surface
 VOTES = "votes_"  # + class id; PLY has scalar properties only
 
 
@@ -39,6 +41,21 @@ def point_arrays(cloud: o3d.t.geometry.PointCloud, centers: np.ndarray) -> tuple
     points = cloud.point.positions.numpy().astype(np.float64)
     given = cloud.point.normals.numpy() if "normals" in cloud.point else None
     return points, unit_normals(given, points, centers, points.min(axis=0))
+
+
+def is_confirmed(cloud: o3d.t.geometry.PointCloud) -> np.ndarray:
+    """(N,) bool: points of surface that several photos confirm, as `extract` has it; all of a cloud that does
+    not say.
+    """
+    if UNCONFIRMED not in cloud.point:
+        return np.ones(len(cloud.point.positions), bool)
+    return cloud.point[UNCONFIRMED].cpu().numpy().ravel() == 0
+
+
+def confirmed_only(cloud: o3d.t.geometry.PointCloud) -> o3d.t.geometry.PointCloud:
+    """The points of `is_confirmed`."""
+    kept = is_confirmed(cloud)
+    return cloud if kept.all() else cloud.select_by_mask(o3d.core.Tensor(kept))
 
 
 def unit_normals(
@@ -72,23 +89,23 @@ def usable_normals(normals: np.ndarray) -> np.ndarray:
 
 
 def read_surface(
-    mesh: Path,
+    files: Sequence[Path],
     points: np.ndarray,
     normals: np.ndarray | None,
     origin: np.ndarray,
     kind: Literal["auto", "surfels", "voxels"] = "auto",
 ) -> RayTarget:
-    """The surface that rays hit, `Label.surface`: the mesh file if there is one and nothing else is wanted,
-    else that of the points.
+    """The surface that rays hit, `Label.surface`: the mesh and what lies beside it (`Scene.surface`) if there
+    is one and nothing else is wanted, else that of the points.
 
     points: (N, 3) float64 world; normals: (N, 3) float32 unit or None = estimated; origin: (3,) world, shift
         of the frame for float32
     """
-    if kind == "auto" and mesh.exists():
-        read = read_mesh(mesh)
-        vertices = read.vertex.positions.numpy().astype(np.float64)
-        check_together(mesh, vertices, points)
-        return Surface.from_mesh(vertices, read.triangle.indices.numpy(), origin)
+    if kind == "auto" and files[0].exists():
+        meshes = [read_mesh(path) for path in files if path == files[0] or num_triangles([path])]
+        parts = [(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy()) for mesh in meshes]
+        check_together(files[0], parts[0][0].astype(np.float64), points)
+        return Surface.from_meshes(parts, origin)
     if kind == "surfels":
         return Surface.from_cloud(points, normals, origin)
     return VoxelSurface.from_cloud(points, normals, SURFACE_VOXEL * spacing_of(points))
@@ -211,14 +228,16 @@ class LabelledSurface:
     reach: float
 
     @classmethod
-    def build(cls, cloud: o3d.t.geometry.PointCloud, views: list[View], mesh: Path) -> LabelledSurface:
-        """cloud: with `label`; views: of the scene, for the side that normals face; mesh: file of the
-        surface, voxels of the cloud if it does not exist.
+    def build(
+        cls, cloud: o3d.t.geometry.PointCloud, views: list[View], files: Sequence[Path]
+    ) -> LabelledSurface:
+        """cloud: with `label`; views: of the scene, for the side that normals face; files:
+        `Scene.surface`, voxels of the cloud if there is no mesh.
         """
         if "label" not in cloud.point:
             raise InputError("the cloud has no labels: run `sc3d label SCENE` and `sc3d propagate SCENE`")
         points, normals = point_arrays(cloud, np.array([view.center for view in views]))
-        surface = read_surface(mesh, points, normals, local_origin(views))
+        surface = read_surface(files, points, normals, local_origin(views))
         return cls(
             surface,
             NeighborIndex(points, points.min(axis=0)),

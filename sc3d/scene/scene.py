@@ -65,6 +65,16 @@ class Scene:
         return self.path / "mesh.ply"
 
     @property
+    def unconfirmed(self) -> Path:
+        """Mesh of the surface that no second photo confirms: it hides things and takes labels, no more."""
+        return self.path / "unconfirmed.ply"
+
+    @property
+    def surface(self) -> tuple[Path, Path]:
+        """All that rays hit; the second only beside the first, and neither need exist."""
+        return self.mesh, self.unconfirmed
+
+    @property
     def cloud(self) -> Path:
         return self.path / "cloud.ply"
 
@@ -127,6 +137,10 @@ class Scene:
     @property
     def metrics(self) -> Path:
         return self.path / "metrics.json"
+
+    @property
+    def check(self) -> Path:
+        return self.path / "check.json"
 
     @property
     def report(self) -> Path:

@@ -75,7 +75,7 @@ def load_refinement_inputs(scene: Scene, masks: Masks) -> RefinementInputs:
     """What refinement needs of a scene, with the default settings of `label` and `propagate`."""
     cloud = read_given_cloud(scene, None)
     points, normals = point_arrays(cloud, np.array([view.center for view in masks.views]))
-    surface = read_surface(scene.mesh, points, normals, local_origin(masks.views))
+    surface = read_surface(scene.surface, points, normals, local_origin(masks.views))
     seen = LabelledSurface(
         surface,
         NeighborIndex(points, points.min(axis=0)),

@@ -92,18 +92,23 @@ def segment_scene(
     aside.
     """
     folders = Folders(scene.masks, scene.confidence, scene.instances)
-    marker, state = scene.path / "segment.unfinished.json", _state(scene, settings, class_table)
+    marker, state = unfinished_marker(scene), _state(scene, settings, class_table)
     unfinished = claim(marker).exists()
     if unfinished and read_json(marker) == state:
         for folder in folders:
             for place in [folder, *folder.rglob("*")]:
                 remove_leftovers(place)
     else:
-        _set_aside(folders, "unfinished" if unfinished else "before")
+        set_aside(folders, "unfinished" if unfinished else "before")
     write_json(marker, state)
     summary = segment_photos(find_photos(scene.images), folders, segmenter, class_table, images=scene.images)
     marker.unlink()
     return summary
+
+
+def unfinished_marker(scene: Scene) -> Path:
+    """File that says with which settings an interrupted run had begun."""
+    return scene.path / "segment.unfinished.json"
 
 
 def _state(scene: Scene, settings: Segment, class_table: ClassTable) -> object:
@@ -113,7 +118,7 @@ def _state(scene: Scene, settings: Segment, class_table: ClassTable) -> object:
     return json.loads(json.dumps([repr(decisive), class_table.as_json(), strokes, digest(scene.images)]))
 
 
-def _set_aside(folders: Folders, suffix: str) -> None:
+def set_aside(folders: Folders, suffix: str) -> None:
     """Older masks may hold somebody's work: they become `<folder>.<suffix>`, in place of still older ones.
     Goes on where it was interrupted.
     """

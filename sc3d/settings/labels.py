@@ -16,9 +16,10 @@ from sc3d.settings.common import Resources
 class Segment:
     """2D masks for all photos."""
 
-    backend: Literal["files", "strokes", "grounded-sam", "sam3"] = "files"
-    """Where masks come from: files (--masks), a few strokes that you drew (--strokes, no model), or text
-    prompts with Grounding DINO and SAM 2 or with SAM 3.
+    backend: Literal["files", "geometry", "strokes", "grounded-sam", "sam3"] = "files"
+    """Where masks come from: files (--masks), the scene's own surface (geometry: ground, low and high
+    vegetation, building by height above the ground, shape and color; no model, nothing to draw), a few
+    strokes that you drew (--strokes, no model), or text prompts with Grounding DINO and SAM 2 or with SAM 3.
     """
     masks: Path | None = None
     """Masks made elsewhere: a folder of PNGs named like the photos, a folder of LabelMe JSONs, a COCO JSON,
@@ -42,6 +43,10 @@ class Segment:
     strokes: Path | None = None
     """Folder of strokes and polygons per class, LabelMe JSON or PNG in the colors of the class table;
     SCENE/strokes otherwise (strokes).
+    """
+    model: Path | None = None
+    """What another site's strokes taught, a file of `sc3d propagate --save-model`: no strokes are needed here
+    (strokes).
     """
     prompts: tuple[str, ...] = ()
     """Texts per class, each as NAME=text,text (grounded-sam, sam3); they replace those of classes.json."""
@@ -74,6 +79,12 @@ class Segment:
     """Compute in half precision (bfloat16; float16 on older GPUs); needs CUDA (grounded-sam, sam3)."""
     device: str = "auto"
     """torch device: auto, cpu, cuda."""
+
+    def __post_init__(self) -> None:
+        if self.model is not None and (self.backend != "strokes" or self.strokes is not None):
+            raise InputError(
+                "--model takes the place of strokes: it needs --backend strokes without --strokes"
+            )
 
 
 @dataclass(frozen=True)
@@ -135,9 +146,24 @@ class Label(Resources):
     """
     cloud: Path | None = None
     """Cloud to label, also of another program, as `sc3d import` reads it; SCENE/cloud.ply otherwise."""
+    prior: Path | None = None
+    """Cloud that another program has classified (LAZ, LAS, PLY): its points vote for the nearest ones within a
+    label voxel, by the ASPRS codes of classes.json or by a column `label` with class ids. Masks are not needed
+    then.
+    """
+    prior_weight: float = 1.0
+    """How many photos that agree a vote of --prior is worth, up to 15."""
     output: Path | None = None
     """Labelled cloud to write; SCENE/seeds.ply otherwise."""
     mechanisms: PaperMechanisms = PaperMechanisms()
+
+    def __post_init__(self) -> None:
+        if not 0 < self.prior_weight <= 15:
+            raise InputError("prior_weight must be above 0 and at most 15")
+        if self.prior is not None and self.method == "direct":
+            raise InputError(
+                "--prior has no place among photos of which the last one wins: choose another --method"
+            )
 
     @property
     def resolved(self) -> Label:
@@ -176,8 +202,22 @@ class Propagate(Resources):
     """Drop seeds that look like another class before the labels spread (knn, geometry); not in the paper."""
     seeds: Path | None = None
     """Cloud written by label; SCENE/seeds.ply otherwise."""
+    model: Path | None = None
+    """Start from what another site taught, a file of --save-model (map): where masks voted it weighs as much
+    as they do at most; without seeds.ply, the cloud of the scene is labelled by it alone.
+    """
+    save_model: Path | None = None
+    """Keep what color and relief the classes have here, and what was learned from SCENE/strokes if there are
+    any, in this file, for --model on other sites (map).
+    """
     output: Path | None = None
     """Labelled cloud to write; SCENE/labelled.ply otherwise."""
+
+    def __post_init__(self) -> None:
+        if (self.model or self.save_model) and (self.method != "map" or not self.appearance):
+            raise InputError(
+                "--model and --save-model are of color and relief: they need --method map with appearance"
+            )
 
 
 @dataclass(frozen=True)
@@ -214,7 +254,7 @@ class Evaluate(Resources):
 @dataclass(frozen=True)
 class Annotate:
     """Draw strokes and polygons per class on photos, on a page in the browser that only this machine can
-    open, and try them out.
+    open, and try them out; or (`--suggest`) answer what the places are of which the labels are least sure.
     """
 
     scene: Annotated[Positional[Path], arg(help="Scene folder with images/ and classes.json.")]
@@ -222,3 +262,11 @@ class Annotate:
     """Port to serve on; the next free one if it is taken."""
     photo: str | None = None
     """Name of the photo to show first."""
+    suggest: bool = False
+    """Ask about places of the labelled cloud, those first where an answer changes most, each outlined in the
+    photo that sees it best; answers are corrections (corrections.json), which propagate takes.
+    """
+
+    def __post_init__(self) -> None:
+        if self.suggest and self.photo is not None:
+            raise InputError("--suggest chooses the photos itself: leave --photo out")

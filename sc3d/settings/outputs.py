@@ -46,6 +46,10 @@ class Export:
     """Names of the classes to write; all otherwise (laz, clouds, splats, spz)."""
     labelled: Path | None = None
     """Labelled cloud; SCENE/labelled.ply otherwise."""
+    unconfirmed: bool = False
+    """Write points too that one photo only shows (`extract --fill`); in LAZ they are flagged synthetic (laz,
+    clouds, maps, objects).
+    """
     max_size: int = 0
     """Longest side of the masks, px; 0 = as the photo (masks)."""
     epsg: int = 0
@@ -70,6 +74,25 @@ class Export:
     """Draw buildings with right angles where that fits; --no-rectangular keeps the simplified outline
     (objects).
     """
+
+
+@dataclass(frozen=True)
+class Check:
+    """Before hours of work: blurred and badly exposed photos, wrong GPS, photos that will not register, overlap,
+    weak classes, and how long each stage will take; what to do about it. Exit status 0 = ready, 1 = not.
+    """
+
+    path: Annotated[
+        Positional[Path], arg(help="Folder of photos, or scene folder; only its check.json is written.")
+    ]
+    json: Path | None = None
+    """File for scripts to write: ready, findings, figures of every photo, coverage, classes, seconds per stage.
+    SCENE/check.json otherwise, which the report shows; none for a folder of photos.
+    """
+    reconstruct: Reconstruct = Reconstruct()
+    depth: Depth = Depth()
+    train: Train = Train()
+    extract: Extract = Extract()
 
 
 @dataclass(frozen=True)
@@ -109,6 +132,8 @@ class ViewCommand:
     """Names of the classes to show; all otherwise."""
     file: Path | None = None
     """Cloud or mesh to show; the labelled cloud, or else cloud.ply, otherwise."""
+    unconfirmed: bool = False
+    """Show points too that one photo only shows (`extract --fill`); --file shows all that it holds."""
     photo: str | None = None
     """Look through the camera of this photo; its suffix and folders may be missing where that is clear."""
     splats: bool = False
@@ -158,7 +183,9 @@ class Run:
     photos: Annotated[Positional[Path], arg(help="Folder of photos; never modified.")]
     scene: Annotated[Positional[Path], arg(help="Scene folder to write.")]
     masks: Path | None = None
-    """Masks made elsewhere; short for --segment.masks."""
+    """Masks made elsewhere; short for --segment.masks. Without any, and without --segment.backend, they are made
+    from the shape of the scene (geometry).
+    """
     confidence: Path | None = None
     """Folder of confidence maps; short for --segment.confidence."""
     classes: Path | None = None

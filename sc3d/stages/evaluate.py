@@ -15,7 +15,7 @@ from sc3d.tiling.evaluate import evaluate_scene as evaluate_scene_by_tiles
 def inputs(scene: Scene, settings: Evaluate) -> list[Input]:
     truth, labelled = settings.truth or scene.truth, settings.labelled or scene.labelled
     frames = PhotoFrames(scene.images)
-    return [scene.sparse, scene.classes, scene.masks, scene.mesh, truth, labelled, frames]
+    return [scene.sparse, scene.classes, scene.masks, *scene.surface, truth, labelled, frames]
 
 
 def outputs(scene: Scene, settings: Evaluate) -> list[Path]:

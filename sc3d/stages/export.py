@@ -31,7 +31,7 @@ def inputs(scene: Scene, settings: Export) -> list[Path]:
     return [
         scene.sparse,
         scene.classes,
-        scene.mesh,
+        *scene.surface,
         settings.labelled or scene.labelled,
         scene.gaussians,
         georeference_path(scene),

@@ -1,4 +1,4 @@
-"""gaussians.ply or depth/ + cameras + photos -> mesh.ply and cloud.ply, in the world of the cameras."""
+"""gaussians.ply or depth/ + cameras + photos -> mesh.ply, unconfirmed.ply and cloud.ply, in the world of the cameras."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def inputs(scene: Scene, settings: Extract) -> list[Path]:
 
 
 def outputs(scene: Scene, settings: Extract) -> list[Path]:
-    return [scene.cloud] if settings.method == "centers" else [scene.cloud, scene.mesh]
+    return [scene.cloud] if settings.method == "centers" else [scene.cloud, *scene.surface]
 
 
 def run(scene: Scene, settings: Extract) -> dict[str, object]:
@@ -56,6 +56,7 @@ def run(scene: Scene, settings: Extract) -> dict[str, object]:
             scene, settings, store
         )
     write_geometry(scene.mesh, _placed(surfaces.mesh, origin))
+    write_geometry(scene.unconfirmed, _placed(surfaces.unconfirmed, origin))
     write_geometry(scene.cloud, _placed(surfaces.cloud, origin))
     return _figures(surfaces, settings.crop)
 
@@ -152,10 +153,12 @@ def _figures(surfaces: Surfaces, crop: int) -> dict[str, object]:
     """What is said of a surface; crop: photos that see each of it, 0 = no matter how many."""
     told = f"{surfaces.cropped:.1%} of the area, seen by fewer than {crop} photos, is left out"
     shares = {
-        name: getattr(surfaces, name) for name in ("confirmed", "continued", "occluders", "sky", "coverage")
+        name: getattr(surfaces, name)
+        for name in ("confirmed", "continued", "occluders", "sky", "coverage", "covered")
     }
     return {
         "points": len(surfaces.cloud.point.positions),
+        "unconfirmed_points": int(surfaces.cloud.point.unconfirmed.numpy().sum()),
         "triangles": len(surfaces.mesh.triangle.indices),
         "voxel_size": round(surfaces.voxel_size, 5),
         **{name: f"{share:.1%} of the pixels" for name, share in shares.items()},

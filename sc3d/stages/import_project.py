@@ -103,6 +103,8 @@ def run(scene: Scene, settings: Import) -> dict[str, object]:
     elif project is not None:
         tell_tilt(scene)
     for geometry, _ in placed.values():
+        if geometry.triangles is not None:
+            scene.unconfirmed.unlink(missing_ok=True)  # it belongs to another mesh
         write_geometry(scene.cloud if geometry.triangles is None else scene.mesh, to_open3d(geometry))
     figures |= {"epsg": georeference.epsg if georeference else None}
     return figures | {

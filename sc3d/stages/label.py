@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from sc3d.errors import InputError
 from sc3d.georeferencing.georeference import georeference_path
 from sc3d.importers.given_cloud import cloud_in_world
 from sc3d.io.provenance import Input, PhotoFrames
@@ -21,7 +23,18 @@ def inputs(scene: Scene, settings: Label) -> list[Input]:
     cloud = [settings.cloud, georeference_path(scene)] if settings.cloud else [scene.cloud]
     frames = PhotoFrames(scene.images)
     confidence = best_confidence(scene)
-    return [scene.sparse, scene.classes, scene.masks, confidence, scene.mesh, *cloud, *splats, frames]
+    prior = [settings.prior, georeference_path(scene)] if settings.prior else []
+    return [
+        scene.sparse,
+        scene.classes,
+        scene.masks,
+        confidence,
+        *scene.surface,
+        *cloud,
+        *splats,
+        *prior,
+        frames,
+    ]
 
 
 def outputs(scene: Scene, settings: Label) -> list[Path]:
@@ -29,16 +42,31 @@ def outputs(scene: Scene, settings: Label) -> list[Path]:
 
 
 def run(scene: Scene, settings: Label) -> dict[str, object]:
-    """Fuse the masks, in memory or, where the cloud does not fit, by tiles; a cloud of another program is
+    """Fuse the masks, in memory or, where the cloud does not fit, by tiles; clouds of another program are
     brought into the world of the scene before.
     """
+    if settings.prior and settings.prior.resolve() == (settings.output or scene.seeds).resolve():
+        raise InputError(f"{settings.prior} is what label writes, and no prior: copy it, or pass --output")
     scene.warn_of_unplaced(scene.masks, *([best_confidence(scene)] if settings.use_confidence else []))
-    if settings.cloud is None:
-        return _label(scene, settings)
-    with cloud_in_world(scene, settings.cloud, settings, settings.output or scene.seeds) as cloud:
-        return _label(scene, replace(settings, cloud=cloud))
+    output = settings.output or scene.seeds
+    with ExitStack() as stack:
+        moved = settings
+        if settings.cloud is not None:
+            cloud = stack.enter_context(cloud_in_world(scene, settings.cloud, settings, output))
+            moved = replace(moved, cloud=cloud)
+        if settings.prior is not None:
+            beside = output.with_name(f"{output.name}.prior")
+            prior = stack.enter_context(cloud_in_world(scene, settings.prior, settings, beside))
+            moved = replace(moved, prior=prior)
+        return _label(scene, moved, settings.prior)
 
 
-def _label(scene: Scene, settings: Label) -> dict[str, object]:
-    label = label_scene if label_fits(scene, settings) else label_scene_by_tiles
-    return label(scene, settings).figures()
+def _label(scene: Scene, settings: Label, prior: Path | None) -> dict[str, object]:
+    if label_fits(scene, settings):
+        return label_scene(scene, settings, prior).figures()
+    if prior is not None:
+        raise InputError(
+            "--prior needs the whole cloud in memory: leave --workers out and raise --max-memory, or label a"
+            " thinner cloud"
+        )
+    return label_scene_by_tiles(scene, settings).figures()

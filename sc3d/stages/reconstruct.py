@@ -6,8 +6,10 @@ Two steps: `map_photos` takes hours and is kept; what is here brings its cameras
 from __future__ import annotations
 
 import logging
-from dataclasses import fields
+from contextlib import suppress
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any, get_args
 
 from sc3d.errors import InputError
 from sc3d.georeferencing.control_points import (
@@ -27,12 +29,14 @@ from sc3d.georeferencing.placement import make_level, place_model
 from sc3d.io.atomic import require_writable
 from sc3d.io.colmap import load_model, registered_images, write_model
 from sc3d.io.images import check_photo, num_pages
+from sc3d.io.json_files import read_json
 from sc3d.io.photo_folder import find_photos, link_photos, unused_files
 from sc3d.io.readable_photos import tell_of_transparent
-from sc3d.runner import execute
+from sc3d.runner import MAX_SIDECAR, execute, sidecar, up_to_date
 from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
-from sc3d.settings.reconstruction import Mapping, Reconstruct, ReconstructCommand
+from sc3d.settings.reconstruction import Mapping, Matching, Reconstruct, ReconstructCommand
+from sc3d.sfm import MATCH_ALL, choose_matching, num_pairs
 
 logger = logging.getLogger(__name__)
 
@@ -41,8 +45,8 @@ MIN_SIDE = 16  # px of a photo; nothing can be matched in less
 
 def main(command: ReconstructCommand) -> None:
     scene = Scene(command.scene)
-    prepare(command.photos, scene, command.reconstruct)
-    reconstruct(scene, command.reconstruct, command.overwrite)
+    settings = prepare(command.photos, scene, command.reconstruct)
+    reconstruct(scene, settings, command.overwrite)
 
 
 def reconstruct(scene: Scene, settings: Reconstruct, overwrite: bool) -> None:
@@ -57,8 +61,10 @@ def steps(settings: Reconstruct) -> list[tuple[str, Mapping]]:
     return [("map_photos", mapping), ("reconstruct", settings)]
 
 
-def prepare(photos: Path, scene: Scene, settings: Reconstruct) -> None:
-    """Check all photos and control points, then make SCENE/images a link to the folder of photos."""
+def prepare(photos: Path, scene: Scene, settings: Reconstruct) -> Reconstruct:
+    """Check all photos and control points, then make SCENE/images a link to the folder of photos. Returns the
+    settings with what --matching auto stands for, so that finished work is known as such by what was done.
+    """
     files = find_photos(photos)
     sizes = {photo_name(file, photos): check_photo(file) for file in files}
     small = [name for name, size in sizes.items() if min(size) < MIN_SIDE]
@@ -78,6 +84,40 @@ def prepare(photos: Path, scene: Scene, settings: Reconstruct) -> None:
     _check_place(photos, sizes, settings)
     require_writable(scene.path)
     link_photos(photos, scene.images)
+    finished = _finished(scene, settings)
+    return finished or replace(settings, matching=_matching(photos, list(sizes), settings))
+
+
+def _finished(scene: Scene, settings: Reconstruct) -> Reconstruct | None:
+    """The settings with the matching that the scene's cameras were made by, whatever auto would take today; None
+    if they would be made anew with it too.
+    """
+    with suppress(InputError):
+        record: Any = read_json(sidecar(scene.mapped), MAX_SIDECAR)
+        made = record.get("settings") if isinstance(record, dict) else None
+        used: Any = made.get("matching") if isinstance(made, dict) else None
+        if settings.matching == "auto" and used in get_args(Matching):
+            asked = replace(settings, matching=used)
+            return asked if up_to_date("map_photos", scene, steps(asked)[0][1]) else None
+    return None
+
+
+def _matching(photos: Path, names: list[str], settings: Reconstruct) -> Matching:
+    """Which pairs to match, told where that is not all, or where all are many."""
+    many = len(names) > MATCH_ALL
+    flight = read_flight(photos, names, quiet=True) if many and settings.gps else None
+    chosen = choose_matching(settings.matching, names, flight)
+    pairs, fewer = (int(num_pairs(len(names), matching)) for matching in (chosen, "auto"))
+    if many and settings.matching == "auto":
+        why = "all have GPS" if chosen == "spatial" else "not all have GPS"
+        logger.info(
+            "%d photos: about %d pairs are matched (--matching %s, as %s)", len(names), pairs, chosen, why
+        )
+    if many and chosen == "exhaustive":
+        logger.warning(
+            "--matching exhaustive compares %d pairs of photos; auto would compare about %d", pairs, fewer
+        )
+    return chosen
 
 
 def _tell(photos: Path, files: list[Path]) -> None:

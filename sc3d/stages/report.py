@@ -19,10 +19,11 @@ def inputs(scene: Scene, settings: Report) -> list[Path]:
         scene.sparse,
         scene.masks,
         scene.classes,
-        scene.mesh,
+        *scene.surface,
         scene.images,
         evaluated_truth(scene),
         scene.path / "train.jpg",
+        *([scene.check] if scene.check.exists() else []),  # reports of before it are up to date without
         *sorted(scene.export.glob("*.geojson")),  # not the folder: the report may be written there
         *(file for file in sidecar_files(scene.path) if not file.name.endswith(".html.json")),  # not its own
     ]

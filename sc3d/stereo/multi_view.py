@@ -33,7 +33,7 @@ from sc3d.stereo.completion import (
     without_speckles,
 )
 from sc3d.stereo.given_sky import SKY, SURFACE, GivenSky
-from sc3d.stereo.patch_match import Stereo, evaluate, sweep
+from sc3d.stereo.patch_match import WORST, Stereo, evaluate, sweep
 from sc3d.stereo.pinhole_pairs import GrayView, smaller, stacked, transfers
 from sc3d.tiling.executor import Executor
 
@@ -235,11 +235,20 @@ def _problem(job: StereoJob, number: int, row: int, geometric: bool) -> Stereo:
     if geometric:
         before = [np.load(job.file(number - 1, source))[..., :3] for source in job.sources[row]]
         others = stacked([upsampled(planes, gray.shape) for planes, gray in zip(before, grays, strict=True)])
-    far, near, nearest = job.ranges[row]
+    reference = job.gray(row).at(max(own.width, own.height)).gray
+    sources = [GrayView(view, gray) for view, gray in zip(views, grays, strict=True)]
+    return _stereo(GrayView(own, reference), sources, job.ranges[row], others)
+
+
+def _stereo(
+    reference: GrayView, sources: list[GrayView], limits: tuple[float, float, float], others: np.ndarray
+) -> Stereo:
+    """limits: as `StereoJob.ranges`; others: as `Stereo.others`"""
+    own, views, (far, near, nearest) = reference.view, [source.view for source in sources], limits
     return Stereo(
-        np.ascontiguousarray(job.gray(row).at(max(own.width, own.height)).gray),
-        stacked(grays),
-        np.array([gray.shape[::-1] for gray in grays], np.int64),
+        np.ascontiguousarray(reference.gray),
+        stacked([source.gray for source in sources]),
+        np.array([source.gray.shape[::-1] for source in sources], np.int64),
         *transfers([own] * len(views), views),
         np.float32(far),
         np.float32(nearest),
@@ -396,6 +405,36 @@ def plane_normals(view: View, planes: np.ndarray) -> np.ndarray:
     away = np.stack([a * matrix[0, 0], b * matrix[1, 1], q - a * columns - b * rows], axis=2)
     length = np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-30)
     return np.round(-127 * away / length).astype(np.int8)
+
+
+def planes_of(view: View, depth: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(H, W, 3) float32 planes of a pinhole view, the inverse of `plane_normals`; 0 where there is no depth.
+
+    depth: (H, W) z, 0 = none; normals: (H, W, 3) of any length, camera frame
+    """
+    matrix = view.matrix
+    x = (np.arange(view.width) + 0.5 - matrix[0, 2]) / matrix[0, 0]
+    y = (np.arange(view.height)[:, None] + 0.5 - matrix[1, 2]) / matrix[1, 1]
+    n = normals.astype(np.float64)
+    distance = depth * (n[..., 0] * x + n[..., 1] * y + n[..., 2])
+    known = (depth > 0) & (np.abs(distance) > 1e-12)
+    safe, z = np.where(known, distance, 1), np.where(known, depth, 1)
+    planes = np.stack([1 / z, n[..., 0] / matrix[0, 0] / safe, n[..., 1] / matrix[1, 1] / safe], axis=2)
+    return (planes * known[..., None]).astype(np.float32)
+
+
+def patch_costs(reference: GrayView, sources: list[GrayView], planes: np.ndarray) -> np.ndarray:
+    """(H, W) float32: 1 - NCC of the patches of each pixel and of the sources that its plane (H, W, 3) leads
+    to, the two best averaged (`patch_match.evaluate`); WORST without sources.
+    """
+    costs = np.full(planes.shape[:2], WORST, np.float32)
+    if sources:
+        evaluate(
+            _stereo(reference, sources, (0.0, 0.0, 0.0), np.zeros((len(sources), 0, 0, 3), np.float32)),
+            planes,
+            costs,
+        )
+    return costs
 
 
 def preview(inverse: np.ndarray) -> np.ndarray:

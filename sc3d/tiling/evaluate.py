@@ -15,6 +15,7 @@ from sc3d.geometry.cameras import View, camera_rays, local_origin, may_see
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raycast import FirstSurface, first_surface, surface_points
 from sc3d.io.chunked_clouds import CloudFile, positions
+from sc3d.io.ply import num_triangles
 from sc3d.io.provenance import PhotoFrames
 from sc3d.metrics import EvaluationSummary, judge, truth_masks
 from sc3d.scene.labelled_cloud import REACH
@@ -31,7 +32,7 @@ from sc3d.tiling.first_surfaces import (
     views_of,
 )
 from sc3d.tiling.label import sample_spacing
-from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, mesh_triangles, num_points
+from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, num_points
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
 from sc3d.tiling.work_folder import WorkFolder
 
@@ -77,14 +78,14 @@ def evaluate_fits(scene: Scene, settings: Evaluate) -> bool:
     """Whether cloud and mesh fit into memory as a whole, and nobody asked for workers."""
     path = settings.labelled or scene.labelled
     count = num_points(path) if path.exists() else None
-    return count is None or fits(count * BYTES + mesh_triangles(scene.mesh) * TRIANGLE, settings)
+    return count is None or fits(count * BYTES + num_triangles(scene.surface) * TRIANGLE, settings)
 
 
 def evaluate_scene(scene: Scene, settings: Evaluate) -> EvaluationSummary:
     """As `metrics.evaluate_scene`, tile by tile, here or on the workers that the settings ask for."""
     cloud, output = CloudFile.open(settings.labelled or scene.labelled), settings.output or scene.metrics
     labels, truth = read_labels(cloud), settings.truth or scene.truth
-    decisive = (scene.sparse, scene.classes, scene.mesh, truth, cloud.path, PhotoFrames(scene.images))
+    decisive = (scene.sparse, scene.classes, *scene.surface, truth, cloud.path, PhotoFrames(scene.images))
     folder = WorkFolder(output, "evaluate", decisive, settings)
     with open_executor(settings) as executor:
         surface = find_points(scene, settings, cloud, folder, executor)
@@ -105,7 +106,7 @@ def find_points(
     spacing, _ = sample_spacing(store, statistics)
     parts, origin = folder.subfolder("surface"), local_origin(scene.model.views)
     if scene.mesh.exists():
-        mesh = split_mesh(scene.mesh, parts, origin, memory_of(settings))
+        mesh = split_mesh(scene.surface, parts, origin, memory_of(settings))
     else:
         mesh = split_surfels(store, spacing, parts, origin)
     maps = RangeMaps(folder.subfolder("ranges"), {view.name: number for number, view in enumerate(views)})

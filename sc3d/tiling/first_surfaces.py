@@ -6,9 +6,10 @@ The minimum does not care about the order of the parts, so the ranges are those 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import chain
 from pathlib import Path
 
 import numba
@@ -19,7 +20,7 @@ from sc3d.geometry.cameras import View, camera_rays, may_see
 from sc3d.geometry.raycast import Surface, surfels
 from sc3d.io.atomic import atomic_path
 from sc3d.io.chunked_clouds import RECORDS_AT_ONCE, CloudFile, columns, positions
-from sc3d.io.ply import Property, check_ply
+from sc3d.io.ply import Property, check_ply, num_triangles
 from sc3d.scene.scene import Scene
 from sc3d.tiling.executor import Executor
 from sc3d.tiling.memory import BASE, TRIANGLE
@@ -257,12 +258,14 @@ def views_of(scene: Path) -> dict[str, View]:
     return {view.name: view for view in Scene(scene).model.views}
 
 
-def split_mesh(path: Path, folder: Path, origin: np.ndarray, memory: int) -> MeshParts:
-    """Parts of a mesh file small enough for `memory` bytes."""
-    vertices = CloudFile.open(path)
+def split_mesh(files: Sequence[Path], folder: Path, origin: np.ndarray, memory: int) -> MeshParts:
+    """Parts of `Scene.surface` small enough for `memory` bytes."""
+    given = [files[0], *(path for path in files[1:] if num_triangles([path]))]
+    share = num_triangles(files[:1]) / max(num_triangles(files), 1)
     # about two triangles for each vertex
-    grid = CloudStatistics.from_cloud(vertices).grid(max((memory - BASE) // TRIANGLE // 2, 1000))
-    return MeshParts.split(read_triangles(path), grid, folder, origin)
+    room = int((memory - BASE) / TRIANGLE / 2 * share)
+    grid = CloudStatistics.from_cloud(CloudFile.open(given[0])).grid(max(room, 1000))
+    return MeshParts.split(chain.from_iterable(map(read_triangles, given)), grid, folder, origin)
 
 
 def split_surfels(store: TileStore, spacing: float, folder: Path, origin: np.ndarray) -> MeshParts:

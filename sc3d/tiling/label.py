@@ -16,7 +16,7 @@ from sc3d.geometry.cameras import local_origin
 from sc3d.geometry.neighbors import NeighborIndex, point_spacing
 from sc3d.geometry.voxels import BLOCK, VOXELS, file_header, sort_by_voxel, unpack_blocks, voxel_origin
 from sc3d.io.chunked_clouds import CloudFile, columns, positions, rows_at_once
-from sc3d.io.ply import write_records
+from sc3d.io.ply import num_triangles, write_records
 from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.labelling.cloud import Cloud, CloudExtent
 from sc3d.labelling.fusion import Fusion, fuse
@@ -44,7 +44,7 @@ from sc3d.settings.labels import Label
 from sc3d.tiling.executor import Executor, open_executor
 from sc3d.tiling.first_surfaces import RangeJob, RangeMaps, compute_ranges, split_mesh, split_surfels
 from sc3d.tiling.label_grid_file import write_field
-from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, mesh_triangles, num_points
+from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, num_points
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
 from sc3d.tiling.work_folder import WorkFolder
 
@@ -86,7 +86,7 @@ def label_fits(scene: Scene, settings: Label) -> bool:
     count = num_points(source)
     if count is None or not source.exists():
         return True  # cannot be read in parts
-    needed = count * bytes_per_point(scene) + mesh_triangles(scene.mesh) * TRIANGLE
+    needed = count * bytes_per_point(scene) + num_triangles(scene.surface) * TRIANGLE
     return fits(needed, settings)
 
 
@@ -112,7 +112,7 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         scene.classes,
         scene.masks,
         *([confidence] if confidence else []),
-        scene.mesh,
+        *scene.surface,
         cloud.path,
         PhotoFrames(scene.images),
     ]
@@ -154,7 +154,7 @@ def _ranges(
 ) -> RangeMaps:
     origin = local_origin(masks.views)
     if scene.mesh.exists() and settings.surface == "auto":
-        mesh = split_mesh(scene.mesh, parts.subfolder("surface"), origin, memory_of(settings))
+        mesh = split_mesh(scene.surface, parts.subfolder("surface"), origin, memory_of(settings))
     elif {"nx", "ny", "nz"} <= set(store.names):
         mesh = split_surfels(store, spacing, parts.subfolder("surface"), origin)
     else:

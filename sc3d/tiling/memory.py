@@ -79,9 +79,3 @@ def num_points(path: Path) -> int | None:
         vertex = read_header(path).element("vertex")
         return vertex.rows if vertex is not None else None
     return CloudFile.open(path).num_points if kind in (".las", ".laz") else None
-
-
-def mesh_triangles(path: Path) -> int:
-    """Triangles of a mesh file, 0 if there is none."""
-    face = read_header(path).element("face") if path.is_file() else None
-    return face.rows if face is not None else 0

@@ -4,7 +4,7 @@ colors.
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.graph import MORTON_BITS, morton_codes
 from sc3d.io.clouds import read_cloud
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.labelled_cloud import VOTES, spacing_of
+from sc3d.scene.labelled_cloud import VOTES, confirmed_only, spacing_of
 from sc3d.scene.scene import Scene
 from sc3d.view.colors import COLORINGS, Coloring, can_color, color_points, shaded
 
@@ -70,7 +70,11 @@ class DisplayCloud:
         )
 
     def relabel(self, labelled: o3d.t.geometry.PointCloud) -> None:
-        """Take the labels of the same points; InputError if they are others."""
+        """Take the labels of the same points, or of more if only the confirmed ones are shown; InputError if
+        they are others.
+        """
+        if len(labelled.point.positions) > len(self.cloud.point.positions):
+            labelled = confirmed_only(labelled)
         positions, others = (one.point.positions.cpu().numpy() for one in (self.cloud, labelled))
         if positions.shape != others.shape or not np.array_equal(positions, others):
             raise InputError("the labels are of other points than those shown: open the page again")
@@ -164,23 +168,23 @@ def only_classes(cloud: o3d.t.geometry.PointCloud, ids: set[int] | None) -> o3d.
 
 
 def load_cloud(
-    scene: Scene, file: Path | None = None, votes: bool | None = False
+    scene: Scene, file: Path | None = None, votes: bool | None = False, unconfirmed: bool = True
 ) -> o3d.t.geometry.PointCloud:
     """The cloud of a file, else the best of the scene; InputError if there is none.
 
+    unconfirmed: of the scene, with what no second photo confirms
     votes: add those of seeds.ply to a cloud of the scene that has none; None = where that is possible
     """
     path = file or scene.best_cloud
     if path is None:
         raise InputError(f"{scene.path} has no cloud to show: run `sc3d extract SCENE`, or pass --file FILE")
     cloud = read_cloud(path)
-    if votes is False or can_color(cloud, "disagreement") or file is not None or not scene.seeds.exists():
+    if file is not None:
         return cloud
-    if votes:
-        return with_votes(cloud, read_cloud(scene.seeds))
-    with suppress(InputError):
-        return with_votes(cloud, read_cloud(scene.seeds))
-    return cloud
+    if votes is not False and not can_color(cloud, "disagreement") and scene.seeds.exists():
+        with nullcontext() if votes else suppress(InputError):
+            cloud = with_votes(cloud, read_cloud(scene.seeds))
+    return cloud if unconfirmed else confirmed_only(cloud)
 
 
 def with_votes(

@@ -72,8 +72,8 @@ class Inspector:
     """Looks points of one cloud up; the search tree and the surface that hides them are made when they are
     first needed.
 
-    views: photos that may have seen the points; mesh: file of the surface, surfels of the cloud if it does
-        not exist
+    views: photos that may have seen the points; surface: `Scene.surface`, surfels of the cloud if there is
+        no mesh
     voxel_size: of the labels, which is the tolerance of visibility, world units; None = 2 point spacings
     """
 
@@ -82,10 +82,10 @@ class Inspector:
         cloud: o3d.t.geometry.PointCloud,
         views: Sequence[View],
         class_table: ClassTable | None,
-        mesh: Path,
+        surface: Sequence[Path],
         voxel_size: float | None = None,
     ) -> None:
-        self.cloud, self.views, self.class_table, self._mesh = cloud, list(views), class_table, mesh
+        self.cloud, self.views, self.class_table, self._files = cloud, list(views), class_table, surface
         self._points = cloud.point.positions.cpu().numpy().astype(np.float64)
         self._given_voxel_size = voxel_size
 
@@ -96,7 +96,7 @@ class Inspector:
         with suppress(InputError, KeyError, TypeError, ValueError):
             record: Any = read_json(sidecar(scene.seeds))
             voxel_size = float(record["summary"]["voxel_size"])
-        return cls(cloud, views, table, scene.mesh, voxel_size)
+        return cls(cloud, views, table, scene.surface, voxel_size)
 
     def nearest(self, position: np.ndarray) -> int:
         """Row of the point nearest to a (3,) world position."""
@@ -175,7 +175,7 @@ class Inspector:
     def _surface(self) -> RayTarget:
         logger.info("preparing the surface, to find out which photos see a point ...")
         normals = self.cloud.point.normals.cpu().numpy() if "normals" in self.cloud.point else None
-        return read_surface(self._mesh, self._points, normals, local_origin(self.views))
+        return read_surface(self._files, self._points, normals, local_origin(self.views))
 
 
 def photos_that_see(

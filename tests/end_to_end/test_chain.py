@@ -4,9 +4,11 @@ the slow one is the acceptance size.
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sc3d.cli import main
 from sc3d.georeferencing.alignment import fit_similarity
@@ -53,18 +55,25 @@ def site(tmp_path_factory):
 def chain(site) -> list:
     """The arguments of `sc3d run` for the scene beside the site."""
     return [
-        "run",
-        site / "images",
-        site.parent / "scene",
+        *without_masks(site, site.parent / "scene"),
         *("--masks", site / "masks"),
         *("--confidence", site / "confidence"),
         *("--classes", site / "classes.json"),
         *("--truth", site / "truth"),
+        *("--log", site.parent / "file.log"),
+    ]
+
+
+def without_masks(site, scene) -> list:
+    """Those for a scene of photos alone."""
+    return [
+        "run",
+        site / "images",
+        scene,
         *("--train.iterations", 250),
         *("--train.max-size", 400),
         *("--train.max-gaussians", 40000),
         *("--extract.max-size", 400),
-        *("--log", site.parent / "file.log"),
     ]
 
 
@@ -119,6 +128,33 @@ def test_second_run_does_nothing_and_a_changed_option_reruns_what_follows(site, 
         "metrics.json",
         "report.html",
     ]
+
+
+@pytest.mark.slow
+def test_photos_alone_give_ground_trees_and_buildings(site, scene, tmp_path, caplog):
+    alone, truth = tmp_path / "scene", tmp_path / "truth"
+    shutil.copytree(scene, alone, symlinks=True)
+    for path in [*alone.glob("masks*"), *alone.glob("confidence*"), alone / "classes.json"]:
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    ids = np.arange(256, dtype=np.uint8)
+    ids[1:5] = 4, 3, 1, 1  # building, tree, road, grass of the site in the classes that are made up
+    truth.mkdir()
+    for file in (site / "truth").iterdir():
+        Image.fromarray(ids[np.array(Image.open(file))]).save(truth / file.name)
+    arguments = [*without_masks(site, alone), "--truth", truth]
+    run(*arguments)
+    assert "made from the shape of the scene" in caplog.text
+    metrics = json.loads((alone / "metrics.json").read_text())
+    assert metrics["classes"] == ["ground", "low vegetation", "high vegetation", "building"]
+    confusion = np.array(metrics["labels"]["confusion"])  # truth by row, found by column, the first none
+    right = confusion[0, 1] + confusion[0, 2] + confusion[2, 3] + confusion[3, 4]
+    assert right > 0.85 * confusion.sum()
+    before = (alone / "labelled.ply").stat().st_mtime_ns, (alone / "depth.json").stat().st_mtime_ns
+    run(*arguments)
+    assert before == ((alone / "labelled.ply").stat().st_mtime_ns, (alone / "depth.json").stat().st_mtime_ns)
 
 
 @pytest.mark.slow

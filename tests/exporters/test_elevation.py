@@ -12,7 +12,8 @@ import shapely
 from sc3d.errors import InputError
 from sc3d.exporters import elevation, height_grids, laz
 from sc3d.exporters.projected_cloud import projected_chunks
-from sc3d.exporters.terrain import ground_classes, low_objects
+from sc3d.exporters.terrain import ground_classes
+from sc3d.geometry.ground_filter import low_objects
 from sc3d.scene.class_table import OTHER, parse_classes
 from sc3d.settings.outputs import Export
 from sc3d.settings.synthesize import Synthesize

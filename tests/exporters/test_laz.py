@@ -207,3 +207,28 @@ def test_laz_in_parts_holds_what_the_whole_does(tmp_path, monkeypatch):
         for name in las.point_format.dimension_names:
             np.testing.assert_array_equal(las[name], again[name], err_msg=name)
         np.testing.assert_array_equal(las.header.offsets, again.header.offsets)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_points_that_no_second_photo_confirms_are_left_out_or_flagged(tmp_path, monkeypatch, whole):
+    if not whole:
+        monkeypatch.setattr("sc3d.exporters.projected_cloud.fits", lambda *_: False)
+    cloud = random_cloud()
+    flags = (np.arange(2000) % 3 == 0).astype(np.uint8)
+    cloud.point.unconfirmed = o3d.core.Tensor(flags[:, None])
+    scene = write_scene(tmp_path, cloud, UTM)
+    np.testing.assert_array_equal(read(scene).label, array(cloud, "label")[flags == 0])
+    assert not np.array(read(scene).synthetic).any()
+    las = read(scene, Export(unconfirmed=True))
+    np.testing.assert_array_equal(las.label, array(cloud, "label"))
+    np.testing.assert_array_equal(las.synthetic, flags)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_cloud_without_any_confirmed_point_is_refused(tmp_path, monkeypatch, whole):
+    if not whole:
+        monkeypatch.setattr("sc3d.exporters.projected_cloud.fits", lambda *_: False)
+    cloud = random_cloud(50)
+    cloud.point.unconfirmed = o3d.core.Tensor(np.ones((50, 1), np.uint8))
+    with pytest.raises(InputError, match="--unconfirmed"):
+        read(write_scene(tmp_path, cloud, UTM))

@@ -100,7 +100,9 @@ def test_mesh_and_cloud_are_cropped_and_the_area_is_told(store):
     surface, points = Surface.from_mesh(vertices, triangles, np.zeros(3)), middles(vertices, triangles)
     up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     kept = count_views(data(), store, surface, points, up, 0.1) >= 3
-    (small, fewer), share = cropped((mesh, cloud), surface, data(), store, 0.1, 3)
+    nothing = (mesh.select_faces_by_mask(o3d.core.Tensor(np.zeros(len(triangles), bool))), cloud)
+    ((small, fewer), (none, _)), share = cropped(((mesh, cloud), nothing), surface, data(), store, 0.1, 3)
+    assert not len(none.triangle.indices)
     np.testing.assert_allclose(
         middles(small.vertex.positions.numpy(), small.triangle.indices.numpy()), points[kept], atol=1e-5
     )
@@ -109,7 +111,7 @@ def test_mesh_and_cloud_are_cropped_and_the_area_is_told(store):
     counts = count_views(data(), store, surface, vertices, up, 0.1)
     np.testing.assert_array_equal(fewer.point.positions.numpy(), np.float32(vertices)[counts >= 3])
     with pytest.raises(Sc3dError, match="lower --crop"):
-        cropped((mesh, cloud), surface, data(), store, 0.1, 6)
+        cropped(((mesh, cloud), nothing), surface, data(), store, 0.1, 6)
 
 
 def test_extracted_surface_is_what_three_views_see():

@@ -47,8 +47,11 @@ class Wall:
         return fuse_views(self.data, self.store, VOXEL, fill)
 
     def seen(self, surfaces: Surfaces, row: int) -> np.ndarray:
-        mesh = surfaces.mesh
-        surface = Surface.from_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), np.zeros(3))
+        meshes = [
+            (mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy())
+            for mesh in (surfaces.mesh, surfaces.unconfirmed)
+        ]
+        surface = Surface.from_meshes([mesh for mesh in meshes if len(mesh[1])], np.zeros(3))
         return depth_of(first_surface(surface, self.data.views[row]))
 
 
@@ -129,6 +132,11 @@ def test_continued_depth_where_nobody_looks_is_added(tmp_path):
     assert not scene.seen(without, 0)[hole].all()
     np.testing.assert_allclose(scene.seen(found, 0)[hole], scene.depths[0][hole], rtol=0.02)
     assert found.confirmed == without.confirmed and found.continued > 0.001
+    points, flags = found.cloud.point.positions.numpy(), found.cloud.point.unconfirmed.numpy().ravel()
+    inside = np.abs(points[:, :2]).max(axis=1) < 1
+    assert flags[inside].all() and not flags[~inside & (np.abs(points[:, :2]).max(axis=1) > 1.2)].any()
+    middles = found.mesh.vertex.positions.numpy()[found.mesh.triangle.indices.numpy()].mean(axis=1)
+    assert (np.abs(middles[:, :2]).max(axis=1) < 0.8).mean() < 0.001  # the mesh has the hole
 
 
 def points_of(scene: Wall, row: int) -> np.ndarray:

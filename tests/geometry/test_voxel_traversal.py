@@ -404,13 +404,13 @@ def test_estimated_normals_do_for_a_cloud_without():
 def test_the_mesh_is_the_surface_unless_another_is_wanted(tmp_path):
     points = grid(-2, 2, 0.1, 1.0)
     normals, mesh = np.tile(UP, (len(points), 1)), tmp_path / "mesh.ply"
-    assert isinstance(read_surface(mesh, points, normals, np.zeros(3)), VoxelSurface)
+    assert isinstance(read_surface([mesh], points, normals, np.zeros(3)), VoxelSurface)
     box = o3d.t.geometry.TriangleMesh.create_box(4, 4, 4)
     o3d.t.io.write_triangle_mesh(str(mesh), box)
-    assert isinstance(read_surface(mesh, points, normals, np.zeros(3)), Surface)
-    assert isinstance(read_surface(mesh, points, normals, np.zeros(3), "voxels"), VoxelSurface)
+    assert isinstance(read_surface([mesh], points, normals, np.zeros(3)), Surface)
+    assert isinstance(read_surface([mesh], points, normals, np.zeros(3), "voxels"), VoxelSurface)
     for kind, height in (("auto", 4), ("surfels", 1), ("voxels", 1)):
-        distance, _ = read_surface(mesh, points, normals, np.zeros(3), kind).cast(
+        distance, _ = read_surface([mesh], points, normals, np.zeros(3), kind).cast(
             camera_at(np.array([1.03, 1.04, 9])), np.float32([[0, 0, -1]])
         )
         assert 9 - distance[0] == pytest.approx(height, abs=1e-4)

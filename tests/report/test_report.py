@@ -261,7 +261,7 @@ def test_images_decode_and_show_the_scene(page):
 def test_fused_labels_match_the_truth_in_the_photo(toy):
     data = load_report_data(toy)
     view = data.views[0]
-    labelled = LabelledSurface.build(data.cloud, data.views, toy.mesh)
+    labelled = LabelledSurface.build(data.cloud, data.views, toy.surface)
     panels = dict(comparison(data, view, labelled))
     assert list(panels) == ["photo", "given mask", "fused labels", "truth"]
     fused, truth = (decode(panels[name].split(",")[1]) for name in ("fused labels", "truth"))

@@ -452,7 +452,10 @@ def reading_runs(scene: Path) -> dict[str, tuple[str, object]]:
         "extract depth": ("extract", reconstruction.Extract(method="depth")),
         "segment masks": ("segment", labels.Segment(masks=scene / "truth")),
         "segment in place": ("segment", labels.Segment()),
+        "segment geometry": ("segment", labels.Segment(backend="geometry")),
         "label cloud": ("label", labels.Label(cloud=scene / "seeds.ply")),
+        "label prior": ("label", labels.Label(prior=scene / "seeds.ply")),
+        "propagate save": ("propagate", labels.Propagate(save_model=scene / "site.npz")),
         "label density": ("label", labels.Label(mechanisms=labels.PaperMechanisms(density=True))),
         "import cloud": ("import_project", reconstruction.Import(**own)),
         "export": ("export", outputs.Export(format=tuple(set(MODULES) - {"objects"}))),
@@ -460,8 +463,8 @@ def reading_runs(scene: Path) -> dict[str, tuple[str, object]]:
 
 
 READS = [
-    *STAGES[1:], "georeference gps", "georeference again", "depth masks", "depth sky", "extract depth", "segment masks", "segment in place", "label cloud", "label density",
-    "import cloud",
+    *STAGES[1:], "georeference gps", "georeference again", "depth masks", "depth sky", "extract depth", "segment masks", "segment in place", "segment geometry", "label cloud", "label density",
+    "label prior", "propagate save", "import cloud",
 ]  # fmt: skip
 
 

@@ -1,20 +1,28 @@
 """Masks from strokes: files, features, filter, classifier and the whole backend on painted textures."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from sklearn.ensemble import ExtraTreesClassifier
 
 from sc3d.cli import main
+from sc3d.errors import InputError
 from sc3d.scene.class_table import parse_classes
+from sc3d.scene.site_model import ModelPart, read_model, write_model
 from sc3d.segmentation.strokes.backend import Strokes, StrokesSettings, assign_folds, sample_pixels
 from sc3d.segmentation.strokes.features import pixel_features
 from sc3d.segmentation.strokes.files import NOTHING, PhotoStrokes, StrokeShape, parse_shapes, read_strokes
+from sc3d.segmentation.strokes.forest import Forest
 from sc3d.segmentation.strokes.guided_filter import fit_lines
+from sc3d.segmentation.strokes.model_file import from_part, to_part
 from sc3d.segmentation.strokes.novelty import fit_novelty
 from sc3d.segmentation.strokes.pixel_classifier import best_temperature
+from sc3d.settings.labels import Segment
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CLASSES = [
@@ -356,3 +364,43 @@ def test_distance_decides_what_is_novel():
     far = pixels + 12
     assert novelty.share(pixels).mean() < 0.05 and novelty.share(far).min() > 0.99
     assert fit_novelty(features, np.full(3000, -1)) is None
+
+
+def test_forest_as_arrays_says_what_scikit_learn_says():
+    random = np.random.default_rng(0)
+    rows = random.normal(size=(3000, 5)).astype(np.float32)
+    codes = (rows[:, 0] > 0).astype(int) + (rows[:, 1] > 0.5)
+    grown = ExtraTreesClassifier(7, min_samples_leaf=5, random_state=0).fit(rows, codes, random.random(3000))
+    forest = Forest.from_sklearn(grown)
+    asked = random.normal(size=(500, 5)).astype(np.float32)
+    assert (forest.probabilities(asked) == grown.predict_proba(asked).astype(np.float32)).all()
+    assert forest.fits(5, 3) and not forest.fits(4, 3) and not forest.fits(5, 2)
+    looping = forest.children.copy()
+    looping[0, 0] = 0
+    assert not replace(forest, children=looping).fits(5, 3)
+
+
+def test_model_makes_the_same_masks_without_a_stroke(scene, tmp_path):
+    learned = Strokes.fit(scene / "strokes", scene / "images", TABLE, QUICK)
+    write_model(scene / "site.npz", TABLE, {"strokes": to_part(learned)})
+    expected = learned.segment(photo(1))
+    read = from_part(read_model(scene / "site.npz", TABLE, "strokes"), TABLE, scene / "site.npz")
+    found = read.segment(photo(1))
+    assert (found.labels == expected.labels).all() and (found.confidence == expected.confidence).all()
+    shutil.rmtree(scene / "strokes")
+    main(["segment", str(scene), "--backend", "strokes", "--model", str(scene / "site.npz")])
+    assert (np.array(Image.open(scene / "masks" / "b.png")) == expected.labels).all()
+
+
+def test_models_of_strokes_that_are_damaged_are_refused(scene):
+    learned = Strokes.fit(scene / "strokes", scene / "images", TABLE, QUICK)
+    part = to_part(learned)
+    cut = {
+        name: part.arrays[name][:-1] for name in ("member0_layer0", "member1_children", "low", "novelty_axes")
+    }
+    wrong = {name: np.full_like(part.arrays[name], 99) for name in ("member0_feature", "codes")}
+    for name, values in [*cut.items(), *wrong.items()]:
+        with pytest.raises(InputError, match="is damaged"):
+            from_part(ModelPart(part.facts, {**part.arrays, name: values}), TABLE, scene / "site.npz")
+    with pytest.raises(InputError, match="without --strokes"):
+        Segment(backend="files", model=scene / "site.npz")

@@ -19,7 +19,7 @@ import pytest
 
 from sc3d.errors import InputError
 from sc3d.io.chunked_clouds import CloudFile
-from sc3d.io.clouds import read_cloud, write_geometry
+from sc3d.io.clouds import read_cloud, read_mesh, write_geometry
 from sc3d.io.ply import write_records
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Evaluate, Label, PaperMechanisms, Propagate
@@ -122,6 +122,21 @@ def test_without_a_mesh_the_surfels_by_tile_are_those_of_the_whole(site, small_t
     assert_same(whole, run_label(tmp_path / "bare", "tiled", surface="surfels", max_memory="2G"))
     with pytest.raises(InputError, match="surface"):
         run_label(tmp_path / "bare", "tiled", surface="voxels", max_memory="2G")
+
+
+def test_what_no_second_photo_confirms_hides_as_the_mesh_does_by_tile_and_as_a_whole(
+    site, small_tiles, tmp_path
+):
+    """The mesh cut in two files gives the labels of the one."""
+    shutil.copytree(site, tmp_path / "cut", ignore=shutil.ignore_patterns(".*"))
+    scene, mesh = Scene(tmp_path / "cut"), read_mesh(site / "mesh.ply")
+    first = np.arange(len(mesh.triangle.indices)) % 3 > 0
+    for path, chosen in zip(scene.surface, (first, ~first), strict=True):
+        write_geometry(path, mesh.select_faces_by_mask(o3d.core.Tensor(chosen)))
+    for name, options in (("whole", {}), ("tiled", {"max_memory": "2G"})):
+        assert_same(run_label(site, name), run_label(scene.path, name, **options))
+    scene.unconfirmed.unlink()
+    assert (run_label(site, "whole")["num_views"] != run_label(scene.path, "whole")["num_views"]).any()
 
 
 @pytest.mark.parametrize("options", [{}, {"rounds": 1, "color": False}, {"fill": True}])

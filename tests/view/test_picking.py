@@ -91,7 +91,7 @@ def inspector(tmp_path, **attributes: np.ndarray) -> Inspector:
     )
     o3d.t.io.write_triangle_mesh(str(tmp_path / "mesh.ply"), mesh)
     return Inspector(
-        make_cloud(points, label=labels, **attributes), views_around(), CLASSES, tmp_path / "mesh.ply", 0.1
+        make_cloud(points, label=labels, **attributes), views_around(), CLASSES, [tmp_path / "mesh.ply"], 0.1
     )
 
 
@@ -128,16 +128,16 @@ def test_nearest_is_the_nearest_at_utm_size(tmp_path):
 
 def test_missing_attributes_views_and_mesh_do_no_harm(tmp_path):
     points, _ = points_on_faces(300)
-    bare = Inspector(make_cloud(points), [], None, tmp_path / "no_mesh.ply").look_up(7)
+    bare = Inspector(make_cloud(points), [], None, [tmp_path / "no_mesh.ply"]).look_up(7)
     assert (bare.label, bare.confidence, bare.state, bare.votes, bare.photos) == (None, None, None, {}, ())
     ground = points[:300]  # no normals, no mesh: both are made from the points
-    seen = Inspector(make_cloud(ground), views_around(), None, tmp_path / "no_mesh.ply").look_up(
+    seen = Inspector(make_cloud(ground), views_around(), None, [tmp_path / "no_mesh.ply"]).look_up(
         int(np.argmin(((ground - UTM - [5, 0, 0]) ** 2).sum(axis=1)))
     )
     assert set(seen.photos) == {view.name for view in views_around()}
     from_below = View("below.jpg", views_around()[0].camera, look_at(UTM + [1, 1, -20], UTM))
     assert (
-        Inspector(make_cloud(ground), [*views_around(), from_below], None, tmp_path / "no_mesh.ply")
+        Inspector(make_cloud(ground), [*views_around(), from_below], None, [tmp_path / "no_mesh.ply"])
         .look_up(0)
         .photos.count("below.jpg")
         == 0

@@ -288,7 +288,7 @@ def test_empty_geometry_is_an_input_error():
 
 
 def test_without_display_the_window_names_the_screenshot(monkeypatch, tmp_path):
-    inspector = Inspector(full_cloud(), [], CLASSES, tmp_path / "no_mesh.ply")
+    inspector = Inspector(full_cloud(), [], CLASSES, [tmp_path / "no_mesh.ply"])
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(Sc3dError, match="--screenshot FILE"):
         show(inspector)
@@ -355,7 +355,7 @@ def test_labels_in_a_photo_match_what_the_camera_sees(tmp_path):
     cloud = make_cloud(np.c_[grid, np.zeros(len(grid))] + UTM, label=label[:, None])
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=[600, 320, 240, -0.05])
     view = View("a.jpg", camera, look_at(UTM + [0, 0, 12.0], UTM))
-    image = LabelledSurface.build(cloud, [view], tmp_path / "no_mesh.ply").see(view, (320, 240))[0]
+    image = LabelledSurface.build(cloud, [view], [tmp_path / "no_mesh.ply"]).see(view, (320, 240))[0]
     assert image.shape == (240, 320) and image.dtype == np.uint8
     border = project(view, UTM + [[2.0, 0, 0]])[0][0, 0] / 2
     row = image[120]

@@ -1,4 +1,4 @@
-"""Measurements: `python -m tools.benchmark {speed,surface,tables,fusion-speed,city} --help`."""
+"""Measurements: `python -m tools.benchmark {speed,surface,tables,fusion-speed,questions,city} --help`."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ RUNS: dict[type, tuple[str, str]] = {
     settings.BenchmarkTables: ("tables", "run_tables"),
     settings.BenchmarkFusionSpeed: ("fusion_speed", "run_fusion_speed"),
     settings.BenchmarkSurface: ("surface_page", "run_surface"),
+    settings.BenchmarkQuestions: ("questions", "run_questions"),
     settings.SynthesizeCity: ("city", "run_city"),
 }
 

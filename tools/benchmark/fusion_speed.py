@@ -102,7 +102,7 @@ def _workload(scene: Scene, masks: Masks, num_points: int) -> FusionWorkload:
     """
     read, origin = read_cloud(scene.cloud), local_origin(masks.views)
     points, normals = point_arrays(read, np.array([view.center for view in masks.views]))
-    surface, rng = read_surface(scene.mesh, points, normals, origin), np.random.default_rng(0)
+    surface, rng = read_surface(scene.surface, points, normals, origin), np.random.default_rng(0)
     colors = read.point.colors.numpy() if "colors" in read.point else np.full(points.shape, 127, np.uint8)
     spacing, rows = (
         spacing_of(points),

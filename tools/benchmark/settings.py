@@ -108,10 +108,26 @@ class BenchmarkSurface:
     """JSON file for the figures; a Markdown table is written beside it."""
 
 
+@dataclass(frozen=True)
+class BenchmarkQuestions:
+    """Measure what answers to `sc3d annotate --suggest` are worth, beside random places and the least confident ones,
+    with a simulated person, on synthetic scenes whose truth.ply is also cloud.ply, after `sc3d label`.
+    """
+
+    scenes: Annotated[Positional[tuple[Path, ...]], arg(help="Synthetic scene folders.")]
+    answers: tuple[int, ...] = (0, 5, 10, 20)
+    """Numbers of answers, rising."""
+    seed: int = 0
+    """Of the random places."""
+    output: Path | None = None
+    """JSON file for the figures; a Markdown table is written beside it."""
+
+
 Benchmark = (
     Annotated[BenchmarkSpeed, subcommand("speed")]
     | Annotated[BenchmarkTables, subcommand("tables")]
     | Annotated[BenchmarkFusionSpeed, subcommand("fusion-speed")]
     | Annotated[BenchmarkSurface, subcommand("surface")]
+    | Annotated[BenchmarkQuestions, subcommand("questions")]
     | Annotated[SynthesizeCity, subcommand("city")]
 )

@@ -120,7 +120,7 @@ def load_place(scene: Scene, every: int) -> Place:
     views, truth_files = scene.model.views, scene.mask_files(scene.truth, scene.class_table(), truth=True)
     cloud = read_cloud(scene.cloud)
     points, normals = point_arrays(cloud, np.array([view.center for view in views]))
-    surface = read_surface(scene.mesh, points, normals, local_origin(views))
+    surface = read_surface(scene.surface, points, normals, local_origin(views))
     index, reach = NeighborIndex(points, points.min(axis=0)), REACH * spacing_of(points)
     photos = [view for view in views if view.name in truth_files]
     photos = photos[:: max(1, min(every, len(photos) // FEW))]

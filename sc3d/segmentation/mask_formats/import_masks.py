@@ -36,7 +36,7 @@ def import_scene_masks(scene: Scene, settings: Segment, class_table: ClassTable)
             )
         if not scene.masks.is_dir():
             raise InputError(
-                "--masks FOLDER is needed (or --backend strokes, grounded-sam or sam3, which make masks)"
+                "--masks FOLDER is needed (or --backend geometry, strokes, grounded-sam or sam3, which make masks)"
             )
         found = scene.mask_files(scene.masks, class_table)
         scene.warn_of_unplaced(scene.masks, scene.confidence)

@@ -78,10 +78,10 @@ class Strokes:
         """classifier: of codes; novelty: of pixels unlike all strokes; label_of_code: (C,) uint8 class id of
         each code, 0 = background
         """
-        self._classifier = classifier
-        self._novelty = novelty
-        self._label_of_code = label_of_code
-        self._settings = settings
+        self.classifier = classifier
+        self.novelty = novelty
+        self.label_of_code = label_of_code
+        self.settings = settings
         self.temperature = 1.0  # below 1 sharpens probabilities, above 1 blunts them
 
     @classmethod
@@ -134,24 +134,24 @@ class Strokes:
             class or the background x 255, 0 where unsure or unlike all strokes
         """
         height, width = image.shape[:2]
-        small, fine = shrink(image, self._settings.max_size), shrink(image, _MAX_SIDE)
+        small, fine = shrink(image, self.settings.max_size), shrink(image, _MAX_SIDE)
         guide = fine.astype(np.float32) / 255
         best, total = np.zeros(guide.shape[:2], np.float32), np.zeros(guide.shape[:2], np.float32)
         labels, known = np.zeros(guide.shape[:2], np.uint8), np.zeros(guide.shape[:2], bool)
         lines = fit_lines(
             small.astype(np.float32) / 255,
             self._planes(pixel_features(small)),
-            self._settings.radius,
-            self._settings.smoothing,
+            self.settings.radius,
+            self.settings.smoothing,
         )
-        unlike = len(self._label_of_code)
-        for code, (label, line) in enumerate(zip([*self._label_of_code, 0], lines, strict=True)):
+        unlike = len(self.label_of_code)
+        for code, (label, line) in enumerate(zip([*self.label_of_code, 0], lines, strict=True)):
             weight = self._sharpened(line.apply(guide))
             labels[weight > best], known[weight > best] = label, code < unlike
             total += weight
             np.maximum(best, weight, out=best)
         sure = best / total
-        unsure = sure < self._settings.unsure
+        unsure = sure < self.settings.unsure
         labels[unsure] = 0
         confidence = np.where(known & ~unsure, np.clip(np.rint(255 * sure), 1, 255), 0).astype(np.uint8)
         return Segmentation(
@@ -163,11 +163,9 @@ class Strokes:
 
     def _planes(self, features: np.ndarray) -> np.ndarray:
         """(H, W, C + 1) float32 probabilities of the codes, and of none of them."""
-        probabilities = self._classifier.probabilities(features)
+        probabilities = self.classifier.probabilities(features)
         unknown = (
-            np.zeros(features.shape[:2], np.float32)
-            if self._novelty is None
-            else self._novelty.share(features)
+            np.zeros(features.shape[:2], np.float32) if self.novelty is None else self.novelty.share(features)
         )
         return np.concatenate([probabilities * (1 - unknown)[..., None], unknown[..., None]], axis=-1)
 
@@ -188,20 +186,20 @@ class Strokes:
         from sc3d.segmentation.strokes.pixel_classifier import best_temperature
 
         ends = np.cumsum([0, *(len(part.labels) for part in training)])
-        found, truth = [np.zeros((0, len(self._label_of_code)), np.float32)], [codes[:0]]
+        found, truth = [np.zeros((0, len(self.label_of_code)), np.float32)], [codes[:0]]
         for index in sorted(range(len(drawn)), key=lambda index: -len(training[index].labels))[
-            : self._settings.calibration_photos
+            : self.settings.calibration_photos
         ]:
             part = slice(ends[index], ends[index + 1])
-            small = shrink(read_image(drawn[index].photo, photos_folder, shown=True), self._settings.max_size)
+            small = shrink(read_image(drawn[index].photo, photos_folder, shown=True), self.settings.max_size)
             features, guide = pixel_features(small), small.astype(np.float32) / 255
             for member in np.unique(folds[part][folds[part] >= 0]):
                 pixels = training[index].pixels[folds[part] == member]
                 lines = fit_lines(
                     guide,
-                    self._classifier.probabilities(features, int(member)),
-                    self._settings.radius,
-                    self._settings.smoothing,
+                    self.classifier.probabilities(features, int(member)),
+                    self.settings.radius,
+                    self.settings.smoothing,
                 )
                 found.append(
                     np.stack(

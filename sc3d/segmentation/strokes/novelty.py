@@ -20,7 +20,7 @@ _MAX_SAMPLES = 15_000  # pixels to compare with
 
 
 @dataclass(frozen=True)
-class _FeatureSpace:
+class FeatureSpace:
     """Where distances are measured: principal components, half whitened because the first say most, and what
     they leave over.
 
@@ -48,7 +48,7 @@ class _FeatureSpace:
 class Novelty:
     """known: places of pixels under strokes; reach: distance from them up to which a pixel is known."""
 
-    space: _FeatureSpace
+    space: FeatureSpace
     known: cKDTree
     reach: float
 
@@ -84,14 +84,14 @@ def fit_novelty(features: np.ndarray, folds: np.ndarray) -> Novelty | None:
     )
 
 
-def _fit(features: np.ndarray) -> _FeatureSpace:
+def _fit(features: np.ndarray) -> FeatureSpace:
     center, scale = features.mean(axis=0), features.std(axis=0) + _UNIT
     _, sizes, axes = np.linalg.svd((features - center) / scale, full_matrices=False)
-    space = _FeatureSpace(
+    space = FeatureSpace(
         center,
         scale,
         axes[:_DIMENSIONS],
         np.sqrt(np.maximum(sizes[:_DIMENSIONS] / np.sqrt(len(features)), _UNIT)),
     )
     rest = max(float(space.place(features)[:, -1].std()), _UNIT)
-    return _FeatureSpace(space.center, space.scale, space.axes, space.sizes, rest)
+    return FeatureSpace(space.center, space.scale, space.axes, space.sizes, rest)

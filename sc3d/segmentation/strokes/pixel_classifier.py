@@ -11,10 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
 from sklearn.ensemble import ExtraTreesClassifier
+
+from sc3d.segmentation.strokes.forest import Forest
 
 _PIXELS_AT_ONCE = 1 << 17  # pixels at once
 _BATCH = 512
@@ -41,7 +44,25 @@ class Member:
     """One network and one forest, which learned from the same pixels."""
 
     network: torch.nn.Module
-    forest: ExtraTreesClassifier
+    forest: Forest
+
+    NUM_PARAMETERS: ClassVar[int] = 6  # arrays of a network
+
+    def parameters(self) -> list[np.ndarray]:
+        """Weights and offsets of the network's layers."""
+        return [values.detach().numpy() for values in self.network.parameters()]
+
+    @classmethod
+    def from_parameters(
+        cls, num_features: int, num_codes: int, layers: list[np.ndarray], forest: Forest
+    ) -> Member:
+        """The opposite of `parameters`; ValueError for arrays of other shapes."""
+        network = _network(num_features, num_codes)
+        for given, values in zip(network.parameters(), layers, strict=True):
+            if tuple(given.shape) != values.shape or not np.isfinite(values).all():
+                raise ValueError("layers")
+            given.data = torch.from_numpy(np.ascontiguousarray(values, np.float32))
+        return cls(network.eval(), forest)
 
 
 @dataclass(frozen=True)
@@ -72,7 +93,7 @@ class PixelClassifier:
         scaled = torch.from_numpy((np.clip(rows, self.low, self.high) - self.center) / self.scale)
         with torch.inference_mode():
             by_networks = sum(member.network(scaled).softmax(dim=1) for member in members).numpy()
-        by_forests = sum(member.forest.predict_proba(rows).astype(np.float32) for member in members)
+        by_forests = sum(member.forest.probabilities(rows) for member in members)
         return (by_networks + by_forests) / (2 * len(members))
 
 
@@ -99,7 +120,8 @@ def train(samples: Samples, num_members: int, num_trees: int, num_steps: int, se
             max_features="sqrt",
             random_state=seed + index,
         )
-        members.append(Member(network, forest.fit(samples.features[used], codes, weights)))
+        grown = Forest.from_sklearn(forest.fit(samples.features[used], codes, weights))
+        members.append(Member(network, grown))
     return PixelClassifier(tuple(members), low, high, center, scale)
 
 

@@ -19,9 +19,9 @@ from sc3d.runner import sidecar
 from sc3d.scene.corrections import Balls, Corrections, add_correction, redo, undo
 from sc3d.scene.labelled_cloud import read_labelled
 from sc3d.scene.scene import Scene
+from sc3d.scene.selection import balls_around, region_around, seen_in_lasso
 from sc3d.settings.labels import Propagate
 from sc3d.view.picking import point_on_ray
-from sc3d.view.selection import balls_around, region_around, seen_in_lasso
 from sc3d.view.web.panel import Page, ShowPanel
 
 if TYPE_CHECKING:
@@ -223,7 +223,8 @@ def made_with(scene: Scene) -> Propagate:
     """The settings of `labelled.ply`, as far as the record beside it has them."""
     record: Any = read_json(sidecar(scene.labelled)) if sidecar(scene.labelled).exists() else {}
     known = record.get("settings", {}) if isinstance(record, dict) else {}
-    names = [field.name for field in fields(Propagate) if field.name not in ("seeds", "output")]
+    paths = ("seeds", "model")  # what it also wrote is not written again
+    names = {field.name for field in fields(Propagate)} - {*paths, "output", "save_model"}
     settings = {name: known[name] for name in names if isinstance(known.get(name), str | int | float)}
-    seeds = known.get("seeds")
-    return Propagate(**settings, seeds=scene.path / seeds if isinstance(seeds, str) else None)
+    given = {name: scene.path / known[name] for name in paths if isinstance(known.get(name), str)}
+    return Propagate(**settings, **given)

@@ -331,7 +331,7 @@ def test_file_opens_from_disk_and_sorts_splats_by_depth(scene, browser, tmp_path
     splats = two_layers(scene.class_table())
     view = WebView(
         scene,
-        Inspector(splats.centers(), scene.model.views, scene.class_table(), scene.mesh),
+        Inspector(splats.centers(), scene.model.views, scene.class_table(), scene.surface),
         lambda: splats,
         splats_first=True,
         cameras=False,

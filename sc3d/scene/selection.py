@@ -17,6 +17,7 @@ HOLE = 2.0  # width of a gap between points through which nothing is seen, point
 STEEP = 3.0  # rise of a surface over that width up to which all of it is seen
 NARROWEST = 0.2  # cosine between the middle of a lasso and its corners
 SIZES = 8  # of balls, each twice as large as the one before
+LEVELS, CLOSEST = 5, 1 / 16  # sizes of balls that hold no other points; the smallest, point spacings
 HALF_DIAGONAL = 0.88  # of a cube, and a little for rounding
 
 
@@ -113,4 +114,21 @@ def balls_around(points: np.ndarray, chosen: np.ndarray, spacing: float) -> Ball
         left = left[~free[cell.ravel()]]
         if not len(left):
             break
+    return Balls(tuple(groups))
+
+
+def balls_within(points: np.ndarray, chosen: np.ndarray, spacing: float) -> Balls:
+    """Balls around the chosen points that hold no other: as large as the spacing where none is near, smaller beside
+    others; a point that lies closer to another than `CLOSEST` spacings takes it along.
+
+    points: (N, 3) float64 world; chosen: (R,) rows of them, R >= 1; spacing: between points
+    """
+    centers, others = points[chosen], np.delete(points, chosen, axis=0)
+    distance = cKDTree(others).query(centers)[0] if len(others) else np.full(len(chosen), np.inf)
+    digits, groups = int(np.ceil(-np.log10(CLOSEST * spacing))) + 2, []
+    radii = [spacing * 0.5**level for level in range(LEVELS)]
+    level = np.searchsorted(-np.array(radii), -distance, side="right").clip(0, LEVELS - 1)
+    for row, radius in enumerate(radii):
+        inside = centers[level == row]
+        groups += [(np.round(inside, digits), float(radius))] if len(inside) else []
     return Balls(tuple(groups))

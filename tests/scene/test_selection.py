@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sc3d.errors import InputError
-from sc3d.view import selection
-from sc3d.view.selection import balls_around, region_around, seen_in_lasso
+from sc3d.scene import selection
+from sc3d.scene.selection import balls_around, balls_within, region_around, seen_in_lasso
 
 FAR = np.array([5e5, 4.2e6, 100.0])  # UTM
 
@@ -75,3 +75,14 @@ def test_what_is_too_ragged_for_balls_is_refused(monkeypatch):
     with pytest.raises(InputError, match="too ragged"):
         balls_around(points, np.arange(0, len(points), 2), 0.1)
     assert balls_around(points, np.arange(len(points)), 0.1).contain(points).all()
+
+
+def test_balls_within_hold_no_other_point():
+    points = np.random.default_rng(3).uniform(0, 10, (3000, 3))
+    chosen = np.flatnonzero((points[:, 0] < 5) & (points[:, 1] < 7))
+    held = np.flatnonzero(balls_within(points, chosen, 0.4).contain(points))
+    assert set(chosen) <= set(held)
+    near = np.linalg.norm(points[:, None] - points[chosen][None], axis=2).min(axis=1)
+    assert (near[np.setdiff1d(held, chosen)] <= 0.4 / 16 * 1.01).all()
+    nearby = points[chosen] + 0.4 / 40  # of another cloud
+    assert balls_within(points, chosen, 0.4).contain(nearby).mean() > 0.95

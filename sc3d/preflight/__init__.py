@@ -1,0 +1,1 @@
+"""What photos, positions, cameras and masks are worth, before hours of work: small pictures, seconds."""
