@@ -23,7 +23,7 @@ from sc3d.propagation.labelled_points import MIN_EXAMPLES, LabelledPoints
 from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.terrain import relief_features
 from sc3d.propagation.trust import BINS, Trust, bins_of, measure_trust
-from sc3d.propagation.vote_evidence import count_disagreement, one_view_evidence, softmax
+from sc3d.propagation.vote_evidence import count_disagreement, one_view_evidence, softmax, vote_shares
 from sc3d.settings.labels import Propagate
 
 COLOR_BINS, RELIEF_BINS = 24, 12  # per feature; 24^3 and 12^4 cells
@@ -81,6 +81,11 @@ class Histogram:
         )
         return np.log(smoothed / smoothed.sum(axis=1, keepdims=True))
 
+    def likelihood(self, counts: np.ndarray) -> np.ndarray:
+        """(cells, C) float32 log-likelihood of each class, up to a number per cell, from the counts (cells, C)."""
+        shares = np.log(np.maximum(counts.sum(axis=0), 1) / max(counts.sum(), 1))
+        return (self.table(counts) - shares).astype(np.float32)
+
 
 def edges_of(counts: list[QuantileSketch], bins: int) -> list[np.ndarray]:
     """Inner borders of `bins` bins per feature, its quantiles over all points, so that unit and scale do not
@@ -107,11 +112,12 @@ class AppearanceModel:
         """The same for a part of a cloud; counts: `feature_counts` of the whole."""
         known = relief.shape[1]
         groups = (Histogram.from_features(relief, edges_of(counts[:known], RELIEF_BINS), RELIEF_BLUR),)
-        return cls(
-            groups
-            if colors is None
-            else (Histogram.from_features(colors, edges_of(counts[known:], COLOR_BINS), COLOR_BLUR), *groups)
-        )
+        if colors is not None:
+            groups = (
+                Histogram.from_features(colors, edges_of(counts[known:], COLOR_BINS), COLOR_BLUR),
+                *groups,
+            )
+        return cls(groups)
 
     def statistics(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> AppearanceStatistics:
         """What the examples (N,) bool of label (N,) uint8 teach."""
@@ -125,10 +131,8 @@ class AppearanceModel:
         """Per group, (cells, C) float32 log-likelihood of each class, up to a number per cell; known: (C,)
         bool classes to look at.
         """
-        counts = np.where(known, statistics[0].sum(axis=0), 0)
-        shares = np.log(np.maximum(counts, 1) / max(counts.sum(), 1))
         return [
-            (group.table(examples * known) - shares).astype(np.float32)
+            group.likelihood(examples * known)
             for group, examples in zip(self.groups, statistics, strict=True)
         ]
 
@@ -151,32 +155,33 @@ class AppearanceModel:
         return result
 
     def log_likelihood(
-        self, statistics: AppearanceStatistics, trust: Trust, label: np.ndarray
+        self, statistics: AppearanceStatistics, trust: Trust, shares: np.ndarray
     ) -> np.ndarray | None:
         """(N, C) float32 log-probability of the classes as color and relief see them; None where no two
         looks are known.
 
-        label: (N,) uint8. Points of a class whose look is not known get zeros: the model does not
-            contradict what it does not know.
+        shares: (N, C) of the votes of each point. The more of them name classes whose look is not known, the
+            less the model says: it does not contradict what it does not know.
         """
         if not tells_apart(statistics, trust):
             return None
         counts, known = statistics[0].sum(axis=0), known_looks(statistics, trust)
-        result, tables = np.zeros((len(label), len(counts)), np.float32), self.tables(statistics, known)
+        result, tables = np.zeros((len(shares), len(counts)), np.float32), self.tables(statistics, known)
         for look in np.unique(trust.look[known]):
             members = np.flatnonzero(known & (trust.look == look))
             number = counts[members].sum()
             # of classes that look alike none is likelier beforehand
-            rating = np.full(len(label), np.log(number / len(members) / counts[known].sum()), np.float32)
-            for group, table, weight in zip(self.groups, tables, trust.weights, strict=True):
+            rating = np.full(len(shares), np.log(number / len(members) / counts[known].sum()), np.float32)
+            for group, table in zip(self.groups, tables, strict=True):
                 mixed = np.logaddexp.reduce(table[:, members] + np.log(counts[members] / number), axis=1)
-                rating += (weight * mixed).astype(np.float32)[group.cell]
+                rating += mixed.astype(np.float32)[group.cell]
             result[:, members] = rating[:, None]
         result[:, ~known] = -np.inf
         result -= np.logaddexp.reduce(result, axis=1, keepdims=True)
         result[:, ~known] = UNKNOWN
-        result[np.append(False, ~known)[label]] = 0
-        return np.maximum(result, np.float32(np.log(1e-4)), out=result)
+        np.maximum(result, np.float32(np.log(1e-4)), out=result)
+        result *= 1 - shares[:, ~known].sum(axis=1, keepdims=True)
+        return result
 
 
 def known_looks(statistics: AppearanceStatistics, trust: Trust) -> np.ndarray:
@@ -290,9 +295,9 @@ class LearnedAppearance:
     statistics: AppearanceStatistics
     trust: Trust
 
-    def log_likelihood(self, label: np.ndarray) -> np.ndarray | None:
+    def log_likelihood(self, known: LabelledPoints) -> np.ndarray | None:
         """As `AppearanceModel.log_likelihood`."""
-        return self.model.log_likelihood(self.statistics, self.trust, label)
+        return self.model.log_likelihood(self.statistics, self.trust, vote_shares(known))
 
 
 def learn_appearance(graph: Graph, known: LabelledPoints) -> LearnedAppearance | None:
@@ -311,5 +316,5 @@ def learn_appearance(graph: Graph, known: LabelledPoints) -> LearnedAppearance |
 
 def plausible(known: LabelledPoints, appearance: LearnedAppearance) -> np.ndarray:
     """(N,) uint8 seeds that look like their class, or of which too many would go."""
-    kept = plausible_seeds(known, appearance.log_likelihood(known.seed_labels), appearance.trust)
+    kept = plausible_seeds(known, appearance.log_likelihood(known), appearance.trust)
     return limited(known, kept, overruled(count_overruled(known, kept), appearance.trust))

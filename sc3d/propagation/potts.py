@@ -54,9 +54,9 @@ def learning_marginals(
     """`appearance_marginals` of the last round; what the appearance teaches is learned again from each round's
     result. None if it knows no two looks.
     """
-    found, label = None, known.seed_labels
+    found = None
     for _ in range(max(settings.rounds, 1)):
-        rating = appearance.log_likelihood(label)
+        rating = appearance.log_likelihood(known)
         if rating is None:
             break  # too little is sure; what was learned before stands
         found = appearance_marginals(graph, known, offered, rating, appearance.trust, settings)

@@ -164,7 +164,7 @@ class SavedAppearance:
         own = AppearanceModel(tuple(groups)).statistics(known.seed_labels, known.agreed, known.num_classes)
         model = SeededModel(tuple(groups), _no_heavier(given, own))
         statistics = model.with_prior(own)
-        trust = Trust.unmeasured(statistics[0].sum(axis=0) >= MIN_EXAMPLES, len(groups), count_disagreement(known))
+        trust = Trust.unmeasured(statistics[0].sum(axis=0) >= MIN_EXAMPLES, count_disagreement(known))
         return LearnedAppearance(model, statistics, trust)
 
 

@@ -1,8 +1,7 @@
 """How far looks and votes are believed, as measured in each scene.
 
 Looks are judged on blocks of space that they were not learned from, class against class: two classes that they do
-not tell apart share one look and are left to the votes; color and relief are weighted so that the held-out points are
-likeliest. Votes are judged by how often views disagree, and, where all views err together, by the looks: if part of
+not tell apart share one look and are left to the votes. Votes are judged by how often views disagree, and, where all views err together, by the looks: if part of
 the points voted k are in truth c, their looks are a mixture. The share of c in it is at most the smallest ratio of
 the two densities (mixture proportion estimation: Blanchard, Lee, Scott, JMLR 11, 2010). As a class may look in part
 like another one, that counts only as far as color and relief, which hardly depend on one another within a class,
@@ -12,6 +11,7 @@ both say c of the same points.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -19,24 +19,21 @@ from sc3d.propagation.vote_evidence import error_of
 
 # of the log-ratio of two classes' densities, per group of features; beyond: the last bin
 BINS, REACH = 17, 6.0
-MIN_SKILL = 0.25  # share of the errors of guessing that looks must avoid on points held out, of two classes alike in number
+MIN_SKILL = 0.5  # share of the errors of guessing that looks must avoid on points held out, of two classes alike in number
 MIN_GAP = 0.25  # between the rates at which color, or relief, says c of points voted c and of points voted k
 TAIL = 0.1  # densities are compared on at least this share of a class's points
 MAX_ERROR = 0.5  # of a class's votes: believed no less than not at all
-WEIGHTS = np.linspace(0.0, 1.0, 11)  # tried for each group of features
 
 
 @dataclass(frozen=True)
 class Trust:
     """What was measured, of C classes.
 
-    errors: (C,) share of the views' votes for each class that are wrong; weights: (G,) of the groups of features, 1 = as if their
-        log-likelihoods were right; look: (C,) int, the same for classes that are not told apart, -1 = left
-        to the votes
+    errors: (C,) share of the views' votes for each class that are wrong; look: (C,) int, the same for classes that are
+        not told apart, -1 = left to the votes
     """
 
     errors: np.ndarray
-    weights: np.ndarray
     look: np.ndarray
 
     @property
@@ -50,18 +47,18 @@ class Trust:
         return self.known & ((self.look[:, None] == self.look).sum(axis=1) > 1)
 
     @classmethod
-    def unmeasured(cls, known: np.ndarray, num_groups: int, disagreement: np.ndarray) -> Trust:
-        """Of looks that another site taught: full weight, each of the known classes (C,) bool a look of its own."""
-        errors = np.full(len(known), error_of(disagreement))
-        return cls(errors, np.ones(num_groups), np.where(known, np.arange(len(known)), -1))
+    def unmeasured(cls, known: np.ndarray, disagreement: np.ndarray) -> Trust:
+        """Of looks that another site taught: each of the known classes (C,) bool has its own."""
+        return cls(np.full(len(known), error_of(disagreement)), np.where(known, np.arange(len(known)), -1))
 
     def describe(self) -> str:
         """In one line."""
-        weights, looks = (
-            ", ".join(f"{weight:.1f}" for weight in self.weights),
-            len(np.unique(self.look[self.known])),
+        looks = len(np.unique(self.look[self.known]))
+        low, high = 100 * self.errors.min(), 100 * self.errors.max()
+        return (
+            f"{looks} looks of {len(self.look)} classes told apart; {low:.1f} to {high:.1f} % of the votes for a"
+            " class are taken to be wrong"
         )
-        return f"{looks} looks of {self.known.sum()} classes told apart, weights {weights}; {100 * self.errors.min():.1f} to {100 * self.errors.max():.1f} % of the votes for a class are wrong"
 
     def without(self, classes: np.ndarray) -> Trust:
         """classes: (C,) bool, to be left to the votes."""
@@ -79,18 +76,36 @@ def measure_trust(contrasts: np.ndarray, known: np.ndarray, disagreement: np.nda
     contrasts: (C, C, BINS per group) of `AppearanceModel.contrasts`; known: (C,) bool classes with enough
         examples; disagreement: of `count_disagreement`
     """
-    error, ids = error_of(disagreement), np.flatnonzero(known).tolist()
-    pairs = [(first, second) for first in ids for second in ids if second < first]
-    weights = _fit_weights(contrasts, pairs, error)
-    alike = [pair for pair in pairs if _skill(contrasts, pair, weights) < MIN_SKILL]
-    look = np.where(known, np.arange(len(known)), -1)
-    for first, second in alike:
-        look[look == look[first]] = look[second]
-    if len(np.unique(look[known])) < 2:
+    alike = np.zeros((len(known), len(known)), bool)
+    for first, second in combinations(np.flatnonzero(known).tolist(), 2):
+        alike[first, second] = alike[second, first] = _skill(contrasts, (first, second)) < MIN_SKILL
+    look = looks_of(alike, known)
+    if len(np.unique(look[look >= 0])) < 2:
         return None
-    apart = [pair for pair in pairs if pair not in alike]
-    weights = _fit_weights(contrasts, apart, error)
-    return Trust(np.maximum(error, _shared_errors(contrasts, apart, weights)), weights, look)
+    pairs = combinations(np.flatnonzero(look >= 0).tolist(), 2)
+    apart = [pair for pair in pairs if look[pair[0]] != look[pair[1]]]
+    return Trust(np.maximum(error_of(disagreement), _shared_errors(contrasts, apart)), look)
+
+
+def looks_of(alike: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """(C,) int as `Trust.look`; alike: (C, C) bool pairs that are not told apart; known: (C,) bool
+
+    Classes that are all alike share a look. A class that is like two which are told apart has none: it would join
+    what can be told.
+    """
+    alike = alike.copy()
+    look = np.where(known, np.arange(len(known)), -1)
+    while True:
+        between = (~alike & ~np.eye(len(alike), dtype=bool)).astype(int)
+        torn = np.einsum("ab,ac,bc->a", alike.astype(int), alike.astype(int), between)
+        if not torn.any():
+            break
+        worst = int(torn.argmax())
+        look[worst] = -1
+        alike[worst] = alike[:, worst] = False
+    for first, second in np.argwhere(np.triu(alike)).tolist():
+        look[second] = look[first]
+    return look
 
 
 def _shares(contrasts: np.ndarray, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -99,52 +114,36 @@ def _shares(contrasts: np.ndarray, pair: tuple[int, int]) -> tuple[np.ndarray, n
     return own / max(own.sum(), 1), other / max(other.sum(), 1)
 
 
-def _scores(weights: np.ndarray) -> np.ndarray:
-    """Weighted log-ratio of each bin."""
+def _scores(groups: int) -> np.ndarray:
+    """Log-ratio of each bin, of as many groups of features."""
     centers = np.linspace(-REACH, REACH, BINS)
-    return sum(np.ix_(*(weight * centers for weight in weights)))  # type: ignore[return-value]
+    return sum(np.ix_(*[centers] * groups))  # type: ignore[return-value]
 
 
-def _skill(contrasts: np.ndarray, pair: tuple[int, int], weights: np.ndarray) -> float:
+def _skill(contrasts: np.ndarray, pair: tuple[int, int]) -> float:
     """Balanced accuracy over chance, at most 1, on points held out."""
     own, other = _shares(contrasts, pair)
-    return float(((other - own) * np.sign(np.round(_scores(weights), 9))).sum() / 2)
+    return float(((other - own) * np.sign(np.round(_scores(contrasts.ndim - 2), 9))).sum() / 2)
 
 
-def _fit_weights(contrasts: np.ndarray, pairs: list[tuple[int, int]], error: float) -> np.ndarray:
-    """Weights of the groups under which the held-out points of all pairs are likeliest, if the share `error` of
-    them has the label of the other class.
-    """
-    groups = contrasts.ndim - 2
-    options = np.stack(np.meshgrid(*[WEIGHTS] * groups, indexing="ij"), axis=-1).reshape(-1, groups)
-    losses = np.zeros(len(options))
-    for number, score in enumerate(map(_scores, options)):
-        for first, second in (order for pair in pairs for order in (pair, pair[::-1])):
-            counts = contrasts[first, second]
-            odds = np.log((contrasts[second, first].sum() + 1) / (counts.sum() + 1))
-            right = 1 / (1 + np.exp(score + odds))
-            losses[number] -= (counts * np.log(error + (1 - 2 * error) * right)).sum()
-    return options[int(np.argmin(losses))]
-
-
-def _shared_errors(contrasts: np.ndarray, pairs: list[tuple[int, int]], weights: np.ndarray) -> np.ndarray:
+def _shared_errors(contrasts: np.ndarray, pairs: list[tuple[int, int]]) -> np.ndarray:
     """(C,) shares of the votes for each class that all views get wrong together: of each pair, what both the
     densities and the joint answers of color and relief allow.
     """
     result = np.zeros(len(contrasts))
     for own, other in (order for pair in pairs for order in (pair, pair[::-1])):
-        share = min(_corroborated(contrasts, (own, other)), _largest_share(contrasts, (own, other), weights))
+        share = min(_corroborated(contrasts, (own, other)), _largest_share(contrasts, (own, other)))
         # to half an octave: no better is known, and noise in the last bits of the features changes nothing
         result[own] += 2.0 ** (np.rint(2 * np.log2(share)) / 2) if share > 0 else 0
     return np.minimum(result, MAX_ERROR)
 
 
-def _largest_share(contrasts: np.ndarray, pair: tuple[int, int], weights: np.ndarray) -> float:
+def _largest_share(contrasts: np.ndarray, pair: tuple[int, int]) -> float:
     """Largest share of c among points voted k, pair (k, c), that their looks allow: the smallest ratio of the two
     densities (mixture proportion estimation: Blanchard, Lee, Scott, JMLR 11, 2010).
     """
     voted, other = _shares(contrasts, pair)
-    order = np.argsort(-_scores(weights), axis=None, kind="stable")
+    order = np.argsort(-_scores(contrasts.ndim - 2), axis=None, kind="stable")
     voted, other = np.cumsum(voted.ravel()[order]), np.cumsum(other.ravel()[order])
     enough = other >= TAIL
     return float(np.min(voted[enough] / other[enough], initial=1.0))
