@@ -23,11 +23,11 @@ from sc3d.propagation.appearance import (
     RELIEF_BLUR,
     AppearanceModel,
     AppearanceStatistics,
-    Histogram,
     LearnedAppearance,
     edges_of,
     feature_counts,
 )
+from sc3d.propagation.histogram import Histogram
 from sc3d.propagation.labelled_points import MIN_EXAMPLES, LabelledPoints
 from sc3d.propagation.terrain import NUM_FEATURES, Scale, relief_features, terrain_of
 from sc3d.propagation.trust import Trust

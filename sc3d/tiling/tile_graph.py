@@ -18,8 +18,8 @@ from sc3d.propagation.appearance import (
     RELIEF_BINS,
     RELIEF_BLUR,
     AppearanceModel,
-    Histogram,
 )
+from sc3d.propagation.histogram import Histogram
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
 from sc3d.propagation.none_evidence import NoneRates
 from sc3d.propagation.propagate import seeds_in_channels
