@@ -15,7 +15,7 @@ from sc3d.exporters.packages import load
 from sc3d.exporters.polygonize import orthogonalized, polygonize, simplified
 from sc3d.exporters.projected_cloud import ProjectedCloud, find_projection, read_projected_cloud
 from sc3d.exporters.regions import cells_by_number
-from sc3d.exporters.terrain import ground_classes, ground_height, tree_codes
+from sc3d.exporters.terrain import ground_height
 from sc3d.exporters.trees import MIN_CROWN, canopy_height, split_crowns
 from sc3d.exporters.vector_files import Feature, has_geopackage, write_geojson, write_geopackage
 from sc3d.geometry.raster import Raster, spacing_of_all
@@ -158,7 +158,7 @@ def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
     labels: (N,) uint8 class ids
     """
     codes = {entry.id: entry.asprs for entry in table}
-    trees = tree_codes(table)
+    trees = table.tree_codes
     if BUILDING not in codes.values() and not trees & set(codes.values()):
         raise InputError(
             'no class has the ASPRS code of buildings (6) or vegetation (3 to 5): add "asprs" to the classes in classes.json'
@@ -168,7 +168,7 @@ def split_kinds(labels: np.ndarray, table: ClassTable) -> Kinds:
         return np.isin(labels, [label for label, code in codes.items() if code in wanted])
 
     building, tree = having({BUILDING}), having(trees)
-    ground = np.isin(labels, ground_classes(table))
+    ground = np.isin(labels, table.ground_classes)
     if not ground.any():
         ground = (labels > 0) & ~building & ~tree & ~having(set(NOISE))
     if not ground.any():

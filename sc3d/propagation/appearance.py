@@ -20,6 +20,7 @@ import numpy as np
 from sc3d.geometry.graph import Graph
 from sc3d.propagation.histogram import Histogram
 from sc3d.propagation.labelled_points import MIN_EXAMPLES, LabelledPoints
+from sc3d.propagation.misplaced import Misplaced, count_sides
 from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.terrain import relief_features
 from sc3d.propagation.trust import BINS, Trust, bins_of, measure_trust
@@ -32,7 +33,7 @@ UNKNOWN = np.log(0.05)  # their probability of a class they do not know
 MIN_HALF = 100  # examples of a class in each half of space, so that they can be judged by one another
 FOLD_BLOCKS = 8  # blocks along the longest side of the cloud; every other one is held out, as on a chessboard
 IMPLAUSIBLE = 0.5  # a seed whose class is less likely is a conflict
-MAX_OVERRULED = 0.5  # share of a class's seeds that many views agree on that looks may overrule
+MAX_OVERRULED = 0.9  # share of a class's seeds that many views agree on that looks may overrule
 
 logger = logging.getLogger(__name__)
 
@@ -64,13 +65,12 @@ class AppearanceModel:
     ) -> AppearanceModel:
         """The same for a part of a cloud; counts: `feature_counts` of the whole."""
         known = relief.shape[1]
-        groups = (Histogram.from_features(relief, edges_of(counts[:known], RELIEF_BINS), RELIEF_BLUR),)
+        groups = [Histogram.from_features(relief, edges_of(counts[:known], RELIEF_BINS), RELIEF_BLUR)]
         if colors is not None:
-            groups = (
-                Histogram.from_features(colors, edges_of(counts[known:], COLOR_BINS), COLOR_BLUR),
-                *groups,
+            groups.insert(
+                0, Histogram.from_features(colors, edges_of(counts[known:], COLOR_BINS), COLOR_BLUR)
             )
-        return cls(groups)
+        return cls(tuple(groups))
 
     def statistics(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> AppearanceStatistics:
         """What the examples (N,) bool of label (N,) uint8 teach."""
@@ -253,18 +253,30 @@ class LearnedAppearance:
         return self.model.log_likelihood(self.statistics, self.trust, vote_shares(known))
 
 
-def learn_appearance(graph: Graph, known: LabelledPoints) -> LearnedAppearance | None:
-    """Color and relief of the classes from the agreed points, if that tells classes apart on agreed points
-    that it has not seen.
+def learn_appearance(graph: Graph, known: LabelledPoints) -> tuple[LabelledPoints, LearnedAppearance | None]:
+    """What is known without `Misplaced` votes, and color and relief of the classes from the agreed points, if that
+    tells classes apart on agreed points that it has not seen.
 
     known: in the order of the graph
     """
     model = AppearanceModel.from_features(relief_features(graph, known.points, known.up), known.colors)
-    start, examples = known.seed_labels, known.agreed
     folds = folds_of(known.points, known.points.min(axis=0), known.points.max(axis=0))
+    if known.levels is not None and known.votes is not None:
+        known = _placed(model.groups[-1], known, folds, known.levels)
+    start, examples = known.seed_labels, known.agreed
     halves = [model.statistics(start, examples & (folds == fold), known.num_classes) for fold in (0, 1)]
     trust = trust_of(halves, held_out(model, halves, start, examples, folds), count_disagreement(known))
-    return None if trust is None else LearnedAppearance(model, sum_statistics(halves), trust)
+    return known, None if trust is None else LearnedAppearance(model, sum_statistics(halves), trust)
+
+
+def _placed(
+    relief: Histogram, known: LabelledPoints, folds: np.ndarray, levels: np.ndarray
+) -> LabelledPoints:
+    start, examples = known.seed_labels, known.agreed
+    halves = [relief.count(start, examples & (folds == fold), known.num_classes) for fold in (0, 1)]
+    sides = count_sides(relief, halves, known, examples, folds)
+    misplaced = Misplaced.measure(relief, halves, sides, levels)
+    return known if misplaced is None else misplaced.without(known, relief.cell)
 
 
 def plausible(known: LabelledPoints, appearance: LearnedAppearance) -> np.ndarray:

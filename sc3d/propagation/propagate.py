@@ -31,7 +31,7 @@ from sc3d.scene.scene import Scene
 from sc3d.scene.site_model import ModelPart, read_model
 from sc3d.settings.labels import Propagate
 
-Learner = Callable[[Graph, LabelledPoints], LearnedAppearance | None]
+Learner = Callable[[Graph, LabelledPoints], tuple[LabelledPoints, LearnedAppearance | None]]
 
 
 def propagate(
@@ -51,7 +51,7 @@ def propagate(
     if points.none:  # how often views find nothing, where there is something
         points = replace(points, rates=NoneRates.from_counts(count_votes(points.known_votes)))
     known = points.ordered(graph.order)
-    appearance = learn(graph, known) if uses_appearance(settings) else None
+    known, appearance = learn(graph, known) if uses_appearance(settings) else (known, None)
     seeds = known.seed_labels
     if settings.method == "map":
         label, confidence = minimize_energy(
@@ -148,7 +148,15 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     channels = Channels.of_classes(np.unique(seeds.label).tolist()) if votes is None else votes.channels
     seeds = seeds_in_channels(seeds, channels, path)
     values = None if votes is None else votes.values
-    points = LabelledPoints(positions, seeds, values, colors, scene_up(scene), channels.none)
+    points = LabelledPoints(
+        positions,
+        seeds,
+        values,
+        colors,
+        scene_up(scene),
+        channels.none,
+        levels=levels_of(scene, channels),
+    )
     normals = cloud.point.normals.numpy()
     graph, learn = neighbor_graph(points, normals, settings), learn_appearance
     if saved is not None and settings.model is not None:
@@ -199,6 +207,11 @@ def _saved_appearance(scene: Scene, settings: Propagate) -> SavedAppearance | No
     saved = SavedAppearance.from_part(part, settings.model)
     saved.require_unit(_meters(scene), settings.model)
     return saved
+
+
+def levels_of(scene: Scene, channels: Channels) -> np.ndarray | None:
+    """As of `LabelledPoints`; None without a class table."""
+    return scene.class_table().levels(channels) if scene.classes.exists() else None
 
 
 def _meters(scene: Scene) -> float | None:

@@ -146,7 +146,7 @@ class SavedAppearance:
 
     def on(
         self, graph: Graph, known: LabelledPoints, channels: Channels, meters: float | None, origin: Path
-    ) -> LearnedAppearance:
+    ) -> tuple[LabelledPoints, LearnedAppearance]:
         """The model on the cloud of another scene, with what the agreed points of that scene teach.
 
         graph, known: in the order of the graph; meters: as in `require_unit`; origin: its file
@@ -165,7 +165,7 @@ class SavedAppearance:
         model = SeededModel(tuple(groups), _no_heavier(given, own))
         statistics = model.with_prior(own)
         trust = Trust.unmeasured(statistics[0].sum(axis=0) >= MIN_EXAMPLES, count_disagreement(known))
-        return LearnedAppearance(model, statistics, trust)
+        return known, LearnedAppearance(model, statistics, trust)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,10 @@ CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 MAX_NAME, MAX_BYTES = 200, 1 << 20
 # in truth masks, unless a class has one of these ids: looked at and none of the classes; not to be judged
 OTHER, UNJUDGED = 254, 255
+# ASPRS codes of vegetation, of buildings, and of ground, low vegetation, water, rail, road
+LOW, MEDIUM, HIGH, BUILDING = 3, 4, 5, 6
+GROUND_CODES = (2, LOW, 9, 10, 11)
+ON_GROUND, STANDING = 0, 1
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,27 @@ class ClassTable:
     def shows_no_surface(self, labels: np.ndarray) -> np.ndarray:
         """Bool, of the shape of `labels` (uint8 ids): of a class without surface."""
         return np.isin(labels, [entry.id for entry in self.without_surface])
+
+    def levels(self, channels: Channels) -> np.ndarray | None:
+        """(C,) int of the labels 1..C of votes: ON_GROUND, STANDING, or -1 where the ASPRS code does not say; None
+        unless there are classes of both.
+        """
+        standing = self.tree_codes | {BUILDING}
+        levels = dict.fromkeys(GROUND_CODES, ON_GROUND) | dict.fromkeys(standing, STANDING)
+        codes = {entry.id: entry.asprs for entry in self.classes}
+        found = [levels.get(codes.get(label, 0), -1) for label in channels.ids[1:].tolist()]
+        return np.array(found + [-1] * channels.none) if {ON_GROUND, STANDING} <= set(found) else None
+
+    @property
+    def tree_codes(self) -> set[int]:
+        """ASPRS codes of trees: medium and high vegetation; low if no class has those."""
+        return {MEDIUM, HIGH} if {MEDIUM, HIGH} & {entry.asprs for entry in self.classes} else {LOW}
+
+    @property
+    def ground_classes(self) -> list[int]:
+        """Ids of the classes that lie on the ground, by their ASPRS codes."""
+        wanted = set(GROUND_CODES) - self.tree_codes
+        return [entry.id for entry in self.classes if entry.asprs in wanted]
 
     @property
     def rest(self) -> SemanticClass | None:

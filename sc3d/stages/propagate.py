@@ -33,7 +33,7 @@ def inputs(scene: Scene, settings: Propagate) -> list[Input]:
     model = [settings.model] if settings.model else []
     learned = _strokes_inputs(scene) if settings.save_model else []
     scale = [georeference_path(scene)] if settings.model or settings.save_model else []
-    table = [scene.classes] if corrections or scale else []
+    table = [scene.classes] if corrections or scale or scene.classes.exists() else []
     return [start, scene.sparse, photos, *corrections, *table, *model, *scale, *learned]
 
 

@@ -40,9 +40,17 @@ from sc3d.propagation.appearance import (
     uses_appearance,
 )
 from sc3d.propagation.labelled_points import views_to_agree
+from sc3d.propagation.misplaced import Misplaced, count_sides
 from sc3d.propagation.none_evidence import NoneRates, count_votes
 from sc3d.propagation.potts import STEPS, appearance_marginals, decided, sure_examples, vote_marginals
-from sc3d.propagation.propagate import PropagateSummary, fill_from_nearest, no_seeds, spread, with_states
+from sc3d.propagation.propagate import (
+    PropagateSummary,
+    fill_from_nearest,
+    levels_of,
+    no_seeds,
+    spread,
+    with_states,
+)
 from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.terrain import WINDOWS, GroundModel, NormalStatistics
 from sc3d.propagation.trust import Trust
@@ -56,7 +64,7 @@ from sc3d.tiling.executor import Executor, open_executor
 from sc3d.tiling.label import sample_spacing
 from sc3d.tiling.memory import fits, max_points, num_points
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
-from sc3d.tiling.tile_graph import PropagateJob, TileGraph, cells_of
+from sc3d.tiling.tile_graph import PropagateJob, TileGraph, cells_of, relief_histogram
 from sc3d.tiling.work_folder import WorkFolder
 
 logger = logging.getLogger(__name__)
@@ -93,7 +101,13 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     if channels is None:
         raise InputError(f"{cloud.path} has votes of no class: it was not written by `sc3d label`")
     corrections = Corrections.of_scene(scene)
-    decisive: list[Input] = [cloud.path, scene.sparse, PhotoFrames(scene.images), *corrections.files]
+    decisive: list[Input] = [
+        cloud.path,
+        scene.sparse,
+        scene.classes,
+        PhotoFrames(scene.images),
+        *corrections.files,
+    ]
     folder, statistics = (
         WorkFolder(output, "propagate", decisive, settings),
         CloudStatistics.from_cloud(cloud),
@@ -104,7 +118,10 @@ def propagate_scene(scene: Scene, settings: Propagate) -> PropagateSummary:
     margin = HOPS * EDGE * sample_spacing(store, statistics)[0]
     results, shared = Results(folder.subfolder("results"), store), folder.subfolder("shared")
     up = scene_up(scene)
-    job = PropagateJob(settings, statistics.extent, store, results, margin, channels, shared, up, corrections)
+    levels = levels_of(scene, channels)
+    job = PropagateJob(
+        settings, statistics.extent, store, results, margin, channels, shared, up, corrections, levels=levels
+    )
     with open_executor(settings) as executor:
         _solve(job, executor, cloud.path)
     summary = _write(output, cloud, job)
@@ -117,16 +134,14 @@ def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
     tiles = job.store.tiles
     summaries = executor.run("graph", partial(_graph_task, job), tiles)
     job.corrections.warn_of_missing(np.sum([summary.touched for summary in summaries], axis=0), path)
-    offered, least = (
-        sum(summary.seeds for summary in summaries) > 0,
-        views_to_agree(sum(summary.agreement for summary in summaries)),
-    )
+    offered = _offered(summaries)
     if not offered[: len(job.channels.ids) - 1].any():
         raise no_seeds(path, job.corrections)
     if job.channels.none:
         job = replace(job, rates=NoneRates.from_counts(sum(summary.found for summary in summaries)))
-    learned = _learn(job, executor, summaries, least) if uses_appearance(job.settings) else None
-    source = None
+    learned, source = None, None
+    if uses_appearance(job.settings):
+        job, offered, learned = _learn(job, executor, summaries)
     if job.settings.method == "map" and learned is not None:
         source = _rounds(job, executor, offered, learned)
     elif learned is not None:
@@ -144,17 +159,16 @@ def _rounds(
     """As `potts.minimize_energy`; returns how the arrays of the last round are named, None = votes alone."""
     tiles, attempt = job.store.tiles, 0
     while learned.tells_apart:
-        taught, before = learned, None
+        taught, last = learned, None
         for turn in range(max(job.settings.rounds, 1)):
             if not taught.tells_apart:
                 break
-            name = f"attempt{attempt}_round{turn}"
-            task = partial(_turn_task, job, offered, taught, before, name)
-            parts = executor.run(f"round {turn + 1}", task, tiles)
+            last = f"attempt{attempt}_round{turn}"
+            parts = executor.run(f"round {turn + 1}", partial(_turn_task, job, offered, taught, last), tiles)
             taught = replace(taught, statistics=sum_statistics([statistics for statistics, _ in parts]))
-            counts, before = np.sum([counts for _, counts in parts], axis=0), name
+            counts = np.sum([counts for _, counts in parts], axis=0)
         if not (too_many := overruled(counts, learned.trust)).any():
-            return before
+            return last
         learned, attempt = replace(learned, trust=learned.trust.without(too_many)), attempt + 1
     return None
 
@@ -198,10 +212,17 @@ def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
     )
 
 
+def _offered(summaries: list[TileSummary]) -> np.ndarray:
+    """(C,) bool classes that have seeds."""
+    return np.sum([summary.seeds for summary in summaries], axis=0) > 0
+
+
 def _learn(
-    job: PropagateJob, executor: Executor, summaries: list[TileSummary], least: int
-) -> LearnedFromTiles | None:
-    """What the agreed points of all tiles teach, if that tells classes apart on points held out."""
+    job: PropagateJob, executor: Executor, summaries: list[TileSummary]
+) -> tuple[PropagateJob, np.ndarray, LearnedFromTiles | None]:
+    """The job without misplaced votes, its classes with seeds (C,) bool, and what the agreed points of all tiles
+    teach, if that tells classes apart on points held out.
+    """
     tiles = job.store.tiles
     lean = NormalStatistics.merge([summary.lean for summary in summaries])
     terrain = GroundModel.from_statistics(lean, job.extent.low, job.extent.high, job.up)
@@ -215,15 +236,43 @@ def _learn(
         QuantileSketch.merge(list(parts))
         for parts in zip(*executor.run("relief", partial(_relief_task, job, terrain), tiles), strict=True)
     ]
-    halves = [
-        sum_statistics(list(parts))
-        for parts in zip(
-            *executor.run("examples", partial(_statistics_task, job, counts, least), tiles), strict=True
-        )
-    ]
+    halves, least = _examples(job, executor, summaries, counts)
+    if job.levels is not None:
+        job = replace(job, misplaced=_misplaced(job, executor, halves, least, job.levels))
+    if job.misplaced is not None:
+        summaries = executor.run("graph", partial(_graph_task, job), tiles)
+        halves, least = _examples(job, executor, summaries, counts)
     contrasts = sum(executor.run("held-out looks", partial(_held_out_task, job, halves, least), tiles))
     trust = trust_of(halves, contrasts, np.sum([summary.disagreement for summary in summaries], axis=0))
-    return None if trust is None else LearnedFromTiles(sum_statistics(halves), trust)
+    learned = None if trust is None else LearnedFromTiles(sum_statistics(halves), trust)
+    return job, _offered(summaries), learned
+
+
+def _examples(
+    job: PropagateJob, executor: Executor, summaries: list[TileSummary], counts: list[QuantileSketch]
+) -> tuple[list[AppearanceStatistics], int]:
+    """Statistics of the agreed points of both folds, and how many views must agree."""
+    least = views_to_agree(np.sum([summary.agreement for summary in summaries], axis=0))
+    parts = executor.run("examples", partial(_statistics_task, job, counts, least), job.store.tiles)
+    return [sum_statistics(list(fold)) for fold in zip(*parts, strict=True)], least
+
+
+def _misplaced(
+    job: PropagateJob, executor: Executor, halves: list[AppearanceStatistics], least: int, levels: np.ndarray
+) -> Misplaced | None:
+    relief = [half[-1] for half in halves]
+    sides = executor.run("sides", partial(_sides_task, job, relief, least), job.store.tiles)
+    return Misplaced.measure(relief_histogram(np.empty(0, np.int32)), relief, sum(sides), levels)
+
+
+def _sides_task(job: PropagateJob, halves: list[np.ndarray], least: int, tile: int) -> np.ndarray:
+    part = TileGraph.load(job, tile)
+    examples, folds = part.known.agreed_by(least) & part.core, _folds(job, part)
+    return count_sides(part.appearance(job).groups[-1], halves, part.known, examples, folds)
+
+
+def _folds(job: PropagateJob, part: TileGraph) -> np.ndarray:
+    return folds_of(part.known.points, job.extent.low, job.extent.high)
 
 
 @dataclass(frozen=True)
@@ -268,10 +317,7 @@ def _statistics_task(
         part.own_in_order(job.results.read(tile, "relief")), part.known.colors, counts
     )
     job.results.write(tile, cells=part.own(cells_of(appearance)))
-    examples, folds = (
-        part.known.agreed_by(least) & part.core,
-        folds_of(part.known.points, job.extent.low, job.extent.high),
-    )
+    examples, folds = part.known.agreed_by(least) & part.core, _folds(job, part)
     even, odd = (
         appearance.statistics(part.known.seed_labels, examples & (folds == fold), part.known.num_classes)
         for fold in (0, 1)
@@ -283,8 +329,7 @@ def _held_out_task(
     job: PropagateJob, halves: list[AppearanceStatistics], least: int, tile: int
 ) -> np.ndarray:
     part = TileGraph.load(job, tile)
-    examples = part.known.agreed_by(least) & part.core
-    folds = folds_of(part.known.points, job.extent.low, job.extent.high)
+    examples, folds = part.known.agreed_by(least) & part.core, _folds(job, part)
     return held_out(part.appearance(job), halves, part.known.seed_labels, examples, folds)
 
 
@@ -292,18 +337,14 @@ def _turn_task(
     job: PropagateJob,
     offered: np.ndarray,
     learned: LearnedFromTiles,
-    before: str | None,
     name: str,
     tile: int,
 ) -> tuple[AppearanceStatistics, np.ndarray]:
-    """A round of mean field, of this name, after the one named before; returns what its result teaches, and
-    `count_overruled`.
-    """
+    """A round of mean field, of this name; returns what its result teaches, and `count_overruled`."""
     part = TileGraph.load(job, tile)
     appearance, known = part.appearance(job), part.known
     if not job.results.has(tile, f"{name}_examples"):
-        label = part.around(job, f"{before}_label") if before else known.seed_labels
-        rating = learned.of(appearance).log_likelihood(label)
+        rating = learned.of(appearance).log_likelihood(known)
         if rating is None:
             raise ValueError("a round needs examples of two looks")
         found = appearance_marginals(part.graph, known, offered, rating, learned.trust, job.settings)
@@ -335,7 +376,7 @@ def _start(job: PropagateJob, part: TileGraph, learned: LearnedFromTiles | None)
     seeds = part.known.seed_labels
     if learned is None or job.settings.method == "map":
         return seeds
-    rating = learned.of(part.appearance(job)).log_likelihood(seeds)
+    rating = learned.of(part.appearance(job)).log_likelihood(part.known)
     kept = plausible_seeds(part.known, rating, learned.trust)
     return kept if learned.too_many is None else limited(part.known, kept, learned.too_many)
 
