@@ -51,6 +51,8 @@ class Histogram:
         return np.log(smoothed / smoothed.sum(axis=1, keepdims=True))
 
     def likelihood(self, counts: np.ndarray) -> np.ndarray:
-        """(cells, C) float32 log-likelihood of each class, up to a number per cell, from the counts (cells, C)."""
+        """(cells, C) float32 log-likelihood of each class, up to a number per cell, from the counts (cells,
+        C).
+        """
         shares = np.log(np.maximum(counts.sum(axis=0), 1) / max(counts.sum(), 1))
         return (self.table(counts) - shares).astype(np.float32)

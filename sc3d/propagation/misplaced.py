@@ -1,10 +1,11 @@
 """Votes for what stands, on what lies on the ground, and the other way round.
 
-Where the class table says by ASPRS codes which classes lie on the ground and which stand on it, relief checks the
-masks: the points voted for each class have two sides, by what the other classes' agreed points look like. If far more
-of one class than of the others of its level lie on the wrong side, that is no fault of the relief: most votes for this
-class are wrong, and all views share the error. Its votes then count on each point by how likely the point is on the
-right side.
+Where the class table says by ASPRS codes which classes lie on the ground and which stand on it, relief checks
+the
+masks: the points voted for each class have two sides, by what the other classes' agreed points look like. If
+    far more of one class than of the others of its level lie on the wrong side, that is no fault of the
+    relief: most votes for this class are wrong, and all views share the error. On each point, as much of its
+    votes as is likely to be wrong then goes to the classes of the other level.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import expit
 
 from sc3d.propagation.histogram import Histogram
 from sc3d.propagation.labelled_points import MIN_EXAMPLES, LabelledPoints
@@ -47,8 +47,8 @@ def count_sides(
     examples: np.ndarray,
     folds: np.ndarray,
 ) -> np.ndarray:
-    """(C, 2) int64 examples (N,) bool of each class on the side of ON_GROUND and of STANDING, as the other of the
-    two folds (N,) tells. halves: (cells, C) examples of each fold, of the whole cloud
+    """(C, 2) int64 examples (N,) bool of each class on the side of ON_GROUND and of STANDING, as the other of
+    the two folds (N,) tells. halves: (cells, C) examples of each fold, of the whole cloud
     """
     levels = known.required_levels
     odds = np.stack([side_odds(relief, halves[1 - fold], levels) for fold in (0, 1)])
@@ -59,8 +59,8 @@ def count_sides(
 
 
 def misplaced_shares(sides: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """(C,) share of the points voted for each class that are of the other level: of those on its side, what is more
-    than the other classes of its own level have there. 0 where it is small, or relief cannot judge.
+    """(C,) share of the points voted for each class that are of the other level: of those on its side, what
+    is more than the other classes of its own level have there. 0 where it is small, or relief cannot judge.
 
     sides: (C, 2) of `count_sides`
     """
@@ -79,17 +79,22 @@ def misplaced_shares(sides: np.ndarray, levels: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Misplaced:
-    """shares: (C,) of `misplaced_shares`; odds: (cells,) of `side_odds`"""
+    """right: (cells, C) float32 how much votes for each class count in each cell of the relief; 1 for classes
+    that are where they belong
+    """
 
-    shares: np.ndarray
-    odds: np.ndarray
+    right: np.ndarray
 
     @classmethod
     def measure(
         cls, relief: Histogram, halves: list[np.ndarray], sides: np.ndarray, levels: np.ndarray
     ) -> Misplaced | None:
-        """None where no class is misplaced. halves, sides: as of `count_sides`, of the whole cloud"""
-        shares = misplaced_shares(sides, levels)
+        """None where no class is misplaced. halves, sides: as of `count_sides`, of the whole cloud
+
+        The density of a class's examples is a mixture of its own and that of the other level, whose part, the
+        share times the ratio of the two, is wrong.
+        """
+        shares, counts = misplaced_shares(sides, levels), halves[0] + halves[1]
         if not shares.any():
             return None
         logger.warning(
@@ -99,18 +104,26 @@ class Misplaced:
             (levels >= 0).sum(),
             ", ".join(f"{share:.0%}" for share in shares[shares > 0]),
         )
-        return cls(shares, side_odds(relief, halves[0] + halves[1], levels))
+        right = np.ones(counts.shape, np.float32)
+        for own in np.flatnonzero(shares):
+            other = counts[:, levels == 1 - levels[own]].sum(axis=1)
+            table = relief.likelihood(np.stack([counts[:, own], other], axis=1))
+            right[:, own] = np.clip(1 - shares[own] * np.exp(table[:, 1] - table[:, 0]), 0, 1)
+        return cls(right)
 
     def without(self, known: LabelledPoints, cell: np.ndarray) -> LabelledPoints:
-        """What is known of the points once these votes count less; seeds that are likelier of the other level are in
-        conflict, but for those that a person has set. cell: (N,) of the relief of each point
+        """What is known of the points once the wrong part of these votes is for the classes of the other
+        level, all alike. Seeds that are likelier of that level are in conflict, but for those that a person
+        has set.
+
+        cell: (N,) of the relief of each point
         """
         votes, seeds, levels = known.known_votes.copy(), known.seed_labels, known.required_levels
         conflict = np.zeros(len(cell), bool)
-        for own in np.flatnonzero(self.shares):
-            prior = np.log(1 / self.shares[own] - 1)
-            odds = self.odds if levels[own] == STANDING else -self.odds
-            right = expit(odds + prior).astype(np.float32)[cell]
+        for own in np.flatnonzero((self.right < 1).any(axis=0)):
+            right = self.right[cell, own]
+            across = np.flatnonzero(levels == 1 - levels[own]) + 1
+            votes[:, across] += (votes[:, own + 1] * (1 - right) / len(across))[:, None]
             votes[:, own + 1] *= right
             conflict |= (seeds == own + 1) & (right < 0.5) & ~known.corrected
         label = np.where(conflict, 0, known.seeds.label).astype(np.uint8)

@@ -1,8 +1,8 @@
 """What votes say of the labels of their points.
 
-Alone, each vote counts (`evidence_of`). Beside looks, which see what all views get wrong together, the votes of a
-point count as those of one view, because disagreement tells how often one view is wrong, but not how often all
-are (`one_view_evidence`).
+Alone, each vote counts (`evidence_of`). Beside looks, which see what all views get wrong together, the votes
+of a point count as those of one view, because disagreement tells how often one view is wrong, but not how
+often all are (`one_view_evidence`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ from sc3d.propagation.labelled_points import LabelledPoints
 MAX_EVIDENCE = 5.0  # a point's votes count as at most this many
 SMOOTHING = 0.25  # added to the votes of each class
 FIXED = 4096  # shares are summed in these parts, so that no order matters
-# views share errors that no disagreement shows: of hand-corrected masks 1 to 2 % disagree, and as much is wrong again
-MIN_ERROR = 0.05
 PRIOR_POINTS, PRIOR_ERROR = 100.0, 0.15  # what is believed of views that no other view checks
 
 
@@ -44,8 +42,8 @@ def vote_likelihood(votes: np.ndarray) -> np.ndarray:
 
 
 def one_view_evidence(known: LabelledPoints, errors: np.ndarray) -> np.ndarray:
-    """(N, C) float32, as `evidence_of`, of one view that says what the views of the point say on average; errors:
-    (C,) share of the votes for each class that are wrong. Without votes a seed has one view.
+    """(N, C) float32, as `evidence_of`, of one view that says what the views of the point say on average;
+    errors: (C,) share of the votes for each class that are wrong. Without votes a seed has one view.
     """
     votes = known.votes
     if votes is None:
@@ -68,8 +66,8 @@ def vote_shares(known: LabelledPoints) -> np.ndarray:
 
 
 def count_disagreement(known: LabelledPoints, core: np.ndarray | None = None) -> np.ndarray:
-    """(2,) int64 points that several views gave a class, and how many of those the views of a pair disagree on, in
-    fixed point. core: (N,) bool points to count, None = all.
+    """(2,) int64 points that several views gave a class, and how many of those the views of a pair disagree
+    on, in fixed point. core: (N,) bool points to count, None = all.
 
     The views of a point are taken to weigh the same.
     """
@@ -89,7 +87,7 @@ def error_of(disagreement: np.ndarray) -> float:
     points, differing = (disagreement / FIXED).tolist()
     prior = 2 * PRIOR_ERROR * (1 - PRIOR_ERROR)
     rate = (differing + PRIOR_POINTS * prior) / (points + PRIOR_POINTS)
-    return max(float((1 - np.sqrt(max(1 - 2 * rate, 0))) / 2), MIN_ERROR)
+    return float((1 - np.sqrt(max(1 - 2 * rate, 0))) / 2)
 
 
 def softmax(values: np.ndarray) -> np.ndarray:

@@ -23,8 +23,9 @@ def fitted(
     model: AppearanceModel, label: np.ndarray, examples: np.ndarray, num_classes: int
 ) -> np.ndarray | None:
     """What the model says of a cloud by the cloud's own examples, if it is believed."""
-    trust = Trust(np.full(num_classes, 0.1), np.ones(len(model.groups)), np.arange(num_classes))
-    return model.log_likelihood(model.statistics(label, examples, num_classes), trust, label)
+    trust = Trust(np.full(num_classes, 0.1), np.arange(num_classes))
+    shares = np.eye(num_classes + 1, dtype=np.float32)[label][:, 1:]
+    return model.log_likelihood(model.statistics(label, examples, num_classes), trust, shares)
 
 
 def village(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -98,7 +98,7 @@ def lying(scene: tuple[np.ndarray, ...]) -> tuple[Graph, LabelledPoints, Learned
     evidence = evidence_of(points, colors, truth)
     graph = neighbor_graph(evidence, normals, Propagate())
     known = evidence.ordered(graph.order)
-    learned = learn_appearance(graph, known)
+    known, learned = learn_appearance(graph, known)
     assert learned is not None
     statistics = tuple(part[:, [1, 0, 2]] for part in learned.statistics)
     trust = replace(learned.trust, errors=np.full(3, 0.3))
