@@ -12,6 +12,7 @@ from sc3d.commands.run import list_stages
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Segment
 from sc3d.settings.outputs import Run
+from sc3d.settings.reconstruction import Extract
 from sc3d.settings.train import Train
 from sc3d.sfm import num_pairs
 from tests.builders import write_bare_scene
@@ -61,6 +62,15 @@ def test_every_stage_has_an_expected_time_that_grows_with_the_photos(stages):
         few, many = (EXPECTED[name](settings, [(800, 600)] * count) for count in (10, 40))
         assert few is not None and many is not None and 0 < few <= many
         assert few < many or name in ("train", "report")
+
+
+def test_a_surface_from_depth_maps_is_not_trained_for(tmp_path):
+    scene = Scene(write_bare_scene(tmp_path / "scene"))
+    trained, from_depth = (
+        [name for name, _ in list_stages(Run(tmp_path, scene.path, extract=extract), scene, Segment())]
+        for extract in (Extract(), Extract(method="depth"))
+    )
+    assert "train" in trained and from_depth == [name for name in trained if name != "train"]
 
 
 def test_pairs_are_counted_and_pixels_as_the_stages_make_them_smaller():

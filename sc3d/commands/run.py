@@ -63,16 +63,18 @@ def tell_plan(command: Run, scene: Scene, stages: list[Stage]) -> None:
     sizes = list(photo_sizes(command.photos).values())
     logger.info(plan(stages, runs, sizes))
     warn_of_slow(stages, runs, sizes)
+    if command.extract.method == "depth" and command.train != type(command.train)():
+        logger.warning("--train options change nothing: --extract.from depth needs no training")
 
 
 def list_stages(command: Run, scene: Scene, segment: Segment) -> list[Stage]:
-    """The stages in the order in which they run."""
+    """The stages in the order in which they run; a surface from depth maps needs no training."""
     depth = command.depth
     if segment.backend == "geometry" and depth.sky_masks is None and scene.class_table().without_surface:
         depth = replace(depth, ignore_masks=True)  # shapes show no sky, and come after depth
     surface: list[Stage] = [
         ("depth", depth),
-        ("train", command.train),
+        *([] if command.extract.method == "depth" else [("train", command.train)]),
         ("extract", command.extract),
     ]
     masks: list[Stage] = [("segment", replace(segment, refine=False))]
