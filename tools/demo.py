@@ -23,7 +23,9 @@ def main() -> None:
     started = time.perf_counter()
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, nargs="?", help="default: demo, or demo-full")
-    parser.add_argument("--full", action="store_true", help="a larger site, with trained Gaussians: some eight minutes")
+    parser.add_argument(
+        "--full", action="store_true", help="a larger site, with trained Gaussians: some eight minutes"
+    )
     asked = parser.parse_args()
     folder = asked.folder or TOOLS.parent / ("demo-full" if asked.full else "demo")
     for name, *arguments in commands(folder, asked.full):
