@@ -29,19 +29,21 @@ NUMBA_FILE = ".numba_config.yaml"
 SHELLS = ("bash", "zsh", "tcsh", "fish")
 GROUPED = "\n\nThe everyday options come first, then those of each stage under its name, in the order in which the stages run."
 COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
-WAYS = """From photos to a labelled cloud, the three usual ways:
+WAYS = """From photos to a labelled cloud, the three usual ways (sc3d synthesize SITE makes photos and masks to try them on):
 
-  masks made elsewhere (COCO, LabelMe, CVAT, PNG):
+  photos alone (ground, vegetation and building, from the shape of the scene):
+    sc3d run PHOTOS SCENE
+
+  classes of your own, by masks made elsewhere (COCO, LabelMe, CVAT, PNG) or by a few strokes drawn in the browser:
     sc3d run PHOTOS SCENE --classes CLASSES.json --masks MASKS
 
-  no masks: a few strokes on some photos, drawn in the browser:
     sc3d reconstruct PHOTOS SCENE
     sc3d annotate SCENE                      (needs SCENE/classes.json, the names of the classes)
     sc3d run PHOTOS SCENE --segment.backend strokes
 
-  a cloud and cameras of another program (ODM, Metashape, Pix4D, COLMAP, nerfstudio):
+  a cloud and cameras of another program (ODM, Metashape, Pix4D, COLMAP, nerfstudio), and masks:
     sc3d import PROJECT SCENE --cloud CLOUD
-    sc3d segment SCENE --masks MASKS
+    sc3d segment SCENE --masks MASKS         (needs SCENE/classes.json, or --backend geometry instead of masks)
     sc3d label SCENE
     sc3d propagate SCENE
 

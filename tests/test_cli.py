@@ -121,6 +121,7 @@ def test_usage_and_unknown_command(capsys):
 def test_scripts_in_tools_are_the_commands():
     tools = Path(__file__).parent.parent / "tools"
     assert {file.stem for file in tools.glob("*.py")} - {
+        "check_wheel",
         "demo",
         "fuzz_readers",
         "make_manual",
@@ -324,7 +325,7 @@ def test_without_arguments_the_three_usual_ways_are_shown_and_are_commands(capsy
     assert stopped.value.code == 2 and shown == WAYS + usage()
     assert len(re.findall(r"^  \S.*:$", WAYS, re.M)) == 3
     ways = re.findall(r"^    sc3d (\w+) (.*?)(?:   +.*)?$", WAYS, re.M)
-    assert len(ways) == 8
+    assert len(ways) == 9
     for name, arguments in ways:
         parse(name, arguments.split())  # exits if it does not fit
 

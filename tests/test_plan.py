@@ -122,7 +122,9 @@ def test_what_takes_hours_is_told_with_what_makes_it_faster(stages, caplog):
     assert not caplog.records
     warn_of_slow(stages, [True] * len(stages), [(4000, 3000)] * 1000)
     assert (
-        "map_photos about" in caplog.text and "--num-sources" in caplog.text and "report" not in caplog.text
+        "map_photos about" in caplog.text
+        and "--depth.num-sources" in caplog.text
+        and "report" not in caplog.text
     )
     caplog.clear()
     warn_of_slow(stages, [False] * len(stages), [(4000, 3000)] * 1000)

@@ -23,10 +23,10 @@ Sizes = Sequence[tuple[int, int]]  # width and height of every photo, px
 ROUND = 5  # s
 SLOW = 3600  # s that a stage takes to be warned of
 FASTER = {  # what makes stages faster, and coarser
-    "map_photos": "less with --matching auto, a smaller --max-size or --max-features",
-    "depth": "less with a smaller --max-size or --num-sources",
-    "train": "less with fewer --iterations, a smaller --max-size, or a GPU",
-    "extract": "less with a smaller --max-size",
+    "map_photos": "less with --reconstruct.matching auto, a smaller --reconstruct.max-size or --reconstruct.max-features",
+    "depth": "less with a smaller --depth.max-size or --depth.num-sources",
+    "train": "none with --extract.from depth; less with fewer --train.iterations, a smaller --train.max-size, or a GPU",
+    "extract": "less with a smaller --extract.max-size",
 }
 
 # seconds on two idle cores. Each rule lies between what the sidecars of two scenes recorded, 18 photos of

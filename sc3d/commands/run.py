@@ -14,7 +14,7 @@ from sc3d.io.atomic import atomic_path
 from sc3d.io.json_files import read_json
 from sc3d.io.progress import under_way
 from sc3d.runner import MAX_SIDECAR, execute, sidecar
-from sc3d.scene.class_table import read_classes
+from sc3d.scene.class_table import MAKE_CLASSES, read_classes
 from sc3d.scene.scene import Scene, match_masks, photo_sizes
 from sc3d.scene.site_model import read_model
 from sc3d.segmentation.shape.backend import write_default_classes
@@ -123,9 +123,7 @@ def check(command: Run, segment: Segment) -> None:
     classes = command.classes or Scene(command.scene).classes
     by_shape = segment.backend == "geometry"
     if not classes.exists() and not by_shape:
-        raise InputError(
-            f"{classes} is missing: pass --classes FILE (data/classes.json of the sc3d repository is one to start from)"
-        )
+        raise InputError(f"{classes} is missing: {MAKE_CLASSES}")
     class_table = read_classes(classes) if command.classes or classes.exists() else DEFAULT
     if by_shape:
         class_ids(class_table)
