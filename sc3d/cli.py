@@ -185,6 +185,8 @@ def print_completion(arguments: list[str]) -> None:
                 f"{arguments[0]} takes a shell ({', '.join(SHELLS)}){' and a file' * (arguments[0] == COMPLETION[1])}"
             )
         )
+    for file in arguments[2:]:
+        Path(file).parent.mkdir(parents=True, exist_ok=True)
     commands: dict[str, Any] = {name: with_messages(name) for name in sorted(STAGES | COMMANDS)}
     tyro.extras.subcommand_cli_from_dict(commands, prog="sc3d", args=arguments)
 

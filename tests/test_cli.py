@@ -345,9 +345,9 @@ def test_help_of_run_has_the_everyday_options_first_then_stage_by_stage(capsys):
 
 def test_shell_completion_knows_commands_and_options(tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
-        main(["--tyro-write-completion", "bash", str(tmp_path / "sc3d.sh")])
+        main(["--tyro-write-completion", "bash", str(tmp_path / "completions" / "sc3d.sh")])
     assert not stopped.value.code
-    script = (tmp_path / "sc3d.sh").read_text()
+    script = (tmp_path / "completions" / "sc3d.sh").read_text()
     assert all(word in script for word in [*STAGES, *COMMANDS, "--label.consensus", "--quiet"])
     assert subprocess.run(["bash", "-n", str(tmp_path / "sc3d.sh")], check=False).returncode == 0
     assert "takes a shell (bash, zsh, tcsh, fish)" in fails(capsys, "--tyro-print-completion", "csh")
