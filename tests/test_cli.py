@@ -349,7 +349,9 @@ def test_shell_completion_knows_commands_and_options(tmp_path, capsys):
     assert not stopped.value.code
     script = (tmp_path / "completions" / "sc3d.sh").read_text()
     assert all(word in script for word in [*STAGES, *COMMANDS, "--label.consensus", "--quiet"])
-    assert subprocess.run(["bash", "-n", str(tmp_path / "sc3d.sh")], check=False).returncode == 0
+    assert (
+        subprocess.run(["bash", "-n", str(tmp_path / "completions" / "sc3d.sh")], check=False).returncode == 0
+    )
     assert "takes a shell (bash, zsh, tcsh, fish)" in fails(capsys, "--tyro-print-completion", "csh")
 
 

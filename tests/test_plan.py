@@ -101,6 +101,17 @@ def test_the_plan_names_what_runs_and_adds_up_only_that(stages):
     assert "in all       about 2 min; rough" in told
 
 
+@pytest.mark.parametrize("kernels", [[], ["label.voting-1.py311.nbi"]])
+def test_the_first_run_is_told_to_compile(stages, tmp_path, monkeypatch, kernels):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    for name in kernels:
+        (tmp_path / "cache").mkdir()
+        (tmp_path / "cache" / name).touch()
+    told = plan(stages, [True] * len(stages), [(1600, 900)] * 18)
+    assert ("also compiles" in told) is not bool(kernels)
+    assert "also compiles" not in plan(stages, [False] * len(stages), [(1600, 900)] * 18)
+
+
 def test_what_was_never_measured_has_no_time(stages):
     stages = [
         (name, replace(settings, backend="strokes") if name == "segment" else settings)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import open3d as o3d
 from PIL import Image
 
 from sc3d.commands.run import run
@@ -33,8 +34,8 @@ from sc3d.view.screenshot import Style, screenshot
 MANUAL = Path(__file__).resolve().parents[1] / "data" / "manual"
 PICTURES = MANUAL / "pictures"
 SITE = Synthesize(views=18, width=400, extent=50.0, altitude=50.0, num_points=1000)
-NUM_NADIR = 11  # the first photos of the site look straight down
 SIZE, LARGEST_SIDE, QUALITY = (560, 400), 400, 82
+PLAIN = Style(by="photo", legend=False)
 
 Edit = Callable[
     [np.ndarray, int], "np.ndarray | None"
@@ -43,8 +44,8 @@ Edit = Callable[
 
 @dataclass(frozen=True)
 class Fault:
-    """What goes wrong, and how it is looked at. Without `photos` and `largest_side` the geometry is that of
-    the good scene.
+    """What goes wrong, and how it is looked at: left the good scene (with `unconfirmed` the bad one without
+    that), right the bad one. Without `photos` and `largest_side` the geometry is that of the good scene.
     """
 
     good: str
@@ -53,6 +54,7 @@ class Fault:
     masks: Edit | None = None
     largest_side: int = LARGEST_SIDE
     by: Coloring = "label"
+    bad_by: Coloring | None = None
     unconfirmed: bool = False
 
 
@@ -69,6 +71,9 @@ def overexposed(pixels: np.ndarray, number: int) -> np.ndarray:
 def only(*numbers: int) -> Edit:
     """These photos alone."""
     return lambda pixels, number: pixels if number in numbers else None
+
+
+FEW = only(0, 3, 5, 7, 10, 14)
 
 
 def other_ids(mask: np.ndarray, number: int) -> np.ndarray:
@@ -88,14 +93,13 @@ def generous(mask: np.ndarray, number: int) -> np.ndarray:
 
 
 FAULTS = {
-    "few-photos": Fault("18 photos", "6 of them", photos=only(0, 3, 5, 7, 10, 14), by="photo"),
-    "straight-down": Fault(
-        "seen obliquely too", "all photos straight down", photos=only(*range(NUM_NADIR)), by="photo"
-    ),
+    "few-photos": Fault("18 photos", "6 of them", photos=FEW, by="photo"),
     "blurred": Fault("sharp photos", "blurred by motion", photos=moved, by="photo"),
     "overexposed": Fault("as exposed", "overexposed", photos=overexposed, by="photo"),
     "coarse": Fault("depth at 400 px", "at 120 px", largest_side=120, by="photo"),
-    "unconfirmed": Fault("seen by two photos", "with --unconfirmed", unconfirmed=True, by="photo"),
+    "unconfirmed": Fault(
+        "6 photos, what two of them show", "with --unconfirmed", photos=FEW, unconfirmed=True, by="photo"
+    ),
     "other-ids": Fault("ids of classes.json", "ids of another program", masks=other_ids),
     "shifted": Fault("masks of the photos", "shifted by an eighth", masks=shifted),
     "few-masks": Fault(
@@ -105,6 +109,7 @@ FAULTS = {
         by="confidence",
     ),
     "generous": Fault("masks as given", "buildings with a margin", masks=generous),
+    "no-class": Fault("cars in the photos", "classes.json has no cars", by="photo", bad_by="label"),
 }
 
 
@@ -133,13 +138,11 @@ def names() -> list[str]:
 def draw_fault(name: str, work: Path) -> np.ndarray:
     """(H, W, 3) uint8 RGB: the scene as it should be, and what the fault makes of it."""
     fault, good = FAULTS[name], good_scene(work)
-    bad = (
-        make(name, fault, good, work)
-        if fault != Fault(fault.good, fault.bad, by=fault.by, unconfirmed=True)
-        else good
-    )
+    same = fault.photos is None and fault.masks is None and fault.largest_side == LARGEST_SIDE
+    bad = good if same else make(name, fault, good, work)
+    left = look(bad if fault.unconfirmed else good, fault.by, False)
     return side_by_side(
-        [look(good, fault.by, False), look(bad, fault.by, fault.unconfirmed)], [fault.good, fault.bad]
+        [left, look(bad, fault.bad_by or fault.by, fault.unconfirmed)], [fault.good, fault.bad]
     )
 
 
@@ -202,28 +205,31 @@ def look(scene: Scene, by: Coloring, unconfirmed: bool) -> np.ndarray:
 
 
 def draw_example(name: str, work: Path) -> np.ndarray:
-    """(H, W, 3) uint8 RGB of what a numbered example has written."""
+    """(H, W, 3) uint8 RGB of what a numbered example makes."""
     folder = work / name
     folder.mkdir(parents=True, exist_ok=True)
-    runpy.run_path(str(MANUAL / "examples" / f"{name}.py"))["main"](folder)
-    style = Style(legend=False, shading=0.5)
+    example = runpy.run_path(str(MANUAL / "examples" / f"{name}.py"))["main"]
+    if name == "03_geometry_utilities":
+        return draw_geometry(*example())
+    example(folder)
     scene = Scene(folder / "scene")
     if scene.labelled.exists():
         by: list[Coloring] = ["label", "confidence"]
         return side_by_side([look(scene, each, True) for each in by], by)
-    if scene.mesh.exists():
-        pictures = [
-            screenshot(read_mesh(scene.mesh), size=SIZE, style=style),
-            screenshot(
-                read_cloud(scene.path / "truth.ply"), size=SIZE, style=Style(by="photo", legend=False)
-            ),
-        ]
-        return side_by_side(pictures, ["mesh of the Gaussians", "true cloud"])
-    clouds = sorted(folder.glob("*.ply"))
-    pictures = [
-        screenshot(read_cloud(cloud), size=SIZE, style=Style(by="photo", legend=False)) for cloud in clouds
-    ]
-    return side_by_side(pictures, [cloud.stem for cloud in clouds])
+    true = read_cloud(scene.path / "truth.ply")
+    pictures = [screenshot(each, size=SIZE, style=PLAIN) for each in (read_mesh(scene.mesh), true)]
+    return side_by_side(pictures, ["mesh of the Gaussians", "true cloud"])
+
+
+def draw_geometry(points: np.ndarray, seen: np.ndarray, bend: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 RGB: which points the camera sees, and how much each is bent."""
+    values = {"seen by the camera": np.isin(np.arange(len(points)), seen), "curvature": 4 * bend}
+    pictures = []
+    for value in values.values():
+        gray = np.repeat(40 + 200 * np.clip(value, 0, 1)[:, None], 3, axis=1).astype(np.uint8)
+        cloud = o3d.t.geometry.PointCloud({"positions": points, "colors": gray})
+        pictures.append(screenshot(cloud, size=SIZE, style=PLAIN))
+    return side_by_side(pictures, list(values))
 
 
 if __name__ == "__main__":

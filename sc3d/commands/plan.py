@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from sc3d.io.caches import has_kernels
 from sc3d.io.progress import duration
 from sc3d.runner import files, up_to_date
 from sc3d.scene.scene import Scene
@@ -108,12 +109,13 @@ def plan(stages: Sequence[Stage], runs: Sequence[bool], sizes: Sizes, finished: 
         for (name, _), run, value in zip(stages, runs, seconds, strict=True)
     ]
     more = " and what is not known" if len(known) < len(seconds) else ""
+    first = "" if has_kernels() or not any(runs) else "; the first run also compiles, a minute or two"
     width, height = max(sizes)
     return "\n".join(
         [
             f"plan: {sum(runs)} of {len(stages)} stages to run, on {len(sizes)} photos of {width}x{height}:",
             *rows,
-            f"  in all       {_told(sum(known))}{more}; rough estimates for two cores, here are {os.cpu_count()}",
+            f"  in all       {_told(sum(known))}{more}; rough estimates for two cores, here are {os.cpu_count()}{first}",
         ]
     )
 
