@@ -26,6 +26,7 @@ from sc3d.settings.common import Messages
 
 # numba reads it in whatever folder a command is called, also in a scene of somebody else
 NUMBA_FILE = ".numba_config.yaml"
+FIRST = ("run", "check", "reconstruct", "import")  # in the list of commands
 SHELLS = ("bash", "zsh", "tcsh", "fish")
 GROUPED = "\n\nThe everyday options come first, then those of each stage under its name, in the order in which the stages run."
 COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
@@ -154,11 +155,13 @@ def reporting_errors() -> Iterator[None]:
 
 
 def usage() -> str:
-    """The list of commands."""
+    """The list of commands, each with the first sentence about it."""
     lines = ["usage: sc3d COMMAND ...   (sc3d COMMAND --help shows the options)", ""]
-    records = {"reconstruct": COMMANDS["reconstruct"]} | STAGES | COMMANDS
+    records = {name: COMMANDS[name] for name in FIRST} | STAGES | COMMANDS
     width = max(map(len, records)) + 2
-    lines += [f"  {name:{width}s}{_describe(record).splitlines()[0]}" for name, record in records.items()]
+    for name, record in records.items():
+        sentence = re.split(r"(?<=[.;]) ", " ".join(_describe(record).split()))[0]
+        lines.append(f"  {name:{width}s}{sentence.rstrip('.;')}")
     return "\n".join(lines) + "\n"
 
 

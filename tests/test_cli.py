@@ -125,6 +125,7 @@ def test_scripts_in_tools_are_the_commands():
         "demo",
         "fuzz_readers",
         "make_manual",
+        "make_pictures",
         "docstring_pages",
         "__init__",
     } == {
