@@ -31,7 +31,8 @@ from sc3d.view.contact_sheet import side_by_side
 from sc3d.view.display_cloud import load_cloud
 from sc3d.view.screenshot import Style, screenshot
 
-MANUAL = Path(__file__).resolve().parents[1] / "data" / "manual"
+DATA = Path(__file__).resolve().parents[1] / "data"
+MANUAL, CLASSES = DATA / "manual", DATA / "classes.json"
 PICTURES = MANUAL / "pictures"
 SITE = Synthesize(views=18, width=400, extent=50.0, altitude=50.0, num_points=1000)
 SIZE, LARGEST_SIDE, QUALITY = (560, 400), 400, 82
@@ -66,6 +67,10 @@ def moved(pixels: np.ndarray, number: int) -> np.ndarray:
 def overexposed(pixels: np.ndarray, number: int) -> np.ndarray:
     """Three times the light that it takes."""
     return np.clip(pixels * 3.0, 0, 255).astype(np.uint8)
+
+
+def as_it_is(pixels: np.ndarray, number: int) -> np.ndarray:
+    return pixels
 
 
 def only(*numbers: int) -> Edit:
@@ -150,35 +155,41 @@ def good_scene(work: Path) -> Scene:
     """The scene as it should be, made unless it is there."""
     site = Scene(work / "site")
     execute("synthesize", site, SITE)
-    return chain(site.images, site.masks, site, Scene(work / "good"))
+    return chain(Given(site.images, site.masks, site.confidence), Scene(work / "good"))
+
+
+@dataclass(frozen=True)
+class Given:
+    """Folders that a chain starts from."""
+
+    photos: Path
+    masks: Path
+    confidence: Path
 
 
 def make(name: str, fault: Fault, good: Scene, work: Path) -> Scene:
     """The scene of a fault, made anew."""
-    site, scene = Scene(work / "site"), Scene(work / name)
-    for folder in (scene.path, work / f"{name}-photos", work / f"{name}-masks"):
-        shutil.rmtree(folder, ignore_errors=True)
-    photos, masks = site.images, site.masks
+    site, scene, folder = Scene(work / "site"), Scene(work / name), work / f"{name}-given"
+    for old in (scene.path, folder):
+        shutil.rmtree(old, ignore_errors=True)
+    photos = site.images
     if fault.photos is not None:
-        photos = edited(site.images, work / f"{name}-photos", fault.photos)
-        kept = {path.stem for path in photos.iterdir()}
-        masks = edited(site.masks, work / f"{name}-masks", lambda mask, number: mask, kept)
-    if fault.masks is not None:
-        masks = edited(site.masks, work / f"{name}-masks", fault.masks)
+        photos = edited(site.images, folder / "photos", fault.photos, names_in(site.images))
+    elif fault.largest_side == LARGEST_SIDE:  # the shape is the good one
         shutil.copytree(good.path, scene.path, symlinks=True)
-        shutil.rmtree(scene.masks)
-    return chain(photos, masks, site, scene, fault.largest_side)
+    masks = edited(site.masks, folder / "masks", fault.masks or as_it_is, names_in(photos))
+    confidence = edited(site.confidence, folder / "confidence", as_it_is, names_in(masks))
+    return chain(Given(photos, masks, confidence), scene, fault.largest_side)
 
 
-def chain(photos: Path, masks: Path, site: Scene, scene: Scene, largest_side: int = LARGEST_SIDE) -> Scene:
+def chain(given: Given, scene: Scene, largest_side: int = LARGEST_SIDE) -> Scene:
     """The scene after `sc3d run`."""
     run(
         Run(
-            photos,
+            given.photos,
             scene.path,
-            classes=site.classes,
-            # where the masks' program was not sure, as beyond the site, they do not say that there is none of the classes
-            segment=Segment(masks=masks, confidence=site.confidence if photos == site.images else None),
+            classes=CLASSES,
+            segment=Segment(masks=given.masks, confidence=given.confidence),
             depth=Depth(max_size=largest_side),
             extract=Extract(method="depth", max_size=largest_side),
         )
@@ -186,13 +197,18 @@ def chain(photos: Path, masks: Path, site: Scene, scene: Scene, largest_side: in
     return scene
 
 
-def edited(source: Path, target: Path, edit: Edit, kept: set[str] | None = None) -> Path:
+def names_in(folder: Path) -> set[str]:
+    """Of files, without suffix."""
+    return {path.stem for path in folder.iterdir()}
+
+
+def edited(source: Path, target: Path, edit: Edit, kept: set[str]) -> Path:
     """The folder `target` with what `edit` makes of the images; kept: of those with these names alone."""
     target.mkdir(parents=True)
     for number, path in enumerate(sorted(source.iterdir())):
         with Image.open(path) as image:
             pixels, exif = edit(np.asarray(image), number), image.getexif()
-        if pixels is not None and (kept is None or path.stem in kept):
+        if pixels is not None and path.stem in kept:
             Image.fromarray(pixels).save(target / path.name, exif=exif, quality=95)
     return target
 

@@ -33,7 +33,7 @@ def test_what_is_done_to_photos_and_masks(tmp_path):
     (tmp_path / "given").mkdir()
     for number in range(3):
         Image.fromarray(np.full((4, 8), number, np.uint8)).save(tmp_path / "given" / f"{number}.png")
-    kept = edited(tmp_path / "given", tmp_path / "kept", only(0, 2))
+    kept = edited(tmp_path / "given", tmp_path / "kept", only(0, 2), {"0", "1", "2"})
     assert sorted(path.name for path in kept.iterdir()) == ["0.png", "2.png"]
     again = edited(tmp_path / "given", tmp_path / "again", other_ids, {"1", "2"})
     assert [np.unique(np.asarray(Image.open(path))).tolist() for path in sorted(again.iterdir())] == [
