@@ -56,6 +56,7 @@ class Fault:
     largest_side: int = LARGEST_SIDE
     by: Coloring = "label"
     bad_by: Coloring | None = None
+    of: str = ""  # the scene that is looked at, if it is that of another fault, or the good one
     unconfirmed: bool = False
 
 
@@ -78,9 +79,6 @@ def only(*numbers: int) -> Edit:
     return lambda pixels, number: pixels if number in numbers else None
 
 
-FEW = only(0, 3, 5, 7, 10, 14)
-
-
 def other_ids(mask: np.ndarray, number: int) -> np.ndarray:
     """Numbered as another program does: building 4, tree 1, road 2, grass 3."""
     return np.array([0, 4, 1, 2, 3], np.uint8)[mask]
@@ -98,23 +96,20 @@ def generous(mask: np.ndarray, number: int) -> np.ndarray:
 
 
 FAULTS = {
-    "few-photos": Fault("18 photos", "6 of them", photos=FEW, by="photo"),
+    "few-photos": Fault("18 photos", "6 of them", photos=only(0, 3, 5, 7, 10, 14), by="photo"),
     "blurred": Fault("sharp photos", "blurred by motion", photos=moved, by="photo"),
     "overexposed": Fault("as exposed", "overexposed", photos=overexposed, by="photo"),
     "coarse": Fault("depth at 400 px", "at 120 px", largest_side=120, by="photo"),
     "unconfirmed": Fault(
-        "6 photos, what two of them show", "with --unconfirmed", photos=FEW, unconfirmed=True, by="photo"
+        "blurred, what two photos show", "with --unconfirmed", of="blurred", unconfirmed=True, by="photo"
     ),
     "other-ids": Fault("ids of classes.json", "ids of another program", masks=other_ids),
     "shifted": Fault("masks of the photos", "shifted by an eighth", masks=shifted),
-    "few-masks": Fault(
-        "18 masks: confidence",
-        "3 masks",
-        masks=lambda mask, number: mask if number < 3 else None,
-        by="confidence",
-    ),
+    "few-masks": Fault("18 masks: where labels come from", "1 mask", masks=only(0), by="state"),
     "generous": Fault("masks as given", "buildings with a margin", masks=generous),
-    "no-class": Fault("cars in the photos", "classes.json has no cars", by="photo", bad_by="label"),
+    "no-class": Fault(
+        "cars in the photos", "classes.json has no cars", of="good", by="photo", bad_by="label"
+    ),
 }
 
 
@@ -143,8 +138,9 @@ def names() -> list[str]:
 def draw_fault(name: str, work: Path) -> np.ndarray:
     """(H, W, 3) uint8 RGB: the scene as it should be, and what the fault makes of it."""
     fault, good = FAULTS[name], good_scene(work)
-    same = fault.photos is None and fault.masks is None and fault.largest_side == LARGEST_SIDE
-    bad = good if same else make(name, fault, good, work)
+    bad = Scene(work / (fault.of or name))
+    if not fault.of or not bad.labelled.exists():
+        bad = make(bad.path.name, FAULTS[bad.path.name], good, work)
     left = look(bad if fault.unconfirmed else good, fault.by, False)
     return side_by_side(
         [left, look(bad, fault.bad_by or fault.by, fault.unconfirmed)], [fault.good, fault.bad]
