@@ -17,6 +17,10 @@ from sc3d.scene.channels import Channels
 # in names: they would act on terminals, or cannot be written
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 MAX_NAME, MAX_BYTES = 200, 1 << 20
+EXAMPLE = '{"id": 1, "name": "building", "color": [214, 60, 60]}'
+MAKE_CLASSES = (
+    f"pass --classes FILE to `sc3d run`, or write there [{EXAMPLE}, ...], with a line for each class"
+)
 # in truth masks, unless a class has one of these ids: looked at and none of the classes; not to be judged
 OTHER, UNJUDGED = 254, 255
 # ASPRS codes of vegetation, of buildings, and of ground, low vegetation, water, rail, road
@@ -149,9 +153,7 @@ class ClassTable:
 def read_classes(path: Path) -> ClassTable:
     """Read `classes.json`; raises InputError that names the faulty entry."""
     if not path.exists():
-        raise InputError(
-            f"{path} is missing: pass --classes FILE, or copy data/classes.json from the sc3d repository and edit it"
-        )
+        raise InputError(f"{path} is missing: {MAKE_CLASSES}")
     entries = read_json(path, MAX_BYTES)
     return parse_classes(entries, path)
 
@@ -178,9 +180,7 @@ def parse_classes(entries: object, origin: Path | str) -> ClassTable:
 
 def _parse_class(entry: object, origin: Path | str) -> SemanticClass:
     if not isinstance(entry, dict):
-        raise InputError(
-            f'{origin}: every class must be an object like {{"id": 1, "name": "building", "color": [214, 60, 60]}}'
-        )
+        raise InputError(f"{origin}: every class must be an object like {EXAMPLE}")
     label, name, color = _whole(entry.get("id")), entry.get("name"), _whole_all(entry.get("color"))
     if not _is_int(label, 1, 255):
         raise InputError(

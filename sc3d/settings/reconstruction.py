@@ -115,7 +115,7 @@ class Extract:
 
     method: Annotated[Literal["tsdf", "depth", "centers"], arg(name="from")] = "tsdf"
     """Fuse depth into a truncated signed distance field: that which the Gaussians render, or that of `sc3d
-    depth`, which needs no training. Or take the Gaussians' centers as the cloud.
+    depth`, which needs no training (`sc3d run` leaves it out then). Or take the Gaussians' centers as the cloud.
     """
     depth_mode: DepthMode = "median"
     """Depth that the Gaussians render: of the alpha-blended planes, or where half of the light is gone
