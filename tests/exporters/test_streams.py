@@ -124,3 +124,86 @@ def test_nodes_of_a_tree(tmp_path, small_nodes):
         cells = (positions << node.level + 4) // tree.side
         assert len(records) <= 400 or len(np.unique(cells, axis=0)) == len(records)
     assert not list(tmp_path.iterdir()) and Node(2, 3, 1, 0).parent == Node(1, 1, 0, 0)
+
+
+def tiles_of(folder) -> tuple[dict, dict[str, dict]]:
+    """The tileset and, by name, what the specification says is in its files."""
+    tileset, found, left = json.loads((folder / "tileset.json").read_text()), {}, []
+    left.append((tileset["root"], None))
+    while left:
+        tile, parent = left.pop()
+        found[tile["content"]["uri"]] = tile | read_pnts((folder / tile["content"]["uri"]).read_bytes())
+        box = np.array(tile["boundingVolume"]["box"])
+        low, high = box[:3] - box[[3, 7, 11]] - 1e-6, box[:3] + box[[3, 7, 11]] + 1e-6
+        positions = found[tile["content"]["uri"]]["positions"]
+        assert (positions >= low).all() and (positions <= high).all()
+        if parent is not None:
+            assert (low >= parent[0]).all() and (high <= parent[1]).all()
+        left += [(child, (low - 1e-6, high + 1e-6)) for child in tile.get("children", [])]
+        assert all(child["geometricError"] < tile["geometricError"] for child in tile.get("children", []))
+    assert {path.name for path in folder.iterdir()} == {*found, "tileset.json"}
+    return tileset, found
+
+
+def read_pnts(content: bytes) -> dict:
+    magic, version, length, *sizes = struct.unpack_from("<4s6I", content)
+    assert (magic, version, length) == (b"pnts", 1, len(content)) and (28 + sizes[0]) % 8 == 0
+    ends = 28 + np.cumsum([0, *sizes])
+    features, body, batch, columns = (content[start:end] for start, end in zip(ends[:-1], ends[1:]))
+    assert not (ends % 4).any() and ends[-1] == length
+    features, batch = json.loads(features), json.loads(batch)
+    count = features["POINTS_LENGTH"]
+    offsets = np.frombuffer(body, "<f4", 3 * count, features["POSITION"]["byteOffset"]).reshape(-1, 3)
+    kinds = {"FLOAT": "<f4", "UNSIGNED_SHORT": "<u2", "UNSIGNED_BYTE": "u1"}
+    found = {
+        name: np.frombuffer(columns, kinds[entry["componentType"]], count, entry["byteOffset"])
+        for name, entry in batch.items()
+    }
+    colors = np.frombuffer(body, "u1", 3 * count, features["RGB"]["byteOffset"]).reshape(-1, 3)
+    return found | {"positions": offsets.astype(float) + features["RTC_CENTER"], "colors": colors}
+
+
+@pytest.mark.parametrize("georeference", [UTM, ENU, None])
+def test_3d_tiles_lie_where_proj_says_with_all_they_have(tmp_path, small_nodes, georeference):
+    scene = scene_of(tmp_path, site(6000), georeference)
+    laz.write(scene, Export())
+    figures = tiles3d.write(scene, Export())
+    tileset, tiles = tiles_of(scene.export / "3dtiles")
+    assert figures["points"] == 6000 and figures["tiles"] == len(tiles) > 20
+    las = laspy.read(laz.outputs(scene, Export())[0])
+    names = ("classification", "label", "state", "num_views", "confidence")
+    whole = {name: np.concatenate([tile[name] for tile in tiles.values()]) for name in (*names, "positions", "colors")}
+    positions = whole["positions"]
+    if georeference is not None:
+        matrix = np.array(tileset["root"]["transform"]).reshape(4, 4).T
+        positions = positions @ matrix[:3, :3].T + matrix[:3, 3]
+        back = pyproj.Transformer.from_crs(4978, 4979, always_xy=True).transform(*positions.T)
+        east, north = pyproj.Proj("EPSG:32615")(back[0], back[1])
+        positions = np.column_stack([east, north, back[2]])
+        up = matrix[:3, :3] @ [0, 0, 1]
+        assert up @ matrix[:3, 3] > 0.99 * np.linalg.norm(matrix[:3, 3])
+    else:
+        assert "transform" not in tileset["root"]
+    keys = ("confidence", "num_views", "label")
+    ours, theirs = (np.lexsort([np.asarray(table[key]) for key in keys]) for table in (whole, las))
+    assert np.abs(positions[ours] - las.xyz[theirs]).max() < 0.0025
+    for name in names:
+        assert (whole[name][ours] == np.asarray(las[name])[theirs]).all()
+    assert (whole["colors"][ours] == np.stack([las.red, las.green, las.blue], 1)[theirs] // 257).all()
+
+
+def test_3d_tiles_in_another_reader(tmp_path, small_nodes):
+    py3dtiles = pytest.importorskip("py3dtiles.tileset")
+    from py3dtiles.tileset.content import read_binary_tile_content
+
+    scene = scene_of(tmp_path, site(6000), ENU)
+    tiles3d.write(scene, Export())
+    tileset = py3dtiles.TileSet.from_file(scene.export / "3dtiles" / "tileset.json")
+    count, left = 0, [tileset.root_tile]
+    while left:
+        tile = left.pop()
+        left += tile.children
+        body = read_binary_tile_content(scene.export / "3dtiles" / str(tile.content_uri)).body
+        count += body.feature_table.nb_points()
+        assert len(body.batch_table.get_binary_property("classification")) == body.feature_table.nb_points()
+    assert count == 6000
