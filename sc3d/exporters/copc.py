@@ -26,7 +26,9 @@ from sc3d.settings.common import Resources
 from sc3d.settings.outputs import Export
 from sc3d.tiling.memory import max_points
 
-INFO = struct.Struct("<5d2Q2d88x")  # center, half side, spacing; hierarchy's place and size; GPS times; reserved
+INFO = struct.Struct(
+    "<5d2Q2d88x"
+)  # center, half side, spacing; hierarchy's place and size; GPS times; reserved
 ENTRY = struct.Struct("<4iQ2i")  # level, x, y, z; place, bytes and points of a chunk
 EVLR = struct.Struct("<2x16sHQ32s")
 LARGEST_PART = 2_000_000  # points that are worked on at a time, where the memory allows
@@ -75,11 +77,9 @@ def _write(
     header.vlrs.append(laspy.vlrs.known.LasZipVlr(laszip.record_data()))
     header.are_points_compressed = True
     header.point_count = header.number_of_points_by_return[0] = found.num_points
-    header.mins, header.maxs = (
-        end * header.scales + header.offsets for end in found.whole_box()
-    )
+    header.mins, header.maxs = (end * header.scales + header.offsets for end in found.whole_box())
     header.write_to(file)
-    compressor, counts = lazrs.LasZipCompressor(file, laszip), {}
+    compressor, counts = lazrs.LasZipCompressor(file, laszip), dict[Node, int]()
     for node, points in nodes:
         if counts:
             compressor.finish_current_chunk()  # not the last, which `done` ends

@@ -72,7 +72,9 @@ class Gltf:
         parts = urlsplit(uri)
         target = self.path.parent / unquote(parts.path)
         if parts.scheme or not resolved(target).is_relative_to(resolved(self.path.parent)):
-            raise InputError(f"{self.path} names {uri[:80]!r}, which is not in its folder: put the file there")
+            raise InputError(
+                f"{self.path} names {uri[:80]!r}, which is not in its folder: put the file there"
+            )
         return target
 
 

@@ -151,7 +151,10 @@ def _first(found: dict[str, list[Path]], kind: str, file: Path) -> Any:
     paths = found.get(kind, [])
     if len(paths) > 1:
         logger.warning(
-            "%s: only %s is read, left out: %s", file, paths[0].name, examples([path.name for path in paths[1:]])
+            "%s: only %s is read, left out: %s",
+            file,
+            paths[0].name,
+            examples([path.name for path in paths[1:]]),
         )
     return read_json(paths[0]) if paths else None
 

@@ -77,7 +77,9 @@ class _Scan:
         """
         axes = next((names for names in (CARTESIAN, SPHERICAL) if set(names) <= self._fields), None)
         if axes is None:
-            raise InputError(f"{self._where} has neither x, y, z nor range, azimuth and elevation of its points")
+            raise InputError(
+                f"{self._where} has neither x, y, z nor range, azimuth and elevation of its points"
+            )
         extra = [name for name in (*COLORS, "intensity", INVALID[axes is SPHERICAL]) if name in self._fields]
         columns = self._read([*axes, *extra])
         points = np.stack([columns[name] for name in axes], axis=1)
@@ -121,8 +123,12 @@ def _colors(tables: list[dict[str, np.ndarray]], valid: list[np.ndarray], path: 
     if len(bare) == len(tables):
         return None
     if bare:
-        logger.warning("%s: %d of %d scans have no colors: their points are gray", path, len(bare), len(tables))
-    stored = np.concatenate([table["colors"][kept] for table, kept in zip(tables, valid) if "colors" in table])
+        logger.warning(
+            "%s: %d of %d scans have no colors: their points are gray", path, len(bare), len(tables)
+        )
+    stored = np.concatenate(
+        [table["colors"][kept] for table, kept in zip(tables, valid) if "colors" in table]
+    )
     whole = stored.max(initial=0) > 1 and bool((stored == np.rint(stored)).all())
     made = iter(np.split(to_bytes(stored.astype(np.int64) if whole else stored, path), _ends(tables, valid)))
     return np.concatenate(

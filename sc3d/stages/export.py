@@ -28,7 +28,12 @@ MODULES = {
     "kml": "camera_files",
     "csv": "camera_files",
 }
-CAMERAS_ONLY = {"transforms", "colmap-text", "kml", "csv"}  # formats that hold no labels, and so need no class table
+CAMERAS_ONLY = {
+    "transforms",
+    "colmap-text",
+    "kml",
+    "csv",
+}  # formats that hold no labels, and so need no class table
 
 
 def inputs(scene: Scene, settings: Export) -> list[Path]:

@@ -203,7 +203,9 @@ class Profile:
     def csv(self, spacing: float, unit: str) -> str:
         """`table` as text."""
         head = f"distance_{unit},lowest_{unit},median_{unit},highest_{unit},points"
-        rows = [f"{row[0]:.3f},{row[1]:.3f},{row[2]:.3f},{row[3]:.3f},{row[4]:.0f}" for row in self.table(spacing)]
+        rows = [
+            f"{row[0]:.3f},{row[1]:.3f},{row[2]:.3f},{row[3]:.3f},{row[4]:.0f}" for row in self.table(spacing)
+        ]
         return "\n".join([head, *rows]) + "\n"
 
 
@@ -213,7 +215,9 @@ def _plan_of(corners: np.ndarray) -> np.ndarray:
     return plan[np.concatenate([[True], (np.diff(plan, axis=0) != 0).any(axis=1)])]
 
 
-def _nearest_on_line(plan: np.ndarray, bends: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _nearest_on_line(
+    plan: np.ndarray, bends: np.ndarray, starts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Where on a line points (N, 2) are, and how far from it; infinitely far before its start and behind its
     end.
 

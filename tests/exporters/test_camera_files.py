@@ -28,7 +28,9 @@ AIMS = np.array([[0.0, 0, 0], [0, 40, 50.0], [60, 5, 60], [-41, 9.5, -9]])
 
 def scene_of(path, georeference=ENU) -> Scene:
     lens = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=[400, 400, 160, 120], camera_id=1)
-    views = [View(f"a & b/{row}.jpg", lens, look_at(eye, aim)) for row, (eye, aim) in enumerate(zip(EYES, AIMS))]
+    views = [
+        View(f"a & b/{row}.jpg", lens, look_at(eye, aim)) for row, (eye, aim) in enumerate(zip(EYES, AIMS))
+    ]
     write_model(path / "sparse" / "0", views)
     if georeference is not None:
         (path / "georeference.json").write_text(json.dumps(georeference))
@@ -64,7 +66,9 @@ def test_positions_and_directions_on_earth(tmp_path):
 def test_angles_give_the_orientation_back(tmp_path):
     scene = scene_of(tmp_path)
     camera_files.write(scene, BOTH)
-    east = np.array(pyproj.Proj("EPSG:32615").get_factors(ENU["origin"][1], ENU["origin"][0]).meridian_convergence)
+    east = np.array(
+        pyproj.Proj("EPSG:32615").get_factors(ENU["origin"][1], ENU["origin"][0]).meridian_convergence
+    )
     turn = Rotation.from_euler("z", float(east), degrees=True).as_matrix()  # grid north is not true north
     for row, view in zip(table(scene), scene.model.views):
         back = Rotation.from_euler("XYZ", numbers(row, "omega", "phi", "kappa"), degrees=True).as_matrix()
@@ -80,12 +84,21 @@ def test_kml_is_well_formed_and_says_the_same(tmp_path):
     main(["export", str(scene.path), "--format", "kml", "csv"])
     root = ElementTree.parse(scene.export / "cameras.kml").getroot()
     marks, rows = root.findall(".//Placemark", KML), table(scene)
-    assert [mark.findtext("name", None, KML) for mark in marks] == [row["photo"] for row in rows] and len(rows) == 4
+    assert [mark.findtext("name", None, KML) for mark in marks] == [row["photo"] for row in rows] and len(
+        rows
+    ) == 4
     for mark, row in zip(marks, rows):
         camera = mark.find("Camera", KML)
-        found = [float(camera.findtext(name, None, KML)) for name in ("longitude", "latitude", "heading", "tilt", "roll")]
-        assert found == pytest.approx(numbers(row, "longitude", "latitude", "heading", "tilt", "roll"), abs=1e-4)
-        assert mark.findtext("Point/coordinates", None, KML).startswith(f"{row['longitude']},{row['latitude']},")
+        found = [
+            float(camera.findtext(name, None, KML))
+            for name in ("longitude", "latitude", "heading", "tilt", "roll")
+        ]
+        assert found == pytest.approx(
+            numbers(row, "longitude", "latitude", "heading", "tilt", "roll"), abs=1e-4
+        )
+        assert mark.findtext("Point/coordinates", None, KML).startswith(
+            f"{row['longitude']},{row['latitude']},"
+        )
 
 
 def test_without_a_place(tmp_path):

@@ -18,7 +18,9 @@ from tests.exporters.test_laz import ENU, UTM
 def site(count: int = 30_000, seed: int = 1) -> np.ndarray:
     """(N, 3) a hilly site of 90 m x 60 m, with a dense corner."""
     rng = np.random.default_rng(seed)
-    plan = np.concatenate([rng.uniform(0, [90, 60], (count - count // 5, 2)), rng.uniform(20, 24, (count // 5, 2))])
+    plan = np.concatenate(
+        [rng.uniform(0, [90, 60], (count - count // 5, 2)), rng.uniform(20, 24, (count // 5, 2))]
+    )
     return np.column_stack([plan, 3 * np.sin(plan[:, 0] / 9) + rng.normal(0, 0.05, count)]) - [40, 30, 0]
 
 
@@ -34,7 +36,9 @@ def small_nodes(monkeypatch):
 
 def scene_of(path, points=None, georeference=UTM):
     points = site() if points is None else points
-    return write_scene(path, labelled_cloud(points, np.random.default_rng(2).choice([0, 1, 2, 4], len(points))), georeference)
+    return write_scene(
+        path, labelled_cloud(points, np.random.default_rng(2).choice([0, 1, 2, 4], len(points))), georeference
+    )
 
 
 def as_rows(points) -> np.ndarray:
@@ -50,7 +54,9 @@ def test_copc_has_the_points_of_laz_with_all_they_have(tmp_path, small_nodes):
     assert (as_rows(streamed.points) == as_rows(plain.points)).all() and figures["points"] == 30_000
     assert figures["levels"] >= 4 and figures["nodes"] > 50
     assert streamed.header.parse_crs().to_epsg() == 32615
-    assert (streamed.header.mins == plain.header.mins).all() and (streamed.header.maxs == plain.header.maxs).all()
+    assert (streamed.header.mins == plain.header.mins).all() and (
+        streamed.header.maxs == plain.header.maxs
+    ).all()
     assert not list(scene.export.glob(".*"))
 
 
@@ -69,7 +75,9 @@ def test_copc_queries_by_bounds_and_level(tmp_path, small_nodes):
         levels = [reader.query(level=level) for level in range(6)]
         coarse = levels[0]
         spacing = reader.copc_info.spacing
-        covered = {tuple(cell) for cell in np.floor((np.stack([coarse.x, coarse.y], 1)) / (4 * spacing)).astype(int)}
+        covered = {
+            tuple(cell) for cell in np.floor((np.stack([coarse.x, coarse.y], 1)) / (4 * spacing)).astype(int)
+        }
         assert covered == {tuple(cell) for cell in np.floor(whole[:, :2] / (4 * spacing)).astype(int)}
         assert len(coarse) < len(levels[1]) and sum(map(len, levels)) <= len(whole)
 
@@ -172,7 +180,10 @@ def test_3d_tiles_lie_where_proj_says_with_all_they_have(tmp_path, small_nodes, 
     assert figures["points"] == 6000 and figures["tiles"] == len(tiles) > 20
     las = laspy.read(laz.outputs(scene, Export())[0])
     names = ("classification", "label", "state", "num_views", "confidence")
-    whole = {name: np.concatenate([tile[name] for tile in tiles.values()]) for name in (*names, "positions", "colors")}
+    whole = {
+        name: np.concatenate([tile[name] for tile in tiles.values()])
+        for name in (*names, "positions", "colors")
+    }
     positions = whole["positions"]
     if georeference is not None:
         matrix = np.array(tileset["root"]["transform"]).reshape(4, 4).T

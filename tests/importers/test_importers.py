@@ -208,7 +208,12 @@ def write_opf(folder: Path, views: list[View], points: np.ndarray, frame: dict |
     for uid, view in zip(ids, views):
         rotation = view.cam_from_world[:3, :3].T * [1, -1, -1]
         angles = Rotation.from_matrix(rotation).as_euler("XYZ", degrees=True)
-        camera = {"id": uid, "sensor_id": 7, "orientation_deg": angles.tolist(), "position": view.center.tolist()}
+        camera = {
+            "id": uid,
+            "sensor_id": 7,
+            "orientation_deg": angles.tolist(),
+            "position": view.center.tolist(),
+        }
         cameras.append(camera)
     listed = [{"id": uid, "uri": f"../photos/{view.name}"} for uid, view in zip(ids, views)]
     documents = {
@@ -222,7 +227,9 @@ def write_opf(folder: Path, views: list[View], points: np.ndarray, frame: dict |
         kind = f"application/opf-{name}+json"
         if content is not None:
             (folder / f"{name}.json").write_text(json.dumps({"format": kind, "version": "1.0", **content}))
-            items.append({"type": name.replace("-", "_"), "resources": [{"format": kind, "uri": f"{name}.json"}]})
+            items.append(
+                {"type": name.replace("-", "_"), "resources": [{"format": kind, "uri": f"{name}.json"}]}
+            )
     items.append({"type": "calibration", "resources": [{"format": "model/gltf+json", "uri": "tracks.gltf"}]})
     write_opf_tracks(folder, ids, views, points)
     project_file = {"format": "application/opf-project+json", "version": "1.0", "items": items}
@@ -233,7 +240,9 @@ def write_opf_tracks(folder: Path, ids: list[int], views: list[View], points: np
     seen = [list(range(row % 3, len(views), 3)) for row in range(len(points))]
     counts = np.array([len(rows) for rows in seen])
     first = np.cumsum(counts) - counts
-    ranges = b"".join(int(a).to_bytes(5, "little") + int(n).to_bytes(3, "little") for a, n in zip(first, counts))
+    ranges = b"".join(
+        int(a).to_bytes(5, "little") + int(n).to_bytes(3, "little") for a, n in zip(first, counts)
+    )
     pixels = [project(views[view], points[row][None])[0][0] for row, rows in enumerate(seen) for view in rows]
     arrays = [
         (points[:, [0, 2, 1]] * [1, 1, -1]).astype("<f4"),
@@ -245,7 +254,12 @@ def write_opf_tracks(folder: Path, ids: list[int], views: list[View], points: np
     kinds = [("VEC3", 5126), ("VEC4", 5121), ("SCALAR", 5125), ("VEC2", 5125), ("VEC2", 5126)]
     offsets = np.cumsum([0, *(array.nbytes for array in arrays)])
     (folder / "tracks.bin").write_bytes(b"".join(array.tobytes() for array in arrays))
-    extension = {"cameraUids": ids, "cameraIds": 2, "pointIndexRanges": 3, "imagePoints": {"pixelCoordinates": 4}}
+    extension = {
+        "cameraUids": ids,
+        "cameraIds": 2,
+        "pointIndexRanges": 3,
+        "imagePoints": {"pixelCoordinates": 4},
+    }
     primitive = {
         "attributes": {"POSITION": 0, "COLOR_0": 1},
         "mode": 0,
@@ -460,13 +474,20 @@ class TestRoundTrips:
 
     @pytest.mark.parametrize(
         ("epsg", "vertical", "scale", "unit"),
-        [(32615, "", [1.0, 1, 1], 1.0), (2229, "", [1200 / 3937] * 3, 1200 / 3937), (32615, "+6360", [1, 1, 1200 / 3937], 1)],
+        [
+            (32615, "", [1.0, 1, 1], 1.0),
+            (2229, "", [1200 / 3937] * 3, 1200 / 3937),
+            (32615, "+6360", [1, 1, 1200 / 3937], 1),
+        ],
     )
     def test_opf(self, tmp_path, caplog, epsg, vertical, scale, unit):
         """6360: heights in US survey feet."""
         shift = [-576600.0 * scale[0], -5188100.0 * scale[1], -150.0 * scale[2]]
         definition = pyproj.CRS.from_user_input(f"EPSG:{epsg}{vertical}").to_wkt()
-        frame = {"crs": {"definition": definition}, "base_to_canonical": {"scale": scale, "shift": shift, "swap_xy": False}}
+        frame = {
+            "crs": {"definition": definition},
+            "base_to_canonical": {"scale": scale, "shift": shift, "swap_xy": False},
+        }
         views, points = self.opf_site(tmp_path, frame)
         run("import", tmp_path / "project", tmp_path / "scene")
         model = Scene(tmp_path / "scene").model
@@ -475,7 +496,9 @@ class TestRoundTrips:
         found = read_georeference(Scene(tmp_path / "scene"))
         base = found.to_crs(points)
         # base coordinates times scale, plus shift, heights in the unit of eastings
-        assert found.epsg == epsg and np.abs((base[:, :2] * scale[:2] + shift[:2]) - points[:, :2]).max() < 1e-6
+        assert (
+            found.epsg == epsg and np.abs((base[:, :2] * scale[:2] + shift[:2]) - points[:, :2]).max() < 1e-6
+        )
         assert np.abs(base[:, 2] * unit - (points[:, 2] - shift[2])).max() < 1e-6
         loaded = load_model(Scene(tmp_path / "scene").sparse)
         for point in list(loaded.points3D.values())[:9]:

@@ -20,7 +20,9 @@ QUARTER = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])  # wxyz, 90 degrees about
 def points(count: int = 50, seed: int = 0) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     columns = {f"cartesian{axis}": rng.uniform(-5, 5, count) for axis in "XYZ"}
-    columns |= {f"color{name}": rng.integers(0, 256, count).astype(np.uint8) for name in ("Red", "Green", "Blue")}
+    columns |= {
+        f"color{name}": rng.integers(0, 256, count).astype(np.uint8) for name in ("Red", "Green", "Blue")
+    }
     return columns | {"intensity": rng.random(count).astype(np.float32)}
 
 
@@ -33,7 +35,11 @@ def write(path, *scans, crs: str = ""):
     library = pytest.importorskip("pye57", reason="E57 files need pye57: pip install 'sc3d[e57]'").libe57
     file = library.ImageFile(str(path), "w")
     file.extensionsAdd("", library.E57_V1_0_URI)
-    for name, value in (("formatName", "ASTM E57 3D Imaging Data File"), ("guid", "a"), ("coordinateMetadata", crs)):
+    for name, value in (
+        ("formatName", "ASTM E57 3D Imaging Data File"),
+        ("guid", "a"),
+        ("coordinateMetadata", crs),
+    ):
         file.root().set(name, library.StringNode(file, value))
     file.root().set("versionMajor", library.IntegerNode(file, 1))
     file.root().set("versionMinor", library.IntegerNode(file, 0))
@@ -50,7 +56,10 @@ def write(path, *scans, crs: str = ""):
         points = library.CompressedVectorNode(file, kinds, library.VectorNode(file, True))
         scan.set("points", points)
         data.append(scan)
-        buffers, stored = library.VectorSourceDestBuffer(), {name: column.astype(float) for name, column in columns.items()}
+        buffers, stored = (
+            library.VectorSourceDestBuffer(),
+            {name: column.astype(float) for name, column in columns.items()},
+        )
         for name, column in stored.items():
             buffers.append(library.SourceDestBuffer(file, name, column, len(column), True, True))
         writer = points.writer(buffers)
@@ -74,14 +83,23 @@ def pose(library, file, rotation, translation):
 def test_scans_are_placed_by_their_poses_with_all_they_have(tmp_path):
     first, second = points(50), points(30, 1)
     offset = np.array([512345.0, 5187654.0, 210.0])
-    path = write(tmp_path / "a.e57", (first, QUARTER, offset), (second, None, None), crs=pyproj.CRS(32632).to_wkt())
+    path = write(
+        tmp_path / "a.e57", (first, QUARTER, offset), (second, None, None), crs=pyproj.CRS(32632).to_wkt()
+    )
     found = read_geometry(path)
     turned = xyz(first)[:, [1, 0, 2]] * [-1, 1, 1] + offset
     assert np.abs(found.positions - np.concatenate([turned, xyz(second)])).max() < 1e-9
-    colors = [np.stack([scan[f"color{name}"] for name in ("Red", "Green", "Blue")], 1) for scan in (first, second)]
+    colors = [
+        np.stack([scan[f"color{name}"] for name in ("Red", "Green", "Blue")], 1) for scan in (first, second)
+    ]
     assert (found.colors == np.concatenate(colors)).all() and found.epsg == 32632
     assert (found.attributes["scan"] == np.repeat([0, 1], [50, 30])).all()
-    assert np.abs(found.attributes["intensity"] - np.concatenate([first["intensity"], second["intensity"]])).max() < 1e-6
+    assert (
+        np.abs(
+            found.attributes["intensity"] - np.concatenate([first["intensity"], second["intensity"]])
+        ).max()
+        < 1e-6
+    )
 
 
 def test_invalid_points_and_scans_without_colors_are_told(tmp_path, caplog):
@@ -89,10 +107,14 @@ def test_invalid_points_and_scans_without_colors_are_told(tmp_path, caplog):
     state = np.zeros(50, np.int8)
     state[3:7] = 2
     bare = {name: column for name, column in second.items() if "color" not in name}
-    found = read_e57(write(tmp_path / "a.e57", (first | {"cartesianInvalidState": state}, None, None), (bare, None, None)))
+    found = read_e57(
+        write(tmp_path / "a.e57", (first | {"cartesianInvalidState": state}, None, None), (bare, None, None))
+    )
     assert np.abs(found.positions - np.concatenate([xyz(first)[state == 0], xyz(second)])).max() < 1e-9
     assert (found.colors[-10:] == 128).all() and found.intensity is not None
-    assert "4 of 60 points are marked as invalid" in caplog.text and "1 of 2 scans have no colors" in caplog.text
+    assert (
+        "4 of 60 points are marked as invalid" in caplog.text and "1 of 2 scans have no colors" in caplog.text
+    )
 
 
 def test_spherical_coordinates(tmp_path):

@@ -78,7 +78,7 @@ class CorrectionPanel:
     def stop(self) -> None:
         """Put the tool away."""
         if self._tool.value != OFF:
-            self._tool.value = OFF
+            self._tool.value = OFF  # type: ignore[misc]  # viser types it as read-only
 
     def _try(self, action: Callable[[], None], lock: AbstractContextManager | None = None) -> None:
         """Do one thing at a time, and say why it failed."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 from collections.abc import Callable
@@ -27,7 +26,9 @@ logger = logging.getLogger(__name__)
 OFF, COORDINATES, DISTANCE, AREA, PROFILE = "off", "coordinates", "distance", "area", "profile"
 TOOLS = (OFF, COORDINATES, DISTANCE, AREA, PROFILE)
 LEAST = {COORDINATES: 1, DISTANCE: 2, AREA: 3, PROFILE: 2}  # points of a measurement
-HINT = "Shift + click: a point on the first surface; or move the view by keys and take its middle, or type one"
+HINT = (
+    "Shift + click: a point on the first surface; or move the view by keys and take its middle, or type one"
+)
 MIDDLE, TYPED = "Middle of view", "Typed point"
 BACK, CLEAR = "Remove last", "Clear"
 _COLOR, _WIDTH = (0, 90, 255), 3.0  # of the line; px
@@ -54,7 +55,10 @@ class MeasurePanel:
         with gui.add_folder("Measure"):
             self._tool = gui.add_dropdown("Measure", TOOLS, initial_value=OFF)
             self._half_width = gui.add_number(
-                f"Half width, {self._frame.unit}", float(f"{3 * spacing * meters:.2g}"), min=0.0, visible=False
+                f"Half width, {self._frame.unit}",
+                float(f"{3 * spacing * meters:.2g}"),
+                min=0.0,
+                visible=False,
             )
             self._typed = gui.add_text("Point", "", hint=f"{' '.join(self._frame.axes)}, {self._frame.name}")
             self._add = gui.add_button_group("Add", (MIDDLE, TYPED))
@@ -74,7 +78,7 @@ class MeasurePanel:
     def stop(self) -> None:
         """Put the tool away."""
         if self._tool.value != OFF:
-            self._tool.value = OFF
+            self._tool.value = OFF  # type: ignore[misc]  # viser types it as read-only
 
     def _try(self, action: Callable[[], None]) -> None:
         """Do one thing at a time, and say why it failed."""
@@ -157,7 +161,9 @@ class MeasurePanel:
             self._text.content = _note(f"{HINT}; {missing} more") + self._coordinates()
             return
         corners, unit = self._frame.lengths(np.array(self._corners)), self._frame.unit
-        found = {COORDINATES: "", DISTANCE: _line_html(corners, unit), AREA: _area_html(corners, unit)}.get(tool)
+        found = {COORDINATES: "", DISTANCE: _line_html(corners, unit), AREA: _area_html(corners, unit)}.get(
+            tool
+        )
         self._text.content = (self._profile(corners) if found is None else found) + self._coordinates()
 
     def _coordinates(self) -> str:
@@ -167,9 +173,9 @@ class MeasurePanel:
         rows = [self._frame.tell(row) for row in self._frame.coordinates(np.array(self._corners))]
         text = "\n".join([",".join(self._frame.axes), *(",".join(row) for row in rows)])
         copied = " ".join(rows[0]) if len(rows) == 1 else text
-        return _table([(self._frame.name, "")] + [(str(place), " ".join(row)) for place, row in enumerate(rows, 1)]) + (
-            _copy_button("Copy coordinates", copied)
-        )
+        return _table(
+            [(self._frame.name, "")] + [(str(place), " ".join(row)) for place, row in enumerate(rows, 1)]
+        ) + (_copy_button("Copy coordinates", copied))
 
     def _profile(self, corners: np.ndarray) -> str:
         unit, display = self._frame.unit, self._page.display
@@ -184,7 +190,11 @@ class MeasurePanel:
             ("height", f"{profile.height.min():.3f} to {profile.height.max():.3f} {unit}"),
             ("rows of the CSV", f"each {profile.step(spacing):.3g} {unit}"),
         ]
-        return _table(facts) + profile_svg(profile, colors, unit) + _copy_button("Copy CSV", profile.csv(spacing, unit))
+        return (
+            _table(facts)
+            + profile_svg(profile, colors, unit)
+            + _copy_button("Copy CSV", profile.csv(spacing, unit))
+        )
 
     @cached_property
     def _in_display(self) -> np.ndarray:
@@ -215,7 +225,7 @@ class MeasurePanel:
             self._drawn.append(ball)
         ends = np.roll(corners, -1, axis=0)
         lines = np.stack([corners, ends], axis=1)[: None if closed and len(corners) > 2 else -1]
-        lines = lines + np.float32([0, 0, radius])  # over the drawn points, not within them
+        lines = lines + np.array([0, 0, radius], np.float32)  # over the drawn points, not within them
         if len(lines):
             self._drawn.append(
                 scene.add_line_segments(

@@ -22,7 +22,9 @@ from tests.view.web.test_page import Visit, browser, home_of, in_canvas, visit  
 STEP = 0.5  # m, the grass lies above the road
 
 
-@pytest.fixture(scope="module", params=[True, pytest.param(False, marks=pytest.mark.slow)], ids=["on Earth", "somewhere"])
+@pytest.fixture(
+    scope="module", params=[True, pytest.param(False, marks=pytest.mark.slow)], ids=["on Earth", "somewhere"]
+)
 def scene(request, tmp_path_factory) -> Scene:
     found = labelled_scene(tmp_path_factory.mktemp("measure") / "scene")
     cloud = read_cloud(found.labelled)
@@ -47,8 +49,10 @@ def measured(scene, browser) -> Iterator[Visit]:  # noqa: F811
         found.page.get_by_text("Color by", exact=True).wait_for()
         found.page.locator(".mantine-Notification-closeButton").click()
         found.wait_for(
-            lambda: all((found.picture == color).all(axis=-1).mean() > 0.02 for color in (ROAD, GRASS))
-            and found.is_still(),
+            lambda: (
+                all((found.picture == color).all(axis=-1).mean() > 0.02 for color in (ROAD, GRASS))
+                and found.is_still()
+            ),
             "the cloud",
         )
         yield found
@@ -103,7 +107,10 @@ def test_measures_by_clicks(scene, measured):
     click(measured, scene, (-2, -1))
     assert measured.page.get_by_text(frame, exact=True).count() == 1
     assert np.abs(np.array(row(measured, "1")) - ORIGIN - [-2, -1, 0]).max() < 0.2
-    assert np.abs(np.array(copied(measured, "Copy coordinates").split(), float) - row(measured, "1")).max() < 1e-9
+    assert (
+        np.abs(np.array(copied(measured, "Copy coordinates").split(), float) - row(measured, "1")).max()
+        < 1e-9
+    )
     press(measured, "Clear")
     choose(measured, "Measure", "distance")
     click(measured, scene, (-3, -2), (1, -2))
@@ -139,7 +146,9 @@ def test_measures_by_keys_alone(scene, measured):
     assert row(measured, "length on the plan") == pytest.approx([6], abs=1e-6)
     lines = copied(measured, "Copy CSV").splitlines()
     table = np.array([line.split(",") for line in lines[1:]], float)
-    assert lines[0].startswith("distance_m," if (scene.path / "georeference.json").exists() else "distance_units,")
+    assert lines[0].startswith(
+        "distance_m," if (scene.path / "georeference.json").exists() else "distance_units,"
+    )
     expected = ORIGIN[2] + np.where(table[:, 0] > 3.1, STEP, 0)
     clear = np.abs(table[:, 0] - 3) > 0.3
     assert np.abs(table[clear, 2] - expected[clear]).max() < 2e-3
@@ -163,9 +172,13 @@ def test_measures_by_keys_alone(scene, measured):
 def test_one_tool_at_a_time(scene, measured):
     choose(measured, "Measure", "distance")
     choose(measured, "Tool", "brush")
-    measured.wait_for(lambda: measured.page.get_by_label("Measure", exact=True).first.input_value() == "off", "off")
+    measured.wait_for(
+        lambda: measured.page.get_by_label("Measure", exact=True).first.input_value() == "off", "off"
+    )
     choose(measured, "Measure", "area")
-    measured.wait_for(lambda: measured.page.get_by_label("Tool", exact=True).first.input_value() == "off", "off")
+    measured.wait_for(
+        lambda: measured.page.get_by_label("Tool", exact=True).first.input_value() == "off", "off"
+    )
     click(measured, scene, (2, 1))
     assert not scene.corrections.exists()
     choose(measured, "Measure", "off")
