@@ -26,9 +26,8 @@ from sc3d.settings.common import Resources
 from sc3d.settings.outputs import Export
 from sc3d.tiling.memory import max_points
 
-INFO = struct.Struct(
-    "<5d2Q2d88x"
-)  # center, half side, spacing; hierarchy's place and size; GPS times; reserved
+# center, half side, spacing; place and size of the hierarchy; GPS times; reserved
+INFO = struct.Struct("<5d2Q2d88x")
 ENTRY = struct.Struct("<4iQ2i")  # level, x, y, z; place, bytes and points of a chunk
 EVLR = struct.Struct("<2x16sHQ32s")
 LARGEST_PART = 2_000_000  # points that are worked on at a time, where the memory allows
@@ -54,7 +53,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
 @contextmanager
 def octree_folder(path: Path, found: Survey) -> Iterator[Path]:
     """An empty folder beside an output for the cloud in parts; OSError if there is no room for it."""
-    require_room(path, 2 * found.num_points * found.header.point_format.size)
+    require_room(path, 3 * found.num_points * found.header.point_format.size // 2)
     with tempfile.TemporaryDirectory(prefix=temporary_name("octree"), dir=path.parent) as folder:
         yield Path(folder)
 

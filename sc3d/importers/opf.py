@@ -81,7 +81,12 @@ def read(path: Path, settings: Import) -> Project:
         lens = lenses.camera(_distortion(internals, sizes[camera["sensor_id"]]), where)
         views.append(View(name, lens, _pose(camera, where)))
         uids.append(camera["id"])
-    seen = {camera["id"] for camera in documents["calibrated-cameras"]["cameras"]}
+    cameras = documents["calibrated-cameras"]["cameras"]
+    if rolling := sum(any(camera.get("rolling_shutter") or []) for camera in cameras):
+        logger.warning(
+            "%s: %d photos have a rolling shutter: each is read as if exposed at once", file, rolling
+        )
+    seen = {camera["id"] for camera in cameras}
     if missing := [name for uid, name in names.items() if uid not in seen]:
         left_out["that are not calibrated"] = missing
     lenses.warn(file)
