@@ -1,6 +1,7 @@
 """COPC and 3D Tiles: every point once, in nodes that thin the cloud evenly, read back by other programs."""
 
 import json
+import os
 import struct
 
 import laspy
@@ -8,8 +9,11 @@ import numpy as np
 import pyproj
 import pytest
 
-from sc3d.exporters import copc, laz, octree, tiles3d
+from sc3d.errors import InputError
+from sc3d.exporters import copc, laz, octree, projected_cloud, tiles3d
 from sc3d.exporters.octree import Node, Octree
+from sc3d.io.atomic import temporary_name
+from sc3d.runner import execute
 from sc3d.settings.outputs import Export
 from tests.builders import labelled_cloud, write_scene
 from tests.exporters.test_laz import ENU, UTM
@@ -99,11 +103,29 @@ def test_copc_in_another_reader(tmp_path, small_nodes):
 
 def test_points_do_not_depend_on_parts(tmp_path, monkeypatch, small_nodes):
     scene, found = scene_of(tmp_path), []
-    for most in (3000, 10**6):
+    for most, needed in (
+        (3000, 250),
+        (10**6, 250),
+        (3000, 1 << 40),
+    ):  # bytes of a point: read as a whole, in parts
         monkeypatch.setattr(copc, "LARGEST_PART", most)
+        monkeypatch.setattr(projected_cloud, "BYTES", needed)
         copc.write(scene, Export())
         found.append(as_rows(laspy.read(copc.outputs(scene, Export())[0]).points))
-    assert (found[0] == found[1]).all()
+    assert (found[0] == found[1]).all() and (found[0] == found[2]).all()
+
+
+def test_memory_decides_nothing(tmp_path):
+    """A finished export stays so, and what a killed one left on disk goes."""
+    scene = scene_of(tmp_path, site(500))
+    left = scene.export / temporary_name("octree").replace(str(os.getpid()), "999999999")
+    (left.with_name(f"{left.name}x1") / "part0").mkdir(parents=True)
+    execute("export", scene, Export(format=("copc",)))
+    first = copc.outputs(scene, Export())[0].stat().st_mtime_ns
+    execute("export", scene, Export(format=("copc",), max_memory="2G"))
+    assert copc.outputs(scene, Export())[0].stat().st_mtime_ns == first and not list(scene.export.glob(".*"))
+    with pytest.raises(InputError, match="--max-memory 2X"):
+        copc.write(scene, Export(format=("copc",), max_memory="2X"))
 
 
 @pytest.mark.parametrize("points", [np.zeros((1, 3)), np.zeros((900, 3)), [[0, 0, 0], [5e5, 0, 0]]])
