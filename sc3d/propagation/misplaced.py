@@ -1,11 +1,10 @@
 """Votes for what stands, on what lies on the ground, and the other way round.
 
 Where the class table says by ASPRS codes which classes lie on the ground and which stand on it, relief checks
-the
-masks: the points voted for each class have two sides, by what the other classes' agreed points look like. If
-    far more of one class than of the others of its level lie on the wrong side, that is no fault of the
-    relief: most votes for this class are wrong, and all views share the error. On each point, as much of its
-    votes as is likely to be wrong then goes to the classes of the other level.
+the masks: the points voted for each class have two sides, by what the other classes' agreed points look like.
+If far more of one class than of the others of its level lie on the wrong side, that is no fault of the relief:
+most votes for this class are wrong, and all views share the error. On each point, as much of its votes as is
+likely to be wrong then goes to the classes of the other level.
 """
 
 from __future__ import annotations

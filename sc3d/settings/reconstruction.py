@@ -161,11 +161,11 @@ class ReconstructCommand:
 @dataclass(frozen=True)
 class Import:
     """Start from another program's project, cloud or mesh: nerfstudio, OpenSfM, ODM, Metashape, Pix4D,
-    COLMAP; PLY, LAS, LAZ, PCD, XYZ, OBJ.
+    OPF, COLMAP; PLY, LAS, LAZ, E57, PCD, XYZ, OBJ.
     """
 
     source: Annotated[
-        Literal["auto", "nerfstudio", "opensfm", "odm", "metashape", "pix4d", "colmap", "cloud"],
+        Literal["auto", "nerfstudio", "opensfm", "odm", "metashape", "pix4d", "opf", "colmap", "cloud"],
         arg(name="from"),
     ] = "auto"
     """What PROJECT is; auto looks at it."""
@@ -174,7 +174,7 @@ class Import:
     say.
     """
     cloud: tuple[Path, ...] = ()
-    """Cloud (PLY, LAS, LAZ, PCD, XYZ) or mesh (PLY, OBJ) that belongs to it, or one of each; becomes
+    """Cloud (PLY, LAS, LAZ, E57, PCD, XYZ) or mesh (PLY, OBJ) that belongs to it, or one of each; becomes
     cloud.ply and mesh.ply.
     """
     epsg: int | None = None
@@ -191,7 +191,7 @@ class Import:
 @dataclass(frozen=True)
 class ImportCommand:
     """Start from another program's project, cloud or mesh: nerfstudio, OpenSfM, ODM, Metashape, Pix4D,
-    COLMAP; PLY, LAS, LAZ, PCD, XYZ, OBJ.
+    OPF, COLMAP; PLY, LAS, LAZ, E57, PCD, XYZ, OBJ.
     """
 
     project: Annotated[
