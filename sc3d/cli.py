@@ -26,22 +26,25 @@ from sc3d.settings.common import Messages
 
 # numba reads it in whatever folder a command is called, also in a scene of somebody else
 NUMBA_FILE = ".numba_config.yaml"
+FIRST = ("run", "check", "reconstruct", "import")  # in the list of commands
 SHELLS = ("bash", "zsh", "tcsh", "fish")
 GROUPED = "\n\nThe everyday options come first, then those of each stage under its name, in the order in which the stages run."
 COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
-WAYS = """From photos to a labelled cloud, the three usual ways:
+WAYS = """From photos to a labelled cloud, the three usual ways (sc3d synthesize SITE makes photos and masks to try them on):
 
-  masks made elsewhere (COCO, LabelMe, CVAT, PNG):
+  photos alone (ground, vegetation and building, from the shape of the scene):
+    sc3d run PHOTOS SCENE
+
+  classes of your own, by masks made elsewhere (COCO, LabelMe, CVAT, PNG) or by a few strokes drawn in the browser:
     sc3d run PHOTOS SCENE --classes CLASSES.json --masks MASKS
 
-  no masks: a few strokes on some photos, drawn in the browser:
     sc3d reconstruct PHOTOS SCENE
     sc3d annotate SCENE                      (needs SCENE/classes.json, the names of the classes)
     sc3d run PHOTOS SCENE --segment.backend strokes
 
-  a cloud and cameras of another program (ODM, Metashape, Pix4D, COLMAP, nerfstudio):
+  a cloud and cameras of another program (ODM, Metashape, Pix4D, COLMAP, nerfstudio), and masks:
     sc3d import PROJECT SCENE --cloud CLOUD
-    sc3d segment SCENE --masks MASKS
+    sc3d segment SCENE --masks MASKS         (needs SCENE/classes.json, or --backend geometry instead of masks)
     sc3d label SCENE
     sc3d propagate SCENE
 
@@ -152,11 +155,13 @@ def reporting_errors() -> Iterator[None]:
 
 
 def usage() -> str:
-    """The list of commands."""
+    """The list of commands, each with the first sentence about it."""
     lines = ["usage: sc3d COMMAND ...   (sc3d COMMAND --help shows the options)", ""]
-    records = {"reconstruct": COMMANDS["reconstruct"]} | STAGES | COMMANDS
+    records = {name: COMMANDS[name] for name in FIRST} | STAGES | COMMANDS
     width = max(map(len, records)) + 2
-    lines += [f"  {name:{width}s}{_describe(record).splitlines()[0]}" for name, record in records.items()]
+    for name, record in records.items():
+        sentence = re.split(r"(?<=[.;]) ", " ".join(_describe(record).split()))[0]
+        lines.append(f"  {name:{width}s}{sentence.rstrip('.;')}")
     return "\n".join(lines) + "\n"
 
 
@@ -183,6 +188,8 @@ def print_completion(arguments: list[str]) -> None:
                 f"{arguments[0]} takes a shell ({', '.join(SHELLS)}){' and a file' * (arguments[0] == COMPLETION[1])}"
             )
         )
+    for file in arguments[2:]:
+        Path(file).parent.mkdir(parents=True, exist_ok=True)
     commands: dict[str, Any] = {name: with_messages(name) for name in sorted(STAGES | COMMANDS)}
     tyro.extras.subcommand_cli_from_dict(commands, prog="sc3d", args=arguments)
 

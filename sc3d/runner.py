@@ -38,7 +38,7 @@ from sc3d.io.json_files import read_json, write_json
 from sc3d.io.progress import under_way
 from sc3d.io.provenance import Input, PhotoFrames, digest, peak_memory_mb, reset_peak_memory, versions
 from sc3d.scene.scene import Scene
-from sc3d.settings.common import Resources, Workers
+from sc3d.settings.common import Resources
 
 logger = logging.getLogger(__name__)
 
@@ -180,7 +180,7 @@ def _room(scene: Scene, outputs: list[Path]) -> Iterator[None]:
 
 def _decisive(settings: Any, scene: Scene) -> dict[str, object]:
     """The settings without those that no result depends on; paths as `_portable` has them."""
-    ignored = {field.name for field in fields(Resources)} if isinstance(settings, Workers) else set()
+    ignored = {field.name for field in fields(Resources)}
     return {name: _plain(value, scene) for name, value in asdict(settings).items() if name not in ignored}
 
 

@@ -121,9 +121,11 @@ def test_usage_and_unknown_command(capsys):
 def test_scripts_in_tools_are_the_commands():
     tools = Path(__file__).parent.parent / "tools"
     assert {file.stem for file in tools.glob("*.py")} - {
+        "check_wheel",
         "demo",
         "fuzz_readers",
         "make_manual",
+        "make_pictures",
         "docstring_pages",
         "__init__",
     } == {
@@ -324,7 +326,7 @@ def test_without_arguments_the_three_usual_ways_are_shown_and_are_commands(capsy
     assert stopped.value.code == 2 and shown == WAYS + usage()
     assert len(re.findall(r"^  \S.*:$", WAYS, re.M)) == 3
     ways = re.findall(r"^    sc3d (\w+) (.*?)(?:   +.*)?$", WAYS, re.M)
-    assert len(ways) == 8
+    assert len(ways) == 9
     for name, arguments in ways:
         parse(name, arguments.split())  # exits if it does not fit
 
@@ -344,11 +346,13 @@ def test_help_of_run_has_the_everyday_options_first_then_stage_by_stage(capsys):
 
 def test_shell_completion_knows_commands_and_options(tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
-        main(["--tyro-write-completion", "bash", str(tmp_path / "sc3d.sh")])
+        main(["--tyro-write-completion", "bash", str(tmp_path / "completions" / "sc3d.sh")])
     assert not stopped.value.code
-    script = (tmp_path / "sc3d.sh").read_text()
+    script = (tmp_path / "completions" / "sc3d.sh").read_text()
     assert all(word in script for word in [*STAGES, *COMMANDS, "--label.consensus", "--quiet"])
-    assert subprocess.run(["bash", "-n", str(tmp_path / "sc3d.sh")], check=False).returncode == 0
+    assert (
+        subprocess.run(["bash", "-n", str(tmp_path / "completions" / "sc3d.sh")], check=False).returncode == 0
+    )
     assert "takes a shell (bash, zsh, tcsh, fish)" in fails(capsys, "--tyro-print-completion", "csh")
 
 

@@ -12,6 +12,7 @@ from sc3d.commands.run import list_stages
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Segment
 from sc3d.settings.outputs import Run
+from sc3d.settings.reconstruction import Extract
 from sc3d.settings.train import Train
 from sc3d.sfm import num_pairs
 from tests.builders import write_bare_scene
@@ -63,6 +64,15 @@ def test_every_stage_has_an_expected_time_that_grows_with_the_photos(stages):
         assert few < many or name in ("train", "report")
 
 
+def test_a_surface_from_depth_maps_is_not_trained_for(tmp_path):
+    scene = Scene(write_bare_scene(tmp_path / "scene"))
+    trained, from_depth = (
+        [name for name, _ in list_stages(Run(tmp_path, scene.path, extract=extract), scene, Segment())]
+        for extract in (Extract(), Extract(method="depth"))
+    )
+    assert "train" in trained and from_depth == [name for name in trained if name != "train"]
+
+
 def test_pairs_are_counted_and_pixels_as_the_stages_make_them_smaller():
     assert num_pairs(24, "exhaustive") == len(list(combinations(range(24), 2)))
     assert num_pairs(100, "sequential") == 1000 and num_pairs(3, "sequential") == 6
@@ -91,6 +101,17 @@ def test_the_plan_names_what_runs_and_adds_up_only_that(stages):
     assert "in all       about 2 min; rough" in told
 
 
+@pytest.mark.parametrize("kernels", [[], ["label.voting-1.py311.nbi"]])
+def test_the_first_run_is_told_to_compile(stages, tmp_path, monkeypatch, kernels):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    for name in kernels:
+        (tmp_path / "cache").mkdir()
+        (tmp_path / "cache" / name).touch()
+    told = plan(stages, [True] * len(stages), [(1600, 900)] * 18)
+    assert ("also compiles" in told) is not bool(kernels)
+    assert "also compiles" not in plan(stages, [False] * len(stages), [(1600, 900)] * 18)
+
+
 def test_what_was_never_measured_has_no_time(stages):
     stages = [
         (name, replace(settings, backend="strokes") if name == "segment" else settings)
@@ -112,7 +133,9 @@ def test_what_takes_hours_is_told_with_what_makes_it_faster(stages, caplog):
     assert not caplog.records
     warn_of_slow(stages, [True] * len(stages), [(4000, 3000)] * 1000)
     assert (
-        "map_photos about" in caplog.text and "--num-sources" in caplog.text and "report" not in caplog.text
+        "map_photos about" in caplog.text
+        and "--depth.num-sources" in caplog.text
+        and "report" not in caplog.text
     )
     caplog.clear()
     warn_of_slow(stages, [False] * len(stages), [(4000, 3000)] * 1000)

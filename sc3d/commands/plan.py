@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from sc3d.io.caches import has_kernels
 from sc3d.io.progress import duration
 from sc3d.runner import files, up_to_date
 from sc3d.scene.scene import Scene
@@ -23,10 +24,10 @@ Sizes = Sequence[tuple[int, int]]  # width and height of every photo, px
 ROUND = 5  # s
 SLOW = 3600  # s that a stage takes to be warned of
 FASTER = {  # what makes stages faster, and coarser
-    "map_photos": "less with --matching auto, a smaller --max-size or --max-features",
-    "depth": "less with a smaller --max-size or --num-sources",
-    "train": "less with fewer --iterations, a smaller --max-size, or a GPU",
-    "extract": "less with a smaller --max-size",
+    "map_photos": "less with --reconstruct.matching auto, a smaller --reconstruct.max-size or --reconstruct.max-features",
+    "depth": "less with a smaller --depth.max-size or --depth.num-sources",
+    "train": "none with --extract.from depth; less with fewer --train.iterations, a smaller --train.max-size, or a GPU",
+    "extract": "less with a smaller --extract.max-size",
 }
 
 # seconds on two idle cores. Each rule lies between what the sidecars of two scenes recorded, 18 photos of
@@ -108,12 +109,13 @@ def plan(stages: Sequence[Stage], runs: Sequence[bool], sizes: Sizes, finished: 
         for (name, _), run, value in zip(stages, runs, seconds, strict=True)
     ]
     more = " and what is not known" if len(known) < len(seconds) else ""
+    first = "" if has_kernels() or not any(runs) else "; the first run also compiles, a minute or two"
     width, height = max(sizes)
     return "\n".join(
         [
             f"plan: {sum(runs)} of {len(stages)} stages to run, on {len(sizes)} photos of {width}x{height}:",
             *rows,
-            f"  in all       {_told(sum(known))}{more}; rough estimates for two cores, here are {os.cpu_count()}",
+            f"  in all       {_told(sum(known))}{more}; rough estimates for two cores, here are {os.cpu_count()}{first}",
         ]
     )
 

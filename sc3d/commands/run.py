@@ -14,7 +14,7 @@ from sc3d.io.atomic import atomic_path
 from sc3d.io.json_files import read_json
 from sc3d.io.progress import under_way
 from sc3d.runner import MAX_SIDECAR, execute, sidecar
-from sc3d.scene.class_table import read_classes
+from sc3d.scene.class_table import MAKE_CLASSES, read_classes
 from sc3d.scene.scene import Scene, match_masks, photo_sizes
 from sc3d.scene.site_model import read_model
 from sc3d.segmentation.shape.backend import write_default_classes
@@ -63,16 +63,18 @@ def tell_plan(command: Run, scene: Scene, stages: list[Stage]) -> None:
     sizes = list(photo_sizes(command.photos).values())
     logger.info(plan(stages, runs, sizes))
     warn_of_slow(stages, runs, sizes)
+    if command.extract.method == "depth" and command.train != type(command.train)():
+        logger.warning("--train options change nothing: --extract.from depth needs no training")
 
 
 def list_stages(command: Run, scene: Scene, segment: Segment) -> list[Stage]:
-    """The stages in the order in which they run."""
+    """The stages in the order in which they run; a surface from depth maps needs no training."""
     depth = command.depth
     if segment.backend == "geometry" and depth.sky_masks is None and scene.class_table().without_surface:
         depth = replace(depth, ignore_masks=True)  # shapes show no sky, and come after depth
     surface: list[Stage] = [
         ("depth", depth),
-        ("train", command.train),
+        *([] if command.extract.method == "depth" else [("train", command.train)]),
         ("extract", command.extract),
     ]
     masks: list[Stage] = [("segment", replace(segment, refine=False))]
@@ -121,9 +123,7 @@ def check(command: Run, segment: Segment) -> None:
     classes = command.classes or Scene(command.scene).classes
     by_shape = segment.backend == "geometry"
     if not classes.exists() and not by_shape:
-        raise InputError(
-            f"{classes} is missing: pass --classes FILE (data/classes.json of the sc3d repository is one to start from)"
-        )
+        raise InputError(f"{classes} is missing: {MAKE_CLASSES}")
     class_table = read_classes(classes) if command.classes or classes.exists() else DEFAULT
     if by_shape:
         class_ids(class_table)

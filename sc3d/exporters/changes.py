@@ -14,7 +14,6 @@ from sc3d.exporters.packages import load
 from sc3d.exporters.polygonize import polygonize, simplified
 from sc3d.geometry.raster import Raster
 from sc3d.instances.regions import cells_by_number, disk, renumbered
-from sc3d.instances.terrain import ground_classes
 from sc3d.scene.class_table import ClassTable
 
 if TYPE_CHECKING:
@@ -136,7 +135,7 @@ def read_dates(
 
 def measure_noise(dates: Dates) -> Noise:
     """From the cells that are ground at both dates."""
-    ground, rise = ground_classes(dates.table), dates.rise
+    ground, rise = dates.table.ground_classes, dates.rise
     both = np.isin(dates.before.label, ground) & np.isin(dates.after.label, ground) & np.isfinite(rise)
     values = rise[both if both.any() else np.isfinite(rise)]
     shift = float(np.median(values))

@@ -4,6 +4,8 @@ extra dimensions.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import laspy
@@ -11,7 +13,7 @@ import numpy as np
 
 import sc3d
 from sc3d.errors import InputError
-from sc3d.exporters.projected_cloud import ProjectedCloud, chosen_classes, projected_chunks
+from sc3d.exporters.projected_cloud import MapProjection, ProjectedCloud, chosen_classes, projected_chunks
 from sc3d.instances.terrain import require_ground
 from sc3d.io.atomic import atomic_path
 from sc3d.scene.class_table import ClassTable
@@ -41,6 +43,49 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/labelled.laz`: point format 7 (6 without colors); positions to 1 mm in the CRS, or in the
     scene's frame without one.
     """
+    found = survey(scene, settings)
+    with (
+        atomic_path(outputs(scene, settings)[0]) as temporary,
+        laspy.open(str(temporary), mode="w", header=found.header) as writer,
+    ):
+        for record in records(scene, settings, found):
+            writer.write_points(record)
+    return found.figures()
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is known of the points to write before the first is written.
+
+    low, high: (3,) of them in the CRS; counts: (256,) by ASPRS code; codes: (256,) uint8 ASPRS code of each
+        class id; classes: ids of the classes to write
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    counts: np.ndarray
+    codes: np.ndarray
+    classes: list[int]
+    projection: MapProjection
+    header: laspy.LasHeader
+
+    @property
+    def num_points(self) -> int:
+        return int(self.counts.sum())
+
+    def whole_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest position (3,) as whole numbers, as they are stored."""
+        low, high = ((end - self.header.offsets) / self.header.scales for end in (self.low, self.high))
+        return np.rint(low).astype(np.int64), np.rint(high).astype(np.int64)
+
+    def figures(self) -> dict[str, object]:
+        """What the summary says."""
+        used = {str(code): int(self.counts[code]) for code in np.flatnonzero(self.counts)}
+        return {"points": self.num_points, **self.projection.figures(), "points_by_asprs_code": used}
+
+
+def survey(scene: Scene, settings: Export) -> Survey:
+    """Look at all points; InputError if none has one of the classes to write."""
     ids, codes = (
         sorted(chosen_classes(scene, settings)),
         asprs_codes(scene.class_table(), settings.ground_as_2),
@@ -55,19 +100,16 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
         counts += np.bincount(codes[projected.labels.label[rows]], minlength=256)
     if projected is None or not counts.any():
         raise InputError(f"no point has one of the classes {', '.join(settings.classes)}: nothing to write")
-    header, projection = make_header(low, high, projected), projected.projection
-    with (
-        atomic_path(outputs(scene, settings)[0]) as temporary,
-        laspy.open(str(temporary), mode="w", header=header) as writer,
-    ):
-        for projected in projected_chunks(scene, settings):
-            rows = np.flatnonzero(np.isin(projected.labels.label, ids))
-            for start in range(0, len(rows), POINTS_AT_ONCE):
-                writer.write_points(
-                    point_record(projected, rows[start : start + POINTS_AT_ONCE], header, codes)
-                )
-    used = {str(code): int(counts[code]) for code in np.flatnonzero(counts)}
-    return {"points": int(counts.sum()), **projection.figures(), "points_by_asprs_code": used}
+    header = make_header(low, high, projected)
+    return Survey(low, high, counts, codes, ids, projected.projection, header)
+
+
+def records(scene: Scene, settings: Export, found: Survey) -> Iterator[laspy.ScaleAwarePointRecord]:
+    """All points to write, up to POINTS_AT_ONCE at a time, in their order."""
+    for projected in projected_chunks(scene, settings):
+        rows = np.flatnonzero(np.isin(projected.labels.label, found.classes))
+        for start in range(0, len(rows), POINTS_AT_ONCE):
+            yield point_record(projected, rows[start : start + POINTS_AT_ONCE], found.header, found.codes)
 
 
 def asprs_codes(table: ClassTable, ground_as_2: bool = False) -> np.ndarray:

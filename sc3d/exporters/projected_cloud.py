@@ -189,10 +189,10 @@ def _require_known(table: ClassTable, labels: Labels, path: Path, scene: Scene) 
 
 
 def projected_chunks(scene: Scene, settings: Export) -> Iterator[ProjectedCloud]:
-    """The same in parts, in order; as a whole if that fits into half of the machine's memory."""
+    """The same in parts, in order; as a whole if that fits into --max-memory."""
     path = settings.labelled or scene.labelled
     count = num_points(path) if path.exists() else None
-    if count is None or fits(count * BYTES, Resources()):
+    if count is None or fits(count * BYTES, Resources(max_memory=settings.max_memory)):
         yield read_projected_cloud(scene, settings)
         return
     projection, table = find_projection(scene, settings), scene.class_table()

@@ -15,6 +15,7 @@ BLOCK = 8
 TRUNCATION = 4.0  # voxels
 SLANTED = 1.5  # largest ratio of depths within the quadrilateral of a pixel
 CPU = o3d.core.Device("CPU:0")
+QUERIES_AT_ONCE = 100_000  # points per call, which lets nothing else run: lines of progress come in between
 
 Part = tuple[o3d.t.geometry.TriangleMesh, o3d.t.geometry.PointCloud]  # a surface, as mesh and as cloud
 
@@ -190,6 +191,9 @@ def near_mesh(points: np.ndarray, mesh: o3d.t.geometry.TriangleMesh, distance: f
     """(N,) bool: which of the (N, 3) points lie within `distance` of the mesh, in the mesh's own frame."""
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(mesh)
-    return (
-        scene.compute_distance(o3d.core.Tensor(np.ascontiguousarray(points, np.float32))).numpy() <= distance
-    )
+    near = np.empty(len(points), bool)
+    for start in range(0, len(points), QUERIES_AT_ONCE):
+        part = slice(start, start + QUERIES_AT_ONCE)
+        queries = o3d.core.Tensor(np.ascontiguousarray(points[part], np.float32))
+        near[part] = scene.compute_distance(queries).numpy() <= distance
+    return near

@@ -1,4 +1,4 @@
-"""Clouds (PLY, LAS, LAZ, PCD, XYZ) and meshes (PLY, OBJ) of other programs: float64 positions, colors,
+"""Clouds (PLY, LAS, LAZ, E57, PCD, XYZ) and meshes (PLY, OBJ) of other programs: float64 positions, colors,
 classes and whatever else they hold.
 """
 
@@ -17,6 +17,7 @@ from sc3d.errors import InputError, examples
 from sc3d.io.clouds import read_cloud, read_mesh
 from sc3d.io.colors import COLORS, color_names, to_bytes
 from sc3d.io.crs import read_las_crs
+from sc3d.io.e57 import read_e57
 from sc3d.io.las import open_las, warn_of_spare
 from sc3d.io.ply import RESERVED, read_header
 from sc3d.io.splats import OTHER_FORMATS, SPLATS
@@ -28,11 +29,10 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-CLOUDS = {".ply", ".las", ".laz", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts", ".txt", ".csv", ".asc"}
+CLOUDS = {".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts", ".txt", ".csv", ".asc"}
 MESHES = {".ply", ".obj"}
 # clouds and meshes that are refused by name
 UNREAD = {
-    ".e57",
     ".ptx",
     ".rcp",
     ".rcs",
@@ -99,6 +99,8 @@ def read_geometry(path: Path) -> Geometry:
         raise InputError(f"{path} does not exist")
     if suffix in (".las", ".laz"):
         found = _read_las(path)
+    elif suffix == ".e57":
+        found = _read_e57(path)
     elif is_mesh(path):
         found = _read_obj(path) if suffix == ".obj" else _read_ply_mesh(path)
     elif suffix in (".ply", ".pcd"):
@@ -171,6 +173,13 @@ def _las_geometry(file: laspy.LasData, path: Path) -> Geometry:
     positions = np.asarray(file.xyz, np.float64)
     positions[:, 2] *= crs.height_scale
     return Geometry(positions, colors, _with_normals(attributes), epsg=crs.epsg)
+
+
+def _read_e57(path: Path) -> Geometry:
+    cloud = read_e57(path)
+    attributes = {"scan": cloud.scan} if cloud.scan.any() else {}
+    attributes |= {"intensity": cloud.intensity} if cloud.intensity is not None else {}
+    return Geometry(cloud.positions, cloud.colors, attributes, epsg=cloud.crs.epsg)
 
 
 def _warn_of_withheld(attributes: dict[str, np.ndarray], path: Path) -> None:

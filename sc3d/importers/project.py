@@ -22,7 +22,7 @@ from sc3d.settings.reconstruction import Import
 logger = logging.getLogger(__name__)
 
 # in the order in which they are tried
-PROGRAMS = ("nerfstudio", "opensfm", "odm", "metashape", "pix4d", "colmap")
+PROGRAMS = ("nerfstudio", "opensfm", "odm", "metashape", "pix4d", "opf", "colmap")
 MODULES = {"odm": "opensfm"}
 
 
@@ -139,7 +139,7 @@ def find_importer(path: Path, source: str) -> ModuleType:
     if source == "auto":
         raise InputError(
             f"{path} is no project that is known here: transforms.json (nerfstudio), an OpenSfM or ODM folder, cameras as XML (Metashape), "
-            "*_calibrated_camera_parameters.txt (Pix4D) or a COLMAP model is expected"
+            "*_calibrated_camera_parameters.txt (Pix4D), a .opf file or a COLMAP model is expected"
         )
     raise InputError(f"{path} is no {source} project: {modules[0].EXPECTED}")
 

@@ -9,8 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from sc3d.instances.terrain import ground_classes
-from sc3d.scene.class_table import BUILDING_CODE, ClassTable
+from sc3d.scene.class_table import BUILDING, ClassTable
 
 NOISE = (7, 18)  # ASPRS codes
 
@@ -31,7 +30,7 @@ def countable_kinds(table: ClassTable) -> list[Kind]:
     """
     counted = [entry for entry in table if entry.surface and table.is_countable(entry)]
     trees = table.tree_codes
-    roofs = tuple(entry.id for entry in counted if entry.asprs == BUILDING_CODE)
+    roofs = tuple(entry.id for entry in counted if entry.asprs == BUILDING)
     crowns = tuple(entry.id for entry in counted if entry.asprs in trees)
     found = [Kind(roofs, "roofs"), Kind(crowns, "crowns")]
     found += [Kind((entry.id,), "parts") for entry in counted if entry.id not in roofs + crowns]
@@ -42,7 +41,7 @@ def ground_ids(table: ClassTable, counts: np.ndarray) -> list[int]:
     """Ids of the classes that the ground shows: by their ASPRS codes or, where no point is of these, whatever
     is neither building, tree nor noise. counts: (256,) points of each id; empty if there are none.
     """
-    present = [label for label in ground_classes(table) if counts[label]]
-    stands = {BUILDING_CODE, *table.tree_codes, *NOISE}
+    present = [label for label in table.ground_classes if counts[label]]
+    stands = {BUILDING, *table.tree_codes, *NOISE}
     rest = [entry.id for entry in table if entry.asprs not in stands and counts[entry.id]]
     return present or [label for label in rest if not table.is_countable(table.entry(label))]

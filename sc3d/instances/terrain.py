@@ -8,9 +8,8 @@ from scipy import ndimage
 from sc3d.errors import InputError
 from sc3d.geometry.ground_filter import opened
 from sc3d.geometry.raster import Raster, interpolate
-from sc3d.scene.class_table import LOW, ClassTable
+from sc3d.scene.class_table import ClassTable
 
-GROUND = (2, LOW, 9, 10, 11)  # of ground, low vegetation, water, rail, road
 CELL = 2.0  # side of the blocks whose median is the ground, m
 # ground that stands out of the lowest of this surrounding by more than STEP is a mislabelled roof or crown, m
 WINDOW = 15.0
@@ -18,15 +17,9 @@ STEP = 1.5
 SUPPORT = 0.25  # blocks with less than this share of the usual number of ground points rest on strays
 
 
-def ground_classes(table: ClassTable) -> list[int]:
-    """Ids of the ground-like classes, by their ASPRS codes."""
-    wanted = set(GROUND) - table.tree_codes
-    return [entry.id for entry in table if entry.asprs in wanted]
-
-
 def require_ground(table: ClassTable) -> list[int]:
-    """The same; InputError if there are none."""
-    ids = ground_classes(table)
+    """Ids of the ground-like classes of a table; InputError if there are none."""
+    ids = table.ground_classes
     if not ids:
         raise InputError(
             "no class is ground by its ASPRS code (2 ground, 3 low vegetation beside trees, 9 water, 10 rail, "

@@ -41,6 +41,13 @@ def kernel_cache() -> str:
     return f"kept in {caches}" if can_be_made(caches) else "have no place: set NUMBA_CACHE_DIR"
 
 
+def has_kernels() -> bool:
+    """Whether any kernel has been compiled already, so that this is not the first run."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    folders = [Path(given)] if given else [PACKAGE, _user_caches() / "numba"]
+    return any(True for folder in folders for _ in folder.rglob("*.nbi"))
+
+
 def _user_caches() -> Path:
     """The user's cache folder; one that cannot be where no home folder is known."""
     given = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")

@@ -19,7 +19,7 @@ from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.labelling.density import GaussianField, gaussian_density, kernel_density
 from sc3d.labelling.observation import Mask
 from sc3d.scene.channels import Channels
-from sc3d.scene.class_table import ClassTable
+from sc3d.scene.class_table import MAKE_CLASSES, ClassTable
 from sc3d.scene.frame_check import Box, box_of, check_frame, describe
 from sc3d.scene.labelled_cloud import spacing_of
 from sc3d.scene.scene import Scene
@@ -62,10 +62,7 @@ class Masks:
         """Masks of a scene, and confidence maps in a folder if it exists, all checked; InputError for what
         does not fit. unlabelled: as `Label.unlabelled`; needed: without a folder of masks, nothing votes
         """
-        scene.require(
-            scene.classes,
-            hint="pass --classes FILE to `sc3d run`, or copy data/classes.json of the sc3d repository there and edit it",
-        )
+        scene.require(scene.classes, hint=MAKE_CLASSES)
         if not needed and not scene.masks.exists():
             names = tuple(view.name for view in scene.model.views)
             return cls({}, {}, [], scene, scene.class_table(), names)

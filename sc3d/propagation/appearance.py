@@ -16,68 +16,29 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from sc3d.geometry.graph import Graph
+from sc3d.propagation.histogram import Histogram
 from sc3d.propagation.labelled_points import MIN_EXAMPLES, LabelledPoints
+from sc3d.propagation.misplaced import Misplaced, count_sides
 from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.terrain import relief_features
+from sc3d.propagation.trust import BINS, Trust, bins_of, measure_trust
+from sc3d.propagation.vote_evidence import count_disagreement, one_view_evidence, softmax, vote_shares
 from sc3d.settings.labels import Propagate
 
 COLOR_BINS, RELIEF_BINS = 24, 12  # per feature; 24^3 and 12^4 cells
 COLOR_BLUR, RELIEF_BLUR = 1.0, 0.7  # standard deviation, bins
-PRIOR_WEIGHT = 2.0  # points of the overall mixture added to each cell
 UNKNOWN = np.log(0.05)  # their probability of a class they do not know
-MIN_SKILL = 0.5  # share of the errors of "always the commonest class" that they must avoid on points held out
+MIN_HALF = 100  # examples of a class in each half of space, so that they can be judged by one another
 FOLD_BLOCKS = 8  # blocks along the longest side of the cloud; every other one is held out, as on a chessboard
-
-IMPLAUSIBLE = np.log(0.5)  # a seed whose class the model gives less is a conflict
+IMPLAUSIBLE = 0.5  # a seed whose class is less likely is a conflict
+MAX_OVERRULED = 0.9  # share of a class's seeds that many views agree on that looks may overrule
 
 logger = logging.getLogger(__name__)
 
 # per group of features, (cells, C) int64 examples of each class; statistics of parts add up
 AppearanceStatistics = tuple[np.ndarray, ...]
-
-
-@dataclass(frozen=True)
-class Histogram:
-    """The histogram cell of each point: cell (N,) int32, of prod(shape) cells; blur: standard deviation in
-    bins.
-    """
-
-    cell: np.ndarray
-    shape: tuple[int, ...]
-    blur: float
-
-    @classmethod
-    def from_features(cls, features: np.ndarray, edges: list[np.ndarray], blur: float) -> Histogram:
-        """features: (N, F); edges: per feature the inner borders of its bins."""
-        cell = np.zeros(len(features), np.int32)
-        for values, borders in zip(features.T, edges, strict=True):
-            cell *= len(borders) + 1
-            cell += np.searchsorted(borders, values, side="right").astype(np.int32)
-        return cls(cell, tuple(len(borders) + 1 for borders in edges), blur)
-
-    def count(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> np.ndarray:
-        """(cells, C) int64 examples of each class; label: (N,) in 1..C at the examples (N,) bool."""
-        counts = np.bincount(
-            self.cell[examples].astype(np.int64) * num_classes + (label[examples] - 1),
-            minlength=int(np.prod(self.shape)) * num_classes,
-        )
-        return counts.reshape(-1, num_classes)
-
-    def table(self, counts: np.ndarray) -> np.ndarray:
-        """(cells, C) log of the class shares in each cell, from the counts (cells, C)."""
-        blurred = [
-            gaussian_filter(
-                part.reshape(self.shape).astype(np.float64), self.blur, mode="nearest", truncate=2.0
-            )
-            for part in counts.T
-        ]
-        smoothed = np.stack(blurred).reshape(len(blurred), -1).T + PRIOR_WEIGHT * np.maximum(
-            counts.sum(axis=0) / max(counts.sum(), 1), 1e-9
-        )
-        return np.log(smoothed / smoothed.sum(axis=1, keepdims=True))
 
 
 def edges_of(counts: list[QuantileSketch], bins: int) -> list[np.ndarray]:
@@ -104,12 +65,12 @@ class AppearanceModel:
     ) -> AppearanceModel:
         """The same for a part of a cloud; counts: `feature_counts` of the whole."""
         known = relief.shape[1]
-        groups = (Histogram.from_features(relief, edges_of(counts[:known], RELIEF_BINS), RELIEF_BLUR),)
-        return cls(
-            groups
-            if colors is None
-            else (Histogram.from_features(colors, edges_of(counts[known:], COLOR_BINS), COLOR_BLUR), *groups)
-        )
+        groups = [Histogram.from_features(relief, edges_of(counts[:known], RELIEF_BINS), RELIEF_BLUR)]
+        if colors is not None:
+            groups.insert(
+                0, Histogram.from_features(colors, edges_of(counts[known:], COLOR_BINS), COLOR_BLUR)
+            )
+        return cls(tuple(groups))
 
     def statistics(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> AppearanceStatistics:
         """What the examples (N,) bool of label (N,) uint8 teach."""
@@ -119,37 +80,71 @@ class AppearanceModel:
         """(C,) bool classes that points may get without a single seed of them."""
         return np.zeros(num_classes, bool)
 
-    def log_likelihood(self, statistics: AppearanceStatistics, label: np.ndarray) -> np.ndarray | None:
-        """(N, C) float32 log-probability of the classes as color and relief see them; None where there is
-        too little to learn from.
-
-        label: (N,) uint8. Points of a class without enough examples get zeros: the model does not contradict
-            what it does not know.
+    def tables(self, statistics: AppearanceStatistics, known: np.ndarray) -> list[np.ndarray]:
+        """Per group, (cells, C) float32 log-likelihood of each class, up to a number per cell; known: (C,)
+        bool classes to look at.
         """
-        counts = statistics[0].sum(axis=0)
-        known = counts >= MIN_EXAMPLES
-        if known.sum() < 2:
+        return [
+            group.likelihood(examples * known)
+            for group, examples in zip(self.groups, statistics, strict=True)
+        ]
+
+    def contrasts(self, statistics: AppearanceStatistics, label: np.ndarray, asked: np.ndarray) -> np.ndarray:
+        """(C, C, BINS per group) int64 points asked (N,) bool of each class (first axis), by how much more
+        they look like another (second axis) than like their own, as the statistics of other points tell.
+        """
+        known = statistics[0].sum(axis=0) >= MIN_HALF
+        size, shape = len(known), (BINS,) * len(self.groups)
+        rows = np.flatnonzero(asked & np.append(False, known)[label])
+        own, tables = label[rows].astype(np.int64) - 1, self.tables(statistics, known)
+        result = np.zeros((size, size, *shape), np.int64)
+        for other in np.flatnonzero(known):
+            place = own
+            for group, table in zip(self.groups, tables, strict=True):
+                cells = group.cell[rows]
+                place = place * BINS + bins_of(table[cells, other] - table[cells, own])
+            counts = np.bincount(place, minlength=size * int(np.prod(shape)))
+            result[:, other] = counts.reshape(size, *shape)
+        return result
+
+    def log_likelihood(
+        self, statistics: AppearanceStatistics, trust: Trust, shares: np.ndarray
+    ) -> np.ndarray | None:
+        """(N, C) float32 log-probability of the classes as color and relief see them; None where no two
+        looks are known.
+
+        shares: (N, C) of the votes of each point. The more of them name classes whose look is not known, the
+            less the model says: it does not contradict what it does not know.
+        """
+        if not tells_apart(statistics, trust):
             return None
-        shares = np.log(np.maximum(counts, 1) / counts[known].sum())
-        result = np.zeros((len(label), len(counts)), np.float32)
-        for group, examples in zip(self.groups, statistics, strict=True):
-            table = group.table(examples * known)
-            # one by one: as a whole it would be copied, with millions of points
-            for column in range(len(counts)):
-                result[:, column] += table[:, column].astype(np.float32)[group.cell]
-        result -= ((len(self.groups) - 1) * shares).astype(np.float32)
+        counts, known = statistics[0].sum(axis=0), known_looks(statistics, trust)
+        result, tables = np.zeros((len(shares), len(counts)), np.float32), self.tables(statistics, known)
+        for look in np.unique(trust.look[known]):
+            members = np.flatnonzero(known & (trust.look == look))
+            number = counts[members].sum()
+            # of classes that look alike none is likelier beforehand
+            rating = np.full(len(shares), np.log(number / len(members) / counts[known].sum()), np.float32)
+            for group, table in zip(self.groups, tables, strict=True):
+                mixed = np.logaddexp.reduce(table[:, members] + np.log(counts[members] / number), axis=1)
+                rating += mixed.astype(np.float32)[group.cell]
+            result[:, members] = rating[:, None]
         result[:, ~known] = -np.inf
         result -= np.logaddexp.reduce(result, axis=1, keepdims=True)
         result[:, ~known] = UNKNOWN
-        result[np.append(False, ~known)[label]] = 0
-        return np.maximum(result, np.float32(np.log(1e-4)), out=result)
+        np.maximum(result, np.float32(np.log(1e-4)), out=result)
+        result *= 1 - shares[:, ~known].sum(axis=1, keepdims=True)
+        return result
 
-    def errors(self, statistics: AppearanceStatistics, label: np.ndarray, asked: np.ndarray) -> int | None:
-        """How many of the points asked (N,) bool, whose label is taken for true, the statistics get wrong; None
-        if it is too short.
-        """
-        rating = self.log_likelihood(statistics, label)
-        return None if rating is None else int((rating[asked].argmax(axis=1) + 1 != label[asked]).sum())
+
+def known_looks(statistics: AppearanceStatistics, trust: Trust) -> np.ndarray:
+    """(C,) bool classes whose look can be judged and of which there are enough examples."""
+    return trust.known & (statistics[0].sum(axis=0) >= MIN_EXAMPLES)
+
+
+def tells_apart(statistics: AppearanceStatistics, trust: Trust) -> bool:
+    """Whether there are examples of two looks."""
+    return len(np.unique(trust.look[known_looks(statistics, trust)])) >= 2
 
 
 def feature_counts(relief: np.ndarray, colors: np.ndarray | None) -> list[QuantileSketch]:
@@ -168,43 +163,77 @@ def folds_of(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarra
     return cells.sum(axis=1) % 2
 
 
-def skill_score(wrong: list[int | None], counts: np.ndarray) -> float:
-    """Share of the errors of the best constant answer that the model avoids on blocks held out; 0 where it
-    cannot learn.
-
-    wrong: errors of each fold, asked about points that it has not seen; counts: (C,) examples of each class
-    """
-    errors = [number for number in wrong if number is not None]
-    if len(errors) < len(wrong):
-        return 0.0
-    return 1 - sum(errors) / max(int(counts.sum() - counts.max()), 1)
-
-
 def sum_statistics(parts: list[AppearanceStatistics]) -> AppearanceStatistics:
     """The statistics of all parts."""
     return tuple(np.sum(group, axis=0) for group in zip(*parts, strict=True))
 
 
-def is_skillful(wrong: list[int | None], statistics: AppearanceStatistics) -> bool:
-    """Whether the model does well enough; wrong: its errors on each fold held out."""
-    skill = skill_score(wrong, statistics[0].sum(axis=0))
-    logger.info(
-        "color and relief avoid %.0f%% of errors on held-out agreed points%s",
-        100 * skill,
-        "" if skill >= MIN_SKILL else ": not used",
-    )
-    return skill >= MIN_SKILL
+def held_out(
+    model: AppearanceModel,
+    halves: list[AppearanceStatistics],
+    label: np.ndarray,
+    examples: np.ndarray,
+    folds: np.ndarray,
+) -> np.ndarray:
+    """`AppearanceModel.contrasts` of the examples (N,) bool, each looked at by what the other fold (N,) teaches."""
+    first, second = (model.contrasts(halves[1 - fold], label, examples & (folds == fold)) for fold in (0, 1))
+    return first + second
 
 
-def plausible(start: np.ndarray, rating: np.ndarray | None) -> np.ndarray:
-    """The seeds (N,) without those that look like another class: conflicts that all views share.
+def trust_of(
+    halves: list[AppearanceStatistics], contrasts: np.ndarray, disagreement: np.ndarray
+) -> Trust | None:
+    """What was measured (see `measure_trust`); halves: statistics of the folds."""
+    counts = np.stack([half[0].sum(axis=0) for half in halves])
+    known = (counts.sum(axis=0) >= MIN_EXAMPLES) & (counts >= MIN_HALF).all(axis=0)
+    trust = measure_trust(contrasts, known, disagreement) if known.sum() >= 2 else None
+    if trust is None:
+        logger.info("color and relief tell no two classes apart on agreed points held out: not used")
+    else:
+        logger.info("color and relief on agreed points held out: %s", trust.describe())
+    return trust
 
-    rating: (N, C) log-likelihood of the classes; None = nothing is known
+
+def count_overruled(known: LabelledPoints, label: np.ndarray, core: np.ndarray | None = None) -> np.ndarray:
+    """(2, C) int64 seeds of each class without a vote against them that nobody has corrected: all, and those
+    that are not of that class by label (N,). core: (N,) bool points to count, None = all.
     """
+    asked = known.agreed & ~known.corrected & (True if core is None else core)
+    seeds, size = known.seed_labels, known.num_classes + 1
+    return np.stack(
+        [np.bincount(seeds[rows], minlength=size)[1:] for rows in (asked, asked & (label != seeds))]
+    )
+
+
+def overruled(counts: np.ndarray, trust: Trust) -> np.ndarray:
+    """(C,) bool classes that must be left to the votes, and are not yet, by `count_overruled`; said in a line."""
+    too_many = trust.known & (counts[1] > MAX_OVERRULED * counts[0])
+    if too_many.any():
+        logger.info(
+            "color and relief contradict most of the seeds of %d classes that no view contradicts: left to the votes",
+            too_many.sum(),
+        )
+    return too_many
+
+
+def plausible_seeds(known: LabelledPoints, rating: np.ndarray | None, trust: Trust) -> np.ndarray:
+    """(N,) uint8 seeds without those likelier of another class, by looks and votes: conflicts that all views share.
+    What people have corrected stays.
+
+    rating: (N, C) log-likelihood of the classes by their looks; None = nothing is known
+    """
+    seeds = known.seed_labels
     if rating is None:
-        return start
-    given = rating[np.arange(len(start)), np.maximum(start, 1).astype(np.int64) - 1]
-    return np.where((start > 0) & (given < IMPLAUSIBLE), 0, start).astype(np.uint8)
+        return seeds
+    posterior = softmax(rating + one_view_evidence(known, trust.errors))
+    own = posterior[np.arange(len(seeds)), np.maximum(seeds, 1).astype(np.int64) - 1]
+    return np.where(known.corrected | (own >= IMPLAUSIBLE), seeds, 0).astype(np.uint8)
+
+
+def limited(known: LabelledPoints, kept: np.ndarray, too_many: np.ndarray) -> np.ndarray:
+    """The seeds kept (N,), and those without a vote against them of classes (C,) bool of which too many would go."""
+    back = known.sure & np.append(False, too_many)[known.seed_labels]
+    return np.where(back, known.seed_labels, kept)
 
 
 def uses_appearance(settings: Propagate) -> bool:
@@ -213,25 +242,44 @@ def uses_appearance(settings: Propagate) -> bool:
 
 @dataclass(frozen=True)
 class LearnedAppearance:
-    """A model of a cloud, and what its examples teach."""
+    """A model of a cloud, what its examples teach, and how far that is believed."""
 
     model: AppearanceModel
     statistics: AppearanceStatistics
+    trust: Trust
 
-    def log_likelihood(self, label: np.ndarray) -> np.ndarray | None:
+    def log_likelihood(self, known: LabelledPoints) -> np.ndarray | None:
         """As `AppearanceModel.log_likelihood`."""
-        return self.model.log_likelihood(self.statistics, label)
+        return self.model.log_likelihood(self.statistics, self.trust, vote_shares(known))
 
 
-def learn_appearance(graph: Graph, known: LabelledPoints) -> LearnedAppearance | None:
-    """Color and relief of the classes from the agreed points, if that does well on agreed points that it has not seen.
+def learn_appearance(graph: Graph, known: LabelledPoints) -> tuple[LabelledPoints, LearnedAppearance | None]:
+    """What is known without `Misplaced` votes, and color and relief of the classes from the agreed points, if that
+    tells classes apart on agreed points that it has not seen.
 
     known: in the order of the graph
     """
     model = AppearanceModel.from_features(relief_features(graph, known.points, known.up), known.colors)
-    start, examples = known.seed_labels, known.agreed
     folds = folds_of(known.points, known.points.min(axis=0), known.points.max(axis=0))
+    if known.levels is not None and known.votes is not None:
+        known = _placed(model.groups[-1], known, folds, known.levels)
+    start, examples = known.seed_labels, known.agreed
     halves = [model.statistics(start, examples & (folds == fold), known.num_classes) for fold in (0, 1)]
-    wrong = [model.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1)]
-    statistics = sum_statistics(halves)
-    return LearnedAppearance(model, statistics) if is_skillful(wrong, statistics) else None
+    trust = trust_of(halves, held_out(model, halves, start, examples, folds), count_disagreement(known))
+    return known, None if trust is None else LearnedAppearance(model, sum_statistics(halves), trust)
+
+
+def _placed(
+    relief: Histogram, known: LabelledPoints, folds: np.ndarray, levels: np.ndarray
+) -> LabelledPoints:
+    start, examples = known.seed_labels, known.agreed
+    halves = [relief.count(start, examples & (folds == fold), known.num_classes) for fold in (0, 1)]
+    sides = count_sides(relief, halves, known, examples, folds)
+    misplaced = Misplaced.measure(relief, halves, sides, levels)
+    return known if misplaced is None else misplaced.without(known, relief.cell)
+
+
+def plausible(known: LabelledPoints, appearance: LearnedAppearance) -> np.ndarray:
+    """(N,) uint8 seeds that look like their class, or of which too many would go."""
+    kept = plausible_seeds(known, appearance.log_likelihood(known), appearance.trust)
+    return limited(known, kept, overruled(count_overruled(known, kept), appearance.trust))

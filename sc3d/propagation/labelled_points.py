@@ -22,7 +22,7 @@ class LabelledPoints:
         float32 or None, column 0 is ignored; colors: (N, 3) uint8 or None
     up: (3,) of the cameras, None = not known
     none: the last of the C labels, and the last column of the votes, stand for none of the classes; rates:
-    what is known of the votes for it
+    what is known of the votes for it; levels: (C,) of `ClassTable.levels`, None = nobody knows
     """
 
     points: np.ndarray
@@ -32,6 +32,7 @@ class LabelledPoints:
     up: np.ndarray | None = None
     none: bool = False
     rates: NoneRates | None = None
+    levels: np.ndarray | None = None
 
     def ordered(self, order: np.ndarray) -> LabelledPoints:
         votes, colors = (None if part is None else part[order] for part in (self.votes, self.colors))
@@ -43,6 +44,13 @@ class LabelledPoints:
         if self.votes is None:
             raise ValueError("these points have no votes, which the map method needs")
         return self.votes
+
+    @property
+    def required_levels(self) -> np.ndarray:
+        """(C,) levels; ValueError if there are none."""
+        if self.levels is None:
+            raise ValueError("nobody knows which classes stand on the ground")
+        return self.levels
 
     @property
     def seed_labels(self) -> np.ndarray:

@@ -54,11 +54,17 @@ class NoneRates:
         """(N,) float32 log-odds of none against the best class, by votes (N, C + 2) as in `LabelledPoints`;
         0 without votes.
         """
-        total, share = votes[:, 1:].sum(axis=1), none_share(votes)
+        total = votes[:, 1:].sum(axis=1)
+        return np.minimum(total, np.float32(MAX_EVIDENCE)) * self.log_odds_of_one(votes)
+
+    def log_odds_of_one(self, votes: np.ndarray) -> np.ndarray:
+        """The same of a single vote, divided among the classes and none as the votes are; 0 without votes."""
+        share = none_share(votes)
         missed, silent = self.missed[best_class(votes)], self.silent
         gain, loss = np.log(silent / missed), np.log((1 - silent) / (1 - missed))
         border = np.maximum(-loss / (gain - loss), EVEN)
-        return (np.minimum(total, MAX_EVIDENCE) * (gain - loss) * (share - border)).astype(np.float32)
+        odds = (gain - loss) * (share - border) * votes[:, 1:].any(axis=1)
+        return odds.astype(np.float32)
 
 
 def none_share(votes: np.ndarray) -> np.ndarray:

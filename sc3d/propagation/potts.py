@@ -8,14 +8,13 @@ import numba
 import numpy as np
 
 from sc3d.geometry.graph import Graph
-from sc3d.propagation.appearance import LearnedAppearance
+from sc3d.propagation.appearance import LearnedAppearance, count_overruled, overruled
 from sc3d.propagation.labelled_points import LabelledPoints
 from sc3d.propagation.region_growing import grow_regions
+from sc3d.propagation.trust import Trust
+from sc3d.propagation.vote_evidence import evidence_of, one_view_evidence, softmax
 from sc3d.settings.labels import Propagate
 
-MAX_EVIDENCE = 5.0  # a point's votes count as at most this many
-SMOOTHING = 0.25  # added to the votes of each class
-TRUST = 0.5  # weight of the votes beside the appearance, which sees what the views' shared errors hide
 SURE = 0.95  # later rounds learn from points of this probability
 # confidence: weight of the evidence and of the neighbors; full weights would be sure everywhere
 CAUTION, SUPPORT = 0.5, 0.1
@@ -28,21 +27,43 @@ def minimize_energy(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N,) uint8 labels of the smallest Potts energy, and (N,) float32 their confidences.
 
-    appearance: votes beside the views; what it teaches is learned again from each round's result. None = votes alone
+    appearance: votes beside the views; None = votes alone. Classes of which it would overrule too many seeds are left
+        to the votes.
     """
     offered = np.bincount(known.seed_labels, minlength=known.num_classes + 1)[1:] > 0
     if appearance is not None:
         offered |= appearance.model.offers(known.num_classes)
-    found, label, rounds = None, known.seed_labels, max(settings.rounds, 1)
-    while appearance is not None and rounds:
-        rating = appearance.log_likelihood(label)
+    while appearance is not None:
+        found = learning_marginals(graph, known, offered, appearance, settings)
+        if found is None:
+            break
+        counts = count_overruled(known, found[1].argmax(axis=1) + 1)
+        if not (too_many := overruled(counts, appearance.trust)).any():
+            return decided(graph, known, *found)
+        appearance = replace(appearance, trust=appearance.trust.without(too_many))
+    return decided(graph, known, *vote_marginals(graph, known, offered, settings))
+
+
+def learning_marginals(
+    graph: Graph,
+    known: LabelledPoints,
+    offered: np.ndarray,
+    appearance: LearnedAppearance,
+    settings: Propagate,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """`appearance_marginals` of the last round; what the appearance teaches is learned again from each round's
+    result. None if it knows no two looks.
+    """
+    found = None
+    for _ in range(max(settings.rounds, 1)):
+        rating = appearance.log_likelihood(known)
         if rating is None:
             break  # too little is sure; what was learned before stands
-        found = appearance_marginals(graph, known, offered, rating, settings)
+        found = appearance_marginals(graph, known, offered, rating, appearance.trust, settings)
         label = (found[1].argmax(axis=1) + 1).astype(np.uint8)
         statistics = appearance.model.statistics(label, sure_examples(found[1], known), known.num_classes)
-        appearance, rounds = replace(appearance, statistics=statistics), rounds - 1
-    return decided(graph, known, *(found or vote_marginals(graph, known, offered, settings)))
+        appearance = replace(appearance, statistics=statistics)
+    return found
 
 
 def vote_marginals(
@@ -63,13 +84,36 @@ def vote_marginals(
 
 
 def appearance_marginals(
-    graph: Graph, known: LabelledPoints, offered: np.ndarray, rating: np.ndarray, settings: Propagate
+    graph: Graph,
+    known: LabelledPoints,
+    offered: np.ndarray,
+    rating: np.ndarray,
+    trust: Trust,
+    settings: Propagate,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same from votes and appearance; rating: (N, C) of the appearance, overwritten."""
-    rating += np.float32(TRUST) * evidence_of(known)
+    rating += one_view_evidence(known, trust.errors)
     rating[:, ~offered] = -np.inf
     hold_corrected(rating, known)
-    return rating, mean_field(graph, rating, settings.smoothness)  # afresh: sure marginals would not move
+    start = softmax(rating)  # afresh: sure marginals would not move
+    split_looks(graph, known, start, trust)
+    return rating, mean_field(graph, rating, settings.smoothness, start)
+
+
+def split_looks(graph: Graph, known: LabelledPoints, marginals: np.ndarray, trust: Trust) -> None:
+    """Between classes that look alike, make the marginals (N, C) of a point without votes, in place, say what
+    the front from the seeds says: votes would take one edge per step to reach it.
+    """
+    if not trust.shared.any():
+        return
+    grown, _ = grow_regions(graph, known.seed_labels)
+    silent = ~known.known_votes[:, 1:].any(axis=1)
+    for own in np.flatnonzero(trust.shared):
+        rows = np.flatnonzero(silent & (grown == own + 1))
+        alike = np.flatnonzero(trust.look == trust.look[own])
+        total = marginals[np.ix_(rows, alike)].sum(axis=1)
+        marginals[np.ix_(rows, alike)] = 0
+        marginals[rows, own] = total
 
 
 def hold_corrected(likelihood: np.ndarray, known: LabelledPoints) -> None:
@@ -101,29 +145,6 @@ def decided(
     return label.astype(np.uint8), cautious[np.arange(len(label)), label - 1]
 
 
-def evidence_of(known: LabelledPoints) -> np.ndarray:
-    """(N, C) float32 log-likelihood of all labels from the votes: of the classes among themselves, and of
-    none of them against the best.
-    """
-    if known.rates is None:
-        return vote_likelihood(known.known_votes)
-    none = known.rates.log_odds(known.known_votes)
-    return np.concatenate([vote_likelihood(known.known_votes[:, :-1]), none[:, None]], axis=1)
-
-
-def vote_likelihood(votes: np.ndarray) -> np.ndarray:
-    """(N, C) float32 log-likelihood of the classes 1..C from the votes (N, C + 1); 0 for points without
-    votes.
-    """
-    total = votes[:, 1:].sum(axis=1, keepdims=True)
-    result = votes[:, 1:] + np.float32(SMOOTHING)
-    result /= total + np.float32(SMOOTHING * (votes.shape[1] - 1))
-    np.log(result, out=result)
-    result *= np.minimum(1 + total, np.float32(MAX_EVIDENCE))
-    result -= result.max(axis=1, keepdims=True)
-    return result.astype(np.float32, copy=False)
-
-
 def mean_field(
     graph: Graph,
     log_likelihood: np.ndarray,
@@ -152,14 +173,6 @@ def mean_field(
         )
         marginals, other = other, marginals
     return marginals
-
-
-def softmax(values: np.ndarray) -> np.ndarray:
-    """(N, C) float32 probabilities of (N, C) logarithms."""
-    result = values - values.max(axis=1, keepdims=True)
-    np.exp(result, out=result)
-    result /= result.sum(axis=1, keepdims=True)
-    return result.astype(np.float32, copy=False)
 
 
 @numba.njit(cache=True)

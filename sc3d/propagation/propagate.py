@@ -40,7 +40,7 @@ from sc3d.scene.scene import Scene
 from sc3d.scene.site_model import ModelPart, read_model
 from sc3d.settings.labels import Propagate
 
-Learner = Callable[[Graph, LabelledPoints], LearnedAppearance | None]
+Learner = Callable[[Graph, LabelledPoints], tuple[LabelledPoints, LearnedAppearance | None]]
 
 
 def propagate(
@@ -60,7 +60,7 @@ def propagate(
     if points.none:  # how often views find nothing, where there is something
         points = replace(points, rates=NoneRates.from_counts(count_votes(points.known_votes)))
     known = points.ordered(graph.order)
-    appearance = learn(graph, known) if uses_appearance(settings) else None
+    known, appearance = learn(graph, known) if uses_appearance(settings) else (known, None)
     seeds = known.seed_labels
     if settings.method == "map":
         label, confidence = minimize_energy(
@@ -70,8 +70,7 @@ def propagate(
             label = np.where(reachable(graph, seeds), label, 0).astype(np.uint8)
     else:
         if appearance is not None:
-            kept = plausible(seeds, appearance.log_likelihood(seeds))
-            seeds = np.where(known.corrected, seeds, kept)
+            seeds = plausible(known, appearance)
         label, confidence = spread(graph, known.points, seeds, settings)  # eq. 9
     if settings.fill:
         label, confidence = fill_from_nearest(known.points, label, confidence)
@@ -170,7 +169,15 @@ def propagate_scene(
     channels = Channels.of_classes(np.unique(seeds.label).tolist()) if votes is None else votes.channels
     seeds = seeds_in_channels(seeds, channels, path)
     values = None if votes is None else votes.values
-    points = LabelledPoints(positions, seeds, values, colors, scene_up(scene), channels.none)
+    points = LabelledPoints(
+        positions,
+        seeds,
+        values,
+        colors,
+        scene_up(scene),
+        channels.none,
+        levels=levels_of(scene, channels),
+    )
     normals = cloud.point.normals.numpy()
     graph, learn = neighbor_graph(points, normals, settings), learn_appearance
     if saved is not None and settings.model is not None:
@@ -227,6 +234,11 @@ def _saved_appearance(scene: Scene, settings: Propagate) -> SavedAppearance | No
     saved = SavedAppearance.from_part(part, settings.model)
     saved.require_unit(_meters(scene), settings.model)
     return saved
+
+
+def levels_of(scene: Scene, channels: Channels) -> np.ndarray | None:
+    """As of `LabelledPoints`; None without a class table."""
+    return scene.class_table().levels(channels) if scene.classes.exists() else None
 
 
 def _meters(scene: Scene) -> float | None:

@@ -23,13 +23,15 @@ from sc3d.propagation.appearance import (
     RELIEF_BLUR,
     AppearanceModel,
     AppearanceStatistics,
-    Histogram,
     LearnedAppearance,
     edges_of,
     feature_counts,
 )
+from sc3d.propagation.histogram import Histogram
 from sc3d.propagation.labelled_points import MIN_EXAMPLES, LabelledPoints
 from sc3d.propagation.terrain import NUM_FEATURES, Scale, relief_features, terrain_of
+from sc3d.propagation.trust import Trust
+from sc3d.propagation.vote_evidence import count_disagreement
 from sc3d.scene.channels import Channels
 from sc3d.scene.labels import Labels
 from sc3d.scene.site_model import ModelPart
@@ -144,7 +146,7 @@ class SavedAppearance:
 
     def on(
         self, graph: Graph, known: LabelledPoints, channels: Channels, meters: float | None, origin: Path
-    ) -> LearnedAppearance:
+    ) -> tuple[LabelledPoints, LearnedAppearance]:
         """The model on the cloud of another scene, with what the agreed points of that scene teach.
 
         graph, known: in the order of the graph; meters: as in `require_unit`; origin: its file
@@ -161,7 +163,9 @@ class SavedAppearance:
         given = _in_channels(self.statistics[-len(groups) :], self.ids, channels)
         own = AppearanceModel(tuple(groups)).statistics(known.seed_labels, known.agreed, known.num_classes)
         model = SeededModel(tuple(groups), _no_heavier(given, own))
-        return LearnedAppearance(model, model.with_prior(own))
+        statistics = model.with_prior(own)
+        trust = Trust.unmeasured(statistics[0].sum(axis=0) >= MIN_EXAMPLES, count_disagreement(known))
+        return known, LearnedAppearance(model, statistics, trust)
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,7 @@ _STAGES = (
     "synthesize",
     "map_photos",
     "reconstruct",
+    "depth",
     "train",
     "extract",
     "segment",

@@ -17,10 +17,16 @@ from sc3d.scene.channels import Channels
 # in names: they would act on terminals, or cannot be written
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 MAX_NAME, MAX_BYTES = 200, 1 << 20
+EXAMPLE = '{"id": 1, "name": "building", "color": [214, 60, 60]}'
+MAKE_CLASSES = (
+    f"pass --classes FILE to `sc3d run`, or write there [{EXAMPLE}, ...], with a line for each class"
+)
 # in truth masks, unless a class has one of these ids: looked at and none of the classes; not to be judged
 OTHER, UNJUDGED = 254, 255
-BUILDING_CODE = 6  # ASPRS code
-LOW, MEDIUM, HIGH = 3, 4, 5  # ASPRS codes of vegetation
+# ASPRS codes of vegetation, of buildings, and of ground, low vegetation, water, rail, road
+LOW, MEDIUM, HIGH, BUILDING = 3, 4, 5, 6
+GROUND_CODES = (2, LOW, 9, 10, 11)
+ON_GROUND, STANDING = 0, 1
 VEHICLES = ("car", "cars", "vehicle", "vehicles")  # names of what LAS has no code for
 
 
@@ -78,6 +84,27 @@ class ClassTable:
         """Bool, of the shape of `labels` (uint8 ids): of a class without surface."""
         return np.isin(labels, [entry.id for entry in self.without_surface])
 
+    def levels(self, channels: Channels) -> np.ndarray | None:
+        """(C,) int of the labels 1..C of votes: ON_GROUND, STANDING, or -1 where the ASPRS code does not say; None
+        unless there are classes of both.
+        """
+        standing = self.tree_codes | {BUILDING}
+        levels = dict.fromkeys(GROUND_CODES, ON_GROUND) | dict.fromkeys(standing, STANDING)
+        codes = {entry.id: entry.asprs for entry in self.classes}
+        found = [levels.get(codes.get(label, 0), -1) for label in channels.ids[1:].tolist()]
+        return np.array(found + [-1] * channels.none) if {ON_GROUND, STANDING} <= set(found) else None
+
+    @property
+    def tree_codes(self) -> set[int]:
+        """ASPRS codes of trees: medium and high vegetation; low if no class has those."""
+        return {MEDIUM, HIGH} if {MEDIUM, HIGH} & {entry.asprs for entry in self.classes} else {LOW}
+
+    @property
+    def ground_classes(self) -> list[int]:
+        """Ids of the classes that lie on the ground, by their ASPRS codes."""
+        wanted = set(GROUND_CODES) - self.tree_codes
+        return [entry.id for entry in self.classes if entry.asprs in wanted]
+
     @property
     def rest(self) -> SemanticClass | None:
         """The class of mask pixels that have none."""
@@ -103,19 +130,13 @@ class ClassTable:
         """The class of an id that the table has."""
         return next(entry for entry in self.classes if entry.id == label)
 
-    @property
-    def tree_codes(self) -> set[int]:
-        """ASPRS codes of trees: medium and high vegetation; low if no class has those."""
-        codes = {entry.asprs for entry in self.classes}
-        return {MEDIUM, HIGH} if {MEDIUM, HIGH} & codes else {LOW}
-
     def is_countable(self, entry: SemanticClass) -> bool:
         """Whether objects of a class are told apart: as the table says, else buildings, trees and
         vehicles.
         """
         if entry.countable is not None:
             return entry.countable
-        coded = entry.asprs in {BUILDING_CODE, *self.tree_codes}
+        coded = entry.asprs in {BUILDING, *self.tree_codes}
         return entry.surface and (coded or entry.name.casefold() in VEHICLES)
 
     def find(self, name: str) -> int | None:
@@ -152,9 +173,7 @@ class ClassTable:
 def read_classes(path: Path) -> ClassTable:
     """Read `classes.json`; raises InputError that names the faulty entry."""
     if not path.exists():
-        raise InputError(
-            f"{path} is missing: pass --classes FILE, or copy data/classes.json from the sc3d repository and edit it"
-        )
+        raise InputError(f"{path} is missing: {MAKE_CLASSES}")
     entries = read_json(path, MAX_BYTES)
     return parse_classes(entries, path)
 
@@ -181,9 +200,7 @@ def parse_classes(entries: object, origin: Path | str) -> ClassTable:
 
 def _parse_class(entry: object, origin: Path | str) -> SemanticClass:
     if not isinstance(entry, dict):
-        raise InputError(
-            f'{origin}: every class must be an object like {{"id": 1, "name": "building", "color": [214, 60, 60]}}'
-        )
+        raise InputError(f"{origin}: every class must be an object like {EXAMPLE}")
     label, name, color = _whole(entry.get("id")), entry.get("name"), _whole_all(entry.get("color"))
     if not _is_int(label, 1, 255):
         raise InputError(

@@ -21,6 +21,8 @@ class Export:
         Literal[
             "masks",
             "laz",
+            "copc",
+            "3dtiles",
             "clouds",
             "splats",
             "spz",
@@ -33,29 +35,33 @@ class Export:
             "object-clouds",
             "transforms",
             "colmap-text",
+            "kml",
+            "csv",
         ],
         ...,
     ] = ("laz",)
     """What to write. masks: the fused labels as each photo sees them; laz: LAZ 1.4 with ASPRS classes;
-    clouds: one PLY per class; splats, spz: Gaussians with labels; orthophoto: GeoTIFFs of color, class and
-    height; dtm, dsm, ndsm: GeoTIFFs of the height of the bare ground (holes interpolated, and marked in a file
+    copc: the same as COPC, which programs read bit by bit, over the network too; 3dtiles: the cloud for globes
+    in the browser; clouds: one PLY per class; splats, spz: Gaussians with labels; orthophoto: GeoTIFFs of
+    color, class and height; dtm, dsm, ndsm: GeoTIFFs of the height of the bare ground (holes interpolated, and marked in a file
     beside it), of the surface, and of the surface above the ground; contours: lines of equal height of the
     ground as GeoPackage; objects: footprints of buildings, crowns of trees and all countable objects as
     GeoJSON; object-clouds: one PLY per object; transforms: cameras and sparse points as nerfstudio's
-    transforms.json; colmap-text: the same as COLMAP's text files.
+    transforms.json; colmap-text: the same as COLMAP's text files; kml, csv: positions and viewing directions
+    of the cameras.
     """
     classes: tuple[str, ...] = ()
-    """Names of the classes to write; all otherwise (laz, clouds, splats, spz)."""
+    """Names of the classes to write; all otherwise (laz, copc, 3dtiles, clouds, splats, spz)."""
     labelled: Path | None = None
     """Labelled cloud; SCENE/labelled.ply otherwise."""
     unconfirmed: bool = False
-    """Write points too that one photo only shows (`extract --fill`); in LAZ they are flagged synthetic (laz,
-    clouds, maps, objects).
+    """Write points too that one photo only shows (`extract --fill`); in LAZ and COPC they are flagged synthetic
+    (laz, copc, 3dtiles, clouds, maps, objects).
     """
     max_size: int = 0
     """Longest side of the masks, px; 0 = as the photo (masks)."""
     epsg: int = 0
-    """EPSG code of a projected CRS for the coordinates (laz, clouds, maps, objects); 0 = that of the
+    """EPSG code of a projected CRS for the coordinates (laz, copc, clouds, maps, objects, csv); 0 = that of the
     scene. Without a georeference it says which CRS the scene's coordinates are in.
     """
     pixel_size: float = 0.0
@@ -66,7 +72,8 @@ class Export:
     """Height between contour lines, units of the CRS; 0 = one that gives up to 25 levels (contours)."""
     ground_as_2: bool = False
     """Write all ground-like classes (ASPRS codes 2, 9, 10, 11, and 3 beside trees) as ASPRS class 2, ground,
-    which terrain programs look for (laz).
+    which terrain programs look for (laz, copc,
+    3dtiles).
     """
     min_height: float = 2.0
     """Lower buildings and plants are left out, m (objects); below 2 objects are told apart anew."""
@@ -75,6 +82,10 @@ class Export:
     rectangular: bool = True
     """Draw buildings with right angles where that fits; --no-rectangular keeps the simplified outline
     (objects).
+    """
+    max_memory: str = ""
+    """Memory to stay below, such as 6G; a cloud that does not fit is written in parts, from disk. Half of this
+    machine's memory otherwise (laz, copc, 3dtiles, dtm, dsm, ndsm, contours).
     """
 
 

@@ -115,7 +115,7 @@ class Extract:
 
     method: Annotated[Literal["tsdf", "depth", "centers"], arg(name="from")] = "tsdf"
     """Fuse depth into a truncated signed distance field: that which the Gaussians render, or that of `sc3d
-    depth`, which needs no training. Or take the Gaussians' centers as the cloud.
+    depth`, which needs no training (`sc3d run` leaves it out then). Or take the Gaussians' centers as the cloud.
     """
     depth_mode: DepthMode = "median"
     """Depth that the Gaussians render: of the alpha-blended planes, or where half of the light is gone
@@ -161,11 +161,11 @@ class ReconstructCommand:
 @dataclass(frozen=True)
 class Import:
     """Start from another program's project, cloud or mesh: nerfstudio, OpenSfM, ODM, Metashape, Pix4D,
-    COLMAP; PLY, LAS, LAZ, PCD, XYZ, OBJ.
+    OPF, COLMAP; PLY, LAS, LAZ, E57, PCD, XYZ, OBJ.
     """
 
     source: Annotated[
-        Literal["auto", "nerfstudio", "opensfm", "odm", "metashape", "pix4d", "colmap", "cloud"],
+        Literal["auto", "nerfstudio", "opensfm", "odm", "metashape", "pix4d", "opf", "colmap", "cloud"],
         arg(name="from"),
     ] = "auto"
     """What PROJECT is; auto looks at it."""
@@ -174,7 +174,7 @@ class Import:
     say.
     """
     cloud: tuple[Path, ...] = ()
-    """Cloud (PLY, LAS, LAZ, PCD, XYZ) or mesh (PLY, OBJ) that belongs to it, or one of each; becomes
+    """Cloud (PLY, LAS, LAZ, E57, PCD, XYZ) or mesh (PLY, OBJ) that belongs to it, or one of each; becomes
     cloud.ply and mesh.ply.
     """
     epsg: int | None = None
@@ -191,7 +191,7 @@ class Import:
 @dataclass(frozen=True)
 class ImportCommand:
     """Start from another program's project, cloud or mesh: nerfstudio, OpenSfM, ODM, Metashape, Pix4D,
-    COLMAP; PLY, LAS, LAZ, PCD, XYZ, OBJ.
+    OPF, COLMAP; PLY, LAS, LAZ, E57, PCD, XYZ, OBJ.
     """
 
     project: Annotated[

@@ -13,7 +13,7 @@ from sc3d.errors import InputError
 
 @dataclass(frozen=True)
 class Synthesize:
-    """What the synthetic scene looks like and how it is photographed."""
+    """A synthetic scene with photos, cameras, masks and truth, to try things on."""
 
     kind: Literal["aerial", "street"] = "aerial"
     """What is photographed: aerial = houses in gardens, as from a drone; street = rows of facades, from eye

@@ -12,6 +12,8 @@ from sc3d.settings.outputs import Export
 MODULES = {
     "masks": "masks",
     "laz": "laz",
+    "copc": "copc",
+    "3dtiles": "tiles3d",
     "clouds": "clouds",
     "splats": "splats",
     "spz": "spz",
@@ -24,8 +26,15 @@ MODULES = {
     "object-clouds": "object_clouds",
     "transforms": "transforms",
     "colmap-text": "colmap_text",
+    "kml": "camera_files",
+    "csv": "camera_files",
 }
-CAMERAS_ONLY = {"transforms", "colmap-text"}  # formats that hold no labels, and so need no class table
+CAMERAS_ONLY = {
+    "transforms",
+    "colmap-text",
+    "kml",
+    "csv",
+}  # formats that hold no labels, and so need no class table
 
 
 def inputs(scene: Scene, settings: Export) -> list[Path]:

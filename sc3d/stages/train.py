@@ -44,7 +44,9 @@ def besides(scene: Scene, settings: Train) -> list[Path]:
 def run(scene: Scene, settings: Train) -> dict[str, object]:
     in_blocks = settings.blocks > 1
     if not (in_blocks and settings.cluster):  # whose workers may have the GPU that this machine lacks
-        pick_device(settings.device)  # complain before the work begins
+        device = pick_device(settings.device)  # complain before the work begins
+        if device.type == "cuda" and not settings.iterations:
+            logger.info("training on a GPU, for as long as suits a CPU; the paper's --iterations is 30000")
     require_views(scene)
     check_photos(scene, [view.name for view in scene.model.views])
     _tell_of_left_out(scene)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 import time
 from collections.abc import Callable
@@ -29,8 +28,6 @@ from sc3d.synthetic.photos import Photo, photograph
 from sc3d.synthetic.shading import display
 from sc3d.synthetic.street import build_street
 from sc3d.synthetic.world import World, build_world
-
-logger = logging.getLogger(__name__)
 
 # fmt: off
 CLASSES = [
@@ -89,16 +86,14 @@ def synthesize(
     write_geometry(scene_path / "truth_mesh.ply", _mesh(world))
     write_json(scene_path / "classes.json", CLASSES)
     report(1.0, "done")
-    summary = {
+    return {
         "num_views": len(views),
         "num_triangles": len(world.corners),
         "num_buildings": len(world.buildings),
-        "mask_accuracy": right / max(labelled, 1),
+        "mask_accuracy": round(right / max(labelled, 1), 4),
         "num_sparse_points": num_sparse,
         "seconds_per_view": round(seconds, 3),
     }
-    logger.info("synthetic scene in %s: %s", scene_path, summary)
-    return summary
 
 
 def _clear(scene_path: Path) -> None:

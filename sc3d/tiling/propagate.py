@@ -28,19 +28,35 @@ from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.propagation.appearance import (
     AppearanceModel,
     AppearanceStatistics,
+    LearnedAppearance,
+    count_overruled,
     feature_counts,
     folds_of,
-    is_skillful,
-    plausible,
+    held_out,
+    limited,
+    overruled,
+    plausible_seeds,
     sum_statistics,
+    tells_apart,
+    trust_of,
     uses_appearance,
 )
-from sc3d.propagation.labelled_points import MIN_EXAMPLES, views_to_agree
+from sc3d.propagation.labelled_points import views_to_agree
+from sc3d.propagation.misplaced import Misplaced, count_sides
 from sc3d.propagation.none_evidence import NoneRates, count_votes
 from sc3d.propagation.potts import STEPS, appearance_marginals, decided, sure_examples, vote_marginals
-from sc3d.propagation.propagate import PropagateSummary, fill_from_nearest, no_seeds, spread, with_states
+from sc3d.propagation.propagate import (
+    PropagateSummary,
+    fill_from_nearest,
+    levels_of,
+    no_seeds,
+    spread,
+    with_states,
+)
 from sc3d.propagation.quantile_sketch import QuantileSketch
 from sc3d.propagation.terrain import WINDOWS, GroundModel, NormalStatistics
+from sc3d.propagation.trust import Trust
+from sc3d.propagation.vote_evidence import count_disagreement
 from sc3d.scene.corrections import Corrections
 from sc3d.scene.labelled_cloud import INSTANCE, UNCONFIRMED, VOTES, vote_channels
 from sc3d.scene.labels import CORRECTED, PROPAGATED
@@ -51,7 +67,7 @@ from sc3d.tiling.executor import Executor, open_executor
 from sc3d.tiling.label import sample_spacing
 from sc3d.tiling.memory import fits, max_points, num_points
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
-from sc3d.tiling.tile_graph import PropagateJob, TileGraph, cells_of
+from sc3d.tiling.tile_graph import PropagateJob, TileGraph, cells_of, relief_histogram
 from sc3d.tiling.work_folder import WorkFolder
 
 logger = logging.getLogger(__name__)
@@ -90,7 +106,13 @@ def propagate_scene(
     if channels is None:
         raise InputError(f"{cloud.path} has votes of no class: it was not written by `sc3d label`")
     corrections = Corrections.of_scene(scene)
-    decisive: list[Input] = [cloud.path, scene.sparse, PhotoFrames(scene.images), *corrections.files]
+    decisive: list[Input] = [
+        cloud.path,
+        scene.sparse,
+        scene.classes,
+        PhotoFrames(scene.images),
+        *corrections.files,
+    ]
     folder, statistics = (
         WorkFolder(output, "propagate", decisive, settings),
         CloudStatistics.from_cloud(cloud),
@@ -101,7 +123,10 @@ def propagate_scene(
     margin = HOPS * EDGE * sample_spacing(store, statistics)[0]
     results, shared = Results(folder.subfolder("results"), store), folder.subfolder("shared")
     up = scene_up(scene)
-    job = PropagateJob(settings, statistics.extent, store, results, margin, channels, shared, up, corrections)
+    levels = levels_of(scene, channels)
+    job = PropagateJob(
+        settings, statistics.extent, store, results, margin, channels, shared, up, corrections, levels=levels
+    )
     with open_executor(settings) as executor:
         _solve(job, executor, cloud.path)
     objects = SceneObjects.tell_apart(scene, partial(_parts, cloud, job), read_objects)
@@ -115,38 +140,61 @@ def _solve(job: PropagateJob, executor: Executor, path: Path) -> None:
     tiles = job.store.tiles
     summaries = executor.run("graph", partial(_graph_task, job), tiles)
     job.corrections.warn_of_missing(np.sum([summary.touched for summary in summaries], axis=0), path)
-    offered, least = (
-        sum(summary.seeds for summary in summaries) > 0,
-        views_to_agree(sum(summary.agreement for summary in summaries)),
-    )
+    offered = _offered(summaries)
     if not offered[: len(job.channels.ids) - 1].any():
         raise no_seeds(path, job.corrections)
     if job.channels.none:
         job = replace(job, rates=NoneRates.from_counts(sum(summary.found for summary in summaries)))
-    statistics = (
-        _learn(job, executor, NormalStatistics.merge([summary.lean for summary in summaries]), least)
-        if uses_appearance(job.settings)
-        else None
-    )
-    source = "once"
-    if job.settings.method == "map" and statistics is not None:
-        for turn in range(max(job.settings.rounds, 1)):
-            if turn and (statistics[0].sum(axis=0) >= MIN_EXAMPLES).sum() < 2:
-                break
-            source = f"round{turn}"
-            statistics = sum_statistics(
-                executor.run(f"round {turn + 1}", partial(_turn_task, job, offered, statistics, turn), tiles)
-            )
-    else:
-        executor.run("labels", partial(_once_task, job, offered, statistics), tiles)
+    learned, source = None, None
+    if uses_appearance(job.settings):
+        job, offered, learned = _learn(job, executor, summaries)
+    if job.settings.method == "map" and learned is not None:
+        source = _rounds(job, executor, offered, learned)
+    elif learned is not None:
+        learned = _limit(job, executor, learned)
+    if source is None:
+        source = "once"
+        executor.run("labels", partial(_once_task, job, offered, learned), tiles)
     reached = _reached(job, executor) if job.settings.method == "map" else None
-    executor.run("states", partial(_state_task, job, source, reached, statistics), tiles)
+    executor.run("states", partial(_state_task, job, source, reached, learned), tiles)
+
+
+def _rounds(
+    job: PropagateJob, executor: Executor, offered: np.ndarray, learned: LearnedFromTiles
+) -> str | None:
+    """As `potts.minimize_energy`; returns how the arrays of the last round are named, None = votes alone."""
+    tiles, attempt = job.store.tiles, 0
+    while learned.tells_apart:
+        taught, last = learned, None
+        for turn in range(max(job.settings.rounds, 1)):
+            if not taught.tells_apart:
+                break
+            last = f"attempt{attempt}_round{turn}"
+            parts = executor.run(f"round {turn + 1}", partial(_turn_task, job, offered, taught, last), tiles)
+            taught = replace(taught, statistics=sum_statistics([statistics for statistics, _ in parts]))
+            counts = np.sum([counts for _, counts in parts], axis=0)
+        if not (too_many := overruled(counts, learned.trust)).any():
+            return last
+        learned, attempt = replace(learned, trust=learned.trust.without(too_many)), attempt + 1
+    return None
+
+
+def _limit(job: PropagateJob, executor: Executor, learned: LearnedFromTiles) -> LearnedFromTiles:
+    """The same, with the classes of which too many seeds would go."""
+    counts = executor.run("seeds", partial(_overruled_task, job, learned), job.store.tiles)
+    return replace(learned, too_many=overruled(np.sum(counts, axis=0), learned.trust))
+
+
+def _overruled_task(job: PropagateJob, learned: LearnedFromTiles, tile: int) -> np.ndarray:
+    part = TileGraph.load(job, tile)
+    return count_overruled(part.known, _start(job, part, learned), part.core)
 
 
 @dataclass(frozen=True)
 class TileSummary:
     """First look at a tile. seeds: (C,) int64 of each class; agreement: as `LabelledPoints.agreement`; lean: of its
-    surfaces; touched: as counts of `Corrections.apply`; found: as `none_evidence.count_votes`
+    surfaces; touched: as counts of `Corrections.apply`; found: as `none_evidence.count_votes`; disagreement: as
+    `vote_evidence.count_disagreement`
     """
 
     seeds: np.ndarray
@@ -154,6 +202,7 @@ class TileSummary:
     lean: NormalStatistics
     touched: np.ndarray
     found: np.ndarray
+    disagreement: np.ndarray
 
 
 def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
@@ -165,14 +214,23 @@ def _graph_task(job: PropagateJob, tile: int) -> TileSummary:
         NormalStatistics.from_normals(part.graph.normals[core], part.graph.spacings[core]),
         job.results.read(tile, "touched"),
         count_votes(part.known.known_votes[core]) if job.channels.none else np.zeros((0, 2), np.int64),
+        count_disagreement(part.known, core),
     )
 
 
+def _offered(summaries: list[TileSummary]) -> np.ndarray:
+    """(C,) bool classes that have seeds."""
+    return np.sum([summary.seeds for summary in summaries], axis=0) > 0
+
+
 def _learn(
-    job: PropagateJob, executor: Executor, lean: NormalStatistics, least: int
-) -> AppearanceStatistics | None:
-    """What the agreed points of all tiles teach, if that does well on points held out."""
+    job: PropagateJob, executor: Executor, summaries: list[TileSummary]
+) -> tuple[PropagateJob, np.ndarray, LearnedFromTiles | None]:
+    """The job without misplaced votes, its classes with seeds (C,) bool, and what the agreed points of all tiles
+    teach, if that tells classes apart on points held out.
+    """
     tiles = job.store.tiles
+    lean = NormalStatistics.merge([summary.lean for summary in summaries])
     terrain = GroundModel.from_statistics(lean, job.extent.low, job.extent.high, job.up)
     for window, ground in zip(
         WINDOWS,
@@ -184,16 +242,62 @@ def _learn(
         QuantileSketch.merge(list(parts))
         for parts in zip(*executor.run("relief", partial(_relief_task, job, terrain), tiles), strict=True)
     ]
-    halves = [
-        sum_statistics(list(parts))
-        for parts in zip(
-            *executor.run("examples", partial(_statistics_task, job, counts, least), tiles), strict=True
-        )
-    ]
-    errors = executor.run("held-out errors", partial(_error_task, job, halves, least), tiles)
-    wrong = [None if None in fold else sum(fold) for fold in zip(*errors, strict=True)]
-    statistics = sum_statistics(halves)
-    return statistics if is_skillful(wrong, statistics) else None
+    halves, least = _examples(job, executor, summaries, counts)
+    if job.levels is not None:
+        job = replace(job, misplaced=_misplaced(job, executor, halves, least, job.levels))
+    if job.misplaced is not None:
+        summaries = executor.run("graph", partial(_graph_task, job), tiles)
+        halves, least = _examples(job, executor, summaries, counts)
+    contrasts = sum(executor.run("held-out looks", partial(_held_out_task, job, halves, least), tiles))
+    trust = trust_of(halves, contrasts, np.sum([summary.disagreement for summary in summaries], axis=0))
+    learned = None if trust is None else LearnedFromTiles(sum_statistics(halves), trust)
+    return job, _offered(summaries), learned
+
+
+def _examples(
+    job: PropagateJob, executor: Executor, summaries: list[TileSummary], counts: list[QuantileSketch]
+) -> tuple[list[AppearanceStatistics], int]:
+    """Statistics of the agreed points of both folds, and how many views must agree."""
+    least = views_to_agree(np.sum([summary.agreement for summary in summaries], axis=0))
+    parts = executor.run("examples", partial(_statistics_task, job, counts, least), job.store.tiles)
+    return [sum_statistics(list(fold)) for fold in zip(*parts, strict=True)], least
+
+
+def _misplaced(
+    job: PropagateJob, executor: Executor, halves: list[AppearanceStatistics], least: int, levels: np.ndarray
+) -> Misplaced | None:
+    relief = [half[-1] for half in halves]
+    sides = executor.run("sides", partial(_sides_task, job, relief, least), job.store.tiles)
+    return Misplaced.measure(relief_histogram(np.empty(0, np.int32)), relief, sum(sides), levels)
+
+
+def _sides_task(job: PropagateJob, halves: list[np.ndarray], least: int, tile: int) -> np.ndarray:
+    part = TileGraph.load(job, tile)
+    examples, folds = part.known.agreed_by(least) & part.core, _folds(job, part)
+    return count_sides(part.appearance(job).groups[-1], halves, part.known, examples, folds)
+
+
+def _folds(job: PropagateJob, part: TileGraph) -> np.ndarray:
+    return folds_of(part.known.points, job.extent.low, job.extent.high)
+
+
+@dataclass(frozen=True)
+class LearnedFromTiles:
+    """`LearnedAppearance` without its model, of which each tile has its own part; too_many: (C,) bool as of
+    `appearance.limited`, None = not known yet
+    """
+
+    statistics: AppearanceStatistics
+    trust: Trust
+    too_many: np.ndarray | None = None
+
+    @property
+    def tells_apart(self) -> bool:
+        """Whether there are examples of two looks."""
+        return tells_apart(self.statistics, self.trust)
+
+    def of(self, model: AppearanceModel) -> LearnedAppearance:
+        return LearnedAppearance(model, self.statistics, self.trust)
 
 
 def _lowest_task(job: PropagateJob, terrain: GroundModel, tile: int) -> tuple[np.ndarray, np.ndarray]:
@@ -219,10 +323,7 @@ def _statistics_task(
         part.own_in_order(job.results.read(tile, "relief")), part.known.colors, counts
     )
     job.results.write(tile, cells=part.own(cells_of(appearance)))
-    examples, folds = (
-        part.known.agreed_by(least) & part.core,
-        folds_of(part.known.points, job.extent.low, job.extent.high),
-    )
+    examples, folds = part.known.agreed_by(least) & part.core, _folds(job, part)
     even, odd = (
         appearance.statistics(part.known.seed_labels, examples & (folds == fold), part.known.num_classes)
         for fold in (0, 1)
@@ -230,73 +331,60 @@ def _statistics_task(
     return even, odd
 
 
-def _error_task(
+def _held_out_task(
     job: PropagateJob, halves: list[AppearanceStatistics], least: int, tile: int
-) -> tuple[int | None, int | None]:
+) -> np.ndarray:
     part = TileGraph.load(job, tile)
-    appearance, start = part.appearance(job), part.known.seed_labels
-    examples, folds = (
-        part.known.agreed_by(least) & part.core,
-        folds_of(part.known.points, job.extent.low, job.extent.high),
-    )
-    even, odd = (appearance.errors(halves[1 - fold], start, examples & (folds == fold)) for fold in (0, 1))
-    return even, odd
+    examples, folds = part.known.agreed_by(least) & part.core, _folds(job, part)
+    return held_out(part.appearance(job), halves, part.known.seed_labels, examples, folds)
 
 
 def _turn_task(
-    job: PropagateJob, offered: np.ndarray, statistics: AppearanceStatistics, turn: int, tile: int
-) -> AppearanceStatistics:
-    """A round of mean field; returns what its result teaches."""
+    job: PropagateJob,
+    offered: np.ndarray,
+    learned: LearnedFromTiles,
+    name: str,
+    tile: int,
+) -> tuple[AppearanceStatistics, np.ndarray]:
+    """A round of mean field, of this name; returns what its result teaches, and `count_overruled`."""
     part = TileGraph.load(job, tile)
     appearance, known = part.appearance(job), part.known
-    if not job.results.has(tile, f"round{turn}_examples"):
-        label = part.around(job, f"round{turn - 1}_label") if turn else known.seed_labels
-        rating = appearance.log_likelihood(statistics, label)
+    if not job.results.has(tile, f"{name}_examples"):
+        rating = learned.of(appearance).log_likelihood(known)
         if rating is None:
-            raise ValueError("a round needs examples of two classes")
-        evidence, marginals = appearance_marginals(part.graph, known, offered, rating, job.settings)
-        examples = sure_examples(marginals, known)
-        label, confidence = decided(part.graph, known, evidence, marginals)
-        names = (f"round{turn}_label", f"round{turn}_confidence", f"round{turn}_examples")
-        job.results.write(
-            tile,
-            **{
-                name: part.own(values)
-                for name, values in zip(names, (label, confidence, examples), strict=True)
-            },
-        )
+            raise ValueError("a round needs examples of two looks")
+        found = appearance_marginals(part.graph, known, offered, rating, learned.trust, job.settings)
+        examples = sure_examples(found[1], known)
+        label, confidence = decided(part.graph, known, *found)
+        arrays = {"label": label, "confidence": confidence, "examples": examples}
+        job.results.write(tile, **{f"{name}_{key}": part.own(values) for key, values in arrays.items()})
     label, examples = (
-        part.own_in_order(job.results.read(tile, f"round{turn}_{name}")) for name in ("label", "examples")
+        part.own_in_order(job.results.read(tile, f"{name}_{key}")) for key in ("label", "examples")
     )
-    return appearance.statistics(label, examples & part.core, known.num_classes)
+    statistics = appearance.statistics(label, examples & part.core, known.num_classes)
+    return statistics, count_overruled(known, label, part.core)
 
 
-def _once_task(
-    job: PropagateJob, offered: np.ndarray, statistics: AppearanceStatistics | None, tile: int
-) -> None:
+def _once_task(job: PropagateJob, offered: np.ndarray, learned: LearnedFromTiles | None, tile: int) -> None:
     """map without appearance, geometry or knn, within the margin."""
     part = TileGraph.load(job, tile)
     if job.settings.method == "map":
         found = vote_marginals(part.graph, part.known, offered, job.settings)
         label, confidence = decided(part.graph, part.known, *found)
     else:
-        start = _start(job, part, statistics)
+        start = _start(job, part, learned)
         label, confidence = spread(part.graph, part.known.points, start, job.settings)
     job.results.write(tile, once_label=part.own(label), once_confidence=part.own(confidence))
 
 
-def _start(job: PropagateJob, part: TileGraph, statistics: AppearanceStatistics | None) -> np.ndarray:
+def _start(job: PropagateJob, part: TileGraph, learned: LearnedFromTiles | None) -> np.ndarray:
     """The labels of the seeds; for geometry and knn without those that look like another class."""
-    start = part.known.seed_labels
-    return (
-        start
-        if statistics is None or job.settings.method == "map"
-        else np.where(
-            part.known.corrected,
-            start,
-            plausible(start, part.appearance(job).log_likelihood(statistics, start)),
-        )
-    )
+    seeds = part.known.seed_labels
+    if learned is None or job.settings.method == "map":
+        return seeds
+    rating = learned.of(part.appearance(job)).log_likelihood(part.known)
+    kept = plausible_seeds(part.known, rating, learned.trust)
+    return kept if learned.too_many is None else limited(part.known, kept, learned.too_many)
 
 
 def _reached(job: PropagateJob, executor: Executor) -> dict[int, np.ndarray]:
@@ -351,7 +439,7 @@ def _state_task(
     job: PropagateJob,
     source: str,
     reached: dict[int, np.ndarray] | None,
-    statistics: AppearanceStatistics | None,
+    learned: LearnedFromTiles | None,
     tile: int,
 ) -> None:
     part = TileGraph.load(job, tile)
@@ -361,7 +449,7 @@ def _state_task(
         label = np.where(groups[part.graph.order], label, 0)
     if job.settings.fill:
         label, confidence = fill_from_nearest(part.known.points, label, confidence)
-    final = with_states(part.known.seeds, _start(job, part, statistics), (label, confidence), job.settings)
+    final = with_states(part.known.seeds, _start(job, part, learned), (label, confidence), job.settings)
     label = job.channels.to_ids(final.label)
     job.results.write(
         tile, label=part.own(label), confidence=part.own(final.confidence), state=part.own(final.state)

@@ -4,7 +4,7 @@ arrays of the tile's own points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +18,10 @@ from sc3d.propagation.appearance import (
     RELIEF_BINS,
     RELIEF_BLUR,
     AppearanceModel,
-    Histogram,
 )
+from sc3d.propagation.histogram import Histogram
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
+from sc3d.propagation.misplaced import Misplaced
 from sc3d.propagation.none_evidence import NoneRates
 from sc3d.propagation.propagate import seeds_in_channels
 from sc3d.propagation.terrain import NUM_FEATURES
@@ -40,7 +41,7 @@ KNOWN = ("points", "votes", *(field.name for field in fields(Labels)), "colors")
 class PropagateJob:
     """What the task of a tile needs to know. margin: world units; channels: of the votes; shared: folder
     for what all tiles read; up: (3,) of the cameras, None = not known; rates: of votes for none, once
-    counted
+    counted; levels: as of `LabelledPoints`; misplaced: votes that count less, once measured
     """
 
     settings: Propagate
@@ -53,6 +54,8 @@ class PropagateJob:
     up: np.ndarray | None = None
     corrections: Corrections = Corrections()
     rates: NoneRates | None = None
+    levels: np.ndarray | None = None
+    misplaced: Misplaced | None = None
 
     @property
     def colored(self) -> bool:
@@ -83,8 +86,13 @@ class TileGraph:
             known[-1] if job.colored else None,
             none=job.channels.none,
             rates=job.rates,
+            levels=job.levels,
         )
-        return cls(tile, halo, graph, evidence, halo.core[graph.order])
+        part = cls(tile, halo, graph, evidence, halo.core[graph.order])
+        if job.misplaced is None:
+            return part
+        placed = job.misplaced.without(evidence, part.appearance(job).groups[-1].cell)
+        return replace(part, known=placed)
 
     def own(self, values: np.ndarray) -> np.ndarray:
         """Values of the tile's own points, as `Results` keeps them, from values (N, ...) of the part."""
@@ -109,10 +117,15 @@ class TileGraph:
 
 def appearance_of(cells: np.ndarray) -> AppearanceModel:
     """Raters from the cells (N, G) int32 that `cells_of` gives."""
-    relief = Histogram(cells[:, -1], (RELIEF_BINS,) * NUM_FEATURES, RELIEF_BLUR)
+    relief = relief_histogram(cells[:, -1])
     return AppearanceModel(
         (relief,) if cells.shape[1] == 1 else (Histogram(cells[:, 0], (COLOR_BINS,) * 3, COLOR_BLUR), relief)
     )
+
+
+def relief_histogram(cell: np.ndarray) -> Histogram:
+    """Of the relief of points, from the cell (N,) int32 of each."""
+    return Histogram(cell, (RELIEF_BINS,) * NUM_FEATURES, RELIEF_BLUR)
 
 
 def cells_of(appearance: AppearanceModel) -> np.ndarray:

@@ -13,7 +13,6 @@ from sc3d.errors import InputError
 from sc3d.exporters import elevation, height_grids, laz
 from sc3d.exporters.projected_cloud import projected_chunks
 from sc3d.geometry.ground_filter import low_objects
-from sc3d.instances.terrain import ground_classes
 from sc3d.scene.class_table import OTHER, parse_classes
 from sc3d.settings.outputs import Export
 from sc3d.settings.synthesize import Synthesize
@@ -175,8 +174,8 @@ def test_ground_is_told_by_the_codes_of_the_class_table(tmp_path):
         classes = [{"id": 5 + row, "name": f"c{row}", "color": [1, 2, 3]} for row in range(len(codes))]
         return parse_classes([entry | {"asprs": code} for entry, code in zip(classes, codes)], "here")
 
-    assert ground_classes(table(2, 3, 5, 6, 11, 1, 9)) == [5, 6, 9, 11]
-    assert ground_classes(table(3, 11)) == [6]  # the only vegetation: trees
+    assert table(2, 3, 5, 6, 11, 1, 9).ground_classes == [5, 6, 9, 11]
+    assert table(3, 11).ground_classes == [6]  # the only vegetation: trees
     codes = laz.asprs_codes(table(2, 3, 5, 6, 11, 1), ground_as_2=True)
     assert codes[5:11].tolist() == [2, 2, 5, 6, 2, 1] and codes[0] == 1
     scene = write_scene(

@@ -14,6 +14,7 @@ import pycolmap
 import pyproj
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from sc3d.cli import main
 from sc3d.errors import InputError
@@ -23,6 +24,7 @@ from sc3d.georeferencing.georeference import Georeference, from_origin, read_geo
 from sc3d.importers.model import guess_observations
 from sc3d.importers.opensfm import _distortion_model as opensfm_model
 from sc3d.importers.project import read_project
+from sc3d.io.colmap import load_model
 from sc3d.scene.scene import Scene, read_sparse_model
 from sc3d.settings.reconstruction import Import
 from tests.builders import CLASSES, ORIGIN, ground, truth_mask, write_model
@@ -189,6 +191,97 @@ def opensfm_json(views: list[View], points: np.ndarray, reference: tuple | None)
     if reference:
         found["reference_lla"] = dict(zip(("latitude", "longitude", "altitude"), reference))
     return [{"cameras": {}, "shots": {}}, found]
+
+
+def write_opf(folder: Path, views: list[View], points: np.ndarray, frame: dict | None = None) -> None:
+    """A project in the Open Photogrammetry Format: every view sees every third point."""
+    fx, _, cx, cy, k1, k2, p1, p2, k3 = CAMERAS["FULL_OPENCV"][:9]
+    internals = {
+        "type": "perspective",
+        "focal_length_px": fx,
+        "principal_point_px": [cx, cy],
+        "radial_distortion": [k1, k2, k3],
+        "tangential_distortion": [p1, p2],
+    }
+    ids = [2**63 + row for row in range(len(views))]
+    cameras = []
+    for uid, view in zip(ids, views):
+        rotation = view.cam_from_world[:3, :3].T * [1, -1, -1]
+        angles = Rotation.from_matrix(rotation).as_euler("XYZ", degrees=True)
+        camera = {
+            "id": uid,
+            "sensor_id": 7,
+            "orientation_deg": angles.tolist(),
+            "position": view.center.tolist(),
+        }
+        cameras.append(camera)
+    listed = [{"id": uid, "uri": f"../photos/{view.name}"} for uid, view in zip(ids, views)]
+    documents = {
+        "camera-list": {"cameras": [*listed, {"id": 5, "uri": "../photos/lost%20one.jpg"}]},
+        "input-cameras": {"sensors": [{"id": 7, "image_size_px": list(SIZE)}], "captures": []},
+        "calibrated-cameras": {"cameras": cameras, "sensors": [{"id": 7, "internals": internals}]},
+        "scene-reference-frame": frame,
+    }
+    items = []
+    for name, content in documents.items():
+        kind = f"application/opf-{name}+json"
+        if content is not None:
+            (folder / f"{name}.json").write_text(json.dumps({"format": kind, "version": "1.0", **content}))
+            items.append(
+                {"type": name.replace("-", "_"), "resources": [{"format": kind, "uri": f"{name}.json"}]}
+            )
+    items.append({"type": "calibration", "resources": [{"format": "model/gltf+json", "uri": "tracks.gltf"}]})
+    write_opf_tracks(folder, ids, views, points)
+    project_file = {"format": "application/opf-project+json", "version": "1.0", "items": items}
+    (folder / "site.opf").write_text(json.dumps(project_file))
+
+
+def write_opf_tracks(folder: Path, ids: list[int], views: list[View], points: np.ndarray) -> None:
+    seen = [list(range(row % 3, len(views), 3)) for row in range(len(points))]
+    counts = np.array([len(rows) for rows in seen])
+    first = np.cumsum(counts) - counts
+    ranges = b"".join(
+        int(a).to_bytes(5, "little") + int(n).to_bytes(3, "little") for a, n in zip(first, counts)
+    )
+    pixels = [project(views[view], points[row][None])[0][0] for row, rows in enumerate(seen) for view in rows]
+    arrays = [
+        (points[:, [0, 2, 1]] * [1, 1, -1]).astype("<f4"),
+        np.tile(np.uint8([9, 8, 7, 255]), (len(points), 1)),
+        np.concatenate(seen).astype("<u4")[:, None],
+        np.frombuffer(ranges, "<u4").reshape(-1, 2),
+        np.array(pixels, "<f4"),
+    ]
+    kinds = [("VEC3", 5126), ("VEC4", 5121), ("SCALAR", 5125), ("VEC2", 5125), ("VEC2", 5126)]
+    offsets = np.cumsum([0, *(array.nbytes for array in arrays)])
+    (folder / "tracks.bin").write_bytes(b"".join(array.tobytes() for array in arrays))
+    extension = {
+        "cameraUids": ids,
+        "cameraIds": 2,
+        "pointIndexRanges": 3,
+        "imagePoints": {"pixelCoordinates": 4},
+    }
+    primitive = {
+        "attributes": {"POSITION": 0, "COLOR_0": 1},
+        "mode": 0,
+        "extensions": {"OPF_mesh_primitive_matches": extension},
+    }
+    content = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": [
+            {"bufferView": row, "componentType": kind, "type": name, "count": len(array)}
+            for row, (array, (name, kind)) in enumerate(zip(arrays, kinds))
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": int(start), "byteLength": array.nbytes}
+            for start, array in zip(offsets, arrays)
+        ],
+        "buffers": [{"uri": "tracks.bin", "byteLength": int(offsets[-1])}],
+    }
+    (folder / "tracks.gltf").write_text(json.dumps(content))
 
 
 def pix4d_text(views: list[View]) -> str:
@@ -369,6 +462,79 @@ class TestRoundTrips:
         assert read_georeference(Scene(tmp_path / "scene")) == Georeference(
             32615, (576600.0, 5188100.0, 150.0)
         )
+
+    def opf_site(self, folder: Path, frame: dict | None) -> tuple[list[View], np.ndarray]:
+        fx, _, *rest = CAMERAS["FULL_OPENCV"]
+        camera = pycolmap.Camera(model="FULL_OPENCV", width=SIZE[0], height=SIZE[1], params=[fx, fx, *rest])
+        views = [replace(view, camera=camera) for view in fly()]
+        (folder / "project").mkdir(parents=True)
+        write_photos(folder / "photos", views)
+        write_opf(folder / "project", views, probe(60), frame)
+        return views, probe(60)
+
+    @pytest.mark.parametrize(
+        ("epsg", "vertical", "scale", "unit"),
+        [
+            (32615, "", [1.0, 1, 1], 1.0),
+            (2229, "", [1200 / 3937] * 3, 1200 / 3937),
+            (32615, "+6360", [1, 1, 1200 / 3937], 1),
+        ],
+    )
+    def test_opf(self, tmp_path, caplog, epsg, vertical, scale, unit):
+        """6360: heights in US survey feet."""
+        shift = [-576600.0 * scale[0], -5188100.0 * scale[1], -150.0 * scale[2]]
+        definition = pyproj.CRS.from_user_input(f"EPSG:{epsg}{vertical}").to_wkt()
+        frame = {
+            "crs": {"definition": definition},
+            "base_to_canonical": {"scale": scale, "shift": shift, "swap_xy": False},
+        }
+        views, points = self.opf_site(tmp_path, frame)
+        run("import", tmp_path / "project", tmp_path / "scene")
+        model = Scene(tmp_path / "scene").model
+        assert same_projections(model.views, views, probe()) < 1e-6
+        assert np.abs(model.points - points).max() < 1e-6 and (model.colors == [9, 8, 7]).all()
+        found = read_georeference(Scene(tmp_path / "scene"))
+        base = found.to_crs(points)
+        # base coordinates times scale, plus shift, heights in the unit of eastings
+        assert (
+            found.epsg == epsg and np.abs((base[:, :2] * scale[:2] + shift[:2]) - points[:, :2]).max() < 1e-6
+        )
+        assert np.abs(base[:, 2] * unit - (points[:, 2] - shift[2])).max() < 1e-6
+        loaded = load_model(Scene(tmp_path / "scene").sparse)
+        for point in list(loaded.points3D.values())[:9]:
+            for element in point.track.elements:
+                image = loaded.images[element.image_id]
+                view = next(view for view in views if image.name.endswith(view.name))
+                pixel = project(view, point.xyz[None])[0][0]
+                assert np.abs(image.points2D[element.point2D_idx].xy - pixel).max() < 1e-3
+            assert point.track.length() in (2, 3, 4)
+        assert "1 that are not calibrated (../photos/lost one.jpg)" in caplog.text
+
+    def test_opf_orientations_as_pyopf_has_them(self, tmp_path):
+        converter = pytest.importorskip("opf_tools.opf2colmap.converter")
+        views, _ = self.opf_site(tmp_path, None)
+        content = json.loads((tmp_path / "project" / "calibrated-cameras.json").read_text())
+        for view, camera in zip(views, content["cameras"]):
+            quaternion, translation = converter.orient_pos_computation(
+                np.array(camera["orientation_deg"]), np.array(camera["position"])
+            )
+            rotation = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+            assert np.abs(rotation - view.cam_from_world[:3, :3]).max() < 1e-6
+            assert np.abs(translation - view.cam_from_world[:3, 3]).max() < 1e-6
+
+    def test_opf_without_a_place_and_with_a_fisheye(self, tmp_path, caplog):
+        self.opf_site(tmp_path, None)
+        path = tmp_path / "project" / "calibrated-cameras.json"
+        content = json.loads(path.read_text())
+        content["sensors"].append({"id": 8, "internals": {"type": "fisheye"}})
+        content["cameras"][0]["sensor_id"] = 8
+        path.write_text(json.dumps(content))
+        run("import", tmp_path / "project" / "site.opf", tmp_path / "scene")
+        assert read_georeference(Scene(tmp_path / "scene")) is None
+        assert "1 of a fisheye lens, which no COLMAP model has (../photos/shot_0.jpg)" in caplog.text
+        path.unlink()
+        with pytest.raises(SystemExit):
+            run("import", tmp_path / "project" / "site.opf", tmp_path / "other")
 
     @pytest.mark.parametrize(
         "reference",

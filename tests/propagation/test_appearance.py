@@ -8,6 +8,7 @@ from sc3d.propagation import propagate as propagation
 from sc3d.propagation.appearance import AppearanceModel
 from sc3d.propagation.labelled_points import LabelledPoints
 from sc3d.propagation.terrain import relief_features
+from sc3d.propagation.trust import Trust
 from sc3d.scene.labels import SEED, UNSEEN, Labels
 from sc3d.settings.labels import Propagate
 
@@ -21,8 +22,10 @@ def propagate(graph: Graph, points: LabelledPoints, settings: Propagate) -> Labe
 def fitted(
     model: AppearanceModel, label: np.ndarray, examples: np.ndarray, num_classes: int
 ) -> np.ndarray | None:
-    """What the model says of a cloud by the cloud's own examples."""
-    return model.log_likelihood(model.statistics(label, examples, num_classes), label)
+    """What the model says of a cloud by the cloud's own examples, if it is believed."""
+    trust = Trust(np.full(num_classes, 0.1), np.arange(num_classes))
+    shares = np.eye(num_classes + 1, dtype=np.float32)[label][:, 1:]
+    return model.log_likelihood(model.statistics(label, examples, num_classes), trust, shares)
 
 
 def village(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -12,8 +12,9 @@ from sc3d.geometry.graph import Graph, build_graph, similarity
 from sc3d.geometry.neighbors import NeighborIndex, curvature
 from sc3d.propagation import propagate as propagation
 from sc3d.propagation.labelled_points import LabelledPoints, tie_breakers
-from sc3d.propagation.potts import mean_field, softmax
+from sc3d.propagation.potts import mean_field
 from sc3d.propagation.region_growing import grow_regions, vote_nearest
+from sc3d.propagation.vote_evidence import softmax
 from sc3d.scene.labels import LOCKED, PROPAGATED, SEED, UNSEEN, Labels
 from sc3d.settings.labels import Propagate
 from tests.reference.potts import free_energy, mean_field_sequential, potts_energy

@@ -362,7 +362,7 @@ def _read_project(folder: Path) -> object:
         (
             file
             for file in folder.iterdir()
-            if file.suffix in (".xml",) or file.name.endswith("parameters.txt")
+            if file.suffix in (".xml", ".opf") or file.name.endswith("parameters.txt")
         ),
         folder,
     )
@@ -408,6 +408,12 @@ def _build_project(kind: str):
             (folder / "x_calibrated_camera_parameters.txt").write_text(made.pix4d_text(views))
             (folder / "x_wkt.prj").write_text(pyproj.CRS.from_epsg(32615).to_wkt())
             (folder / "x_offset.xyz").write_text("576000 5188000 0\n")
+        elif kind == "opf":
+            frame = {
+                "crs": {"definition": "EPSG:32615"},
+                "base_to_canonical": {"scale": [1, 1, 1], "shift": [-576000, -5188000, 0], "swap_xy": False},
+            }
+            made.write_opf(folder, views, points, frame)
 
     return build
 
@@ -488,6 +494,7 @@ PROJECT_FILES = {
     "opensfm": ("reconstruction.json", "tracks.csv"),
     "metashape": ("cameras.xml",),
     "pix4d": ("x_calibrated_camera_parameters.txt", "x_wkt.prj", "x_offset.xyz"),
+    "opf": ("site.opf", "camera-list.json", "calibrated-cameras.json", "tracks.gltf", "tracks.bin"),
 }
 
 READERS: dict[str, Reader] = {

@@ -269,7 +269,7 @@ def test_other_text_is_refused_with_what_to_do(tmp_path, text, match):
         read_geometry(tmp_path / "a.xyz")
 
 
-@pytest.mark.parametrize("suffix", [".e57", ".ptx", ".stl", ".glb"])
+@pytest.mark.parametrize("suffix", [".ptx", ".stl", ".glb"])
 def test_other_formats_are_refused_with_what_to_save(site, tmp_path, suffix):
     (tmp_path / f"a{suffix}").write_bytes(bytes(64))
     settings = Import(project=tmp_path / f"a{suffix}")

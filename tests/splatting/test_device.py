@@ -8,10 +8,12 @@ import torch
 
 from sc3d.errors import InputError, MissingPackageError
 from sc3d.scene.held_out import mean_scores
-from sc3d.settings.train import TrainSettings
+from sc3d.scene.scene import Scene
+from sc3d.settings.train import Train, TrainSettings
 from sc3d.splatting import device, trainer
 from sc3d.splatting.gpu import gsplat_backend
 from sc3d.splatting.trainer import train
+from sc3d.stages import train as train_stage
 from tests.pretend_device import PretendDevice
 from tests.splatting.gpu.test_gsplat_backend import functions, reference  # noqa: F401, fixtures
 from tests.splatting.scenes import photographed, ring, valley
@@ -76,3 +78,12 @@ def test_device_is_picked_by_what_is_there(monkeypatch):
     monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: name)
     assert device.pick_device("auto").type == device.pick_device("cuda").type == "cuda"
     torch.backends.cudnn.allow_tf32 = precision
+
+
+@pytest.mark.parametrize(("name", "iterations", "told"), [("cuda", 0, 1), ("cuda", 500, 0), ("cpu", 0, 0)])
+def test_on_a_gpu_the_papers_iterations_are_named(tmp_path, monkeypatch, caplog, name, iterations, told):
+    monkeypatch.setattr(train_stage, "pick_device", lambda asked: torch.device(name))
+    caplog.set_level("INFO")
+    with pytest.raises(InputError):  # nothing is there to be trained on
+        train_stage.run(Scene(tmp_path), Train(iterations=iterations))
+    assert caplog.text.count("--iterations is 30000") == told

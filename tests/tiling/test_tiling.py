@@ -158,6 +158,27 @@ def test_map_by_tile_is_that_of_the_whole(site, small_tiles, options):
     assert_same(whole, tiled, but=("label", "state", "confidence"))
 
 
+def test_votes_that_stand_on_the_ground_by_mistake_count_less_by_tile_as_in_the_whole(
+    site, small_tiles, tmp_path, caplog
+):
+    """Every view calls most of the road a building."""
+    seeds = tmp_path / "seeds.ply"
+    label.run(Scene(site), Label(output=seeds))
+    cloud = read_cloud(seeds)
+    told, votes = cloud.point["label"].numpy(), [cloud.point[f"votes_{id_}"].numpy() for id_ in (1, 3)]
+    wrong = (told == 3) & (cloud.point.positions.numpy()[:, 1:2] % 10 < 8)
+    votes[0][wrong], votes[1][wrong], told[wrong] = votes[1][wrong], votes[0][wrong], 1
+    write_geometry(seeds, cloud)
+    results = []
+    for name, memory in (("whole", ""), ("tiled", "2G")):
+        caplog.clear()
+        propagate.run(Scene(site), Propagate(seeds=seeds, output=tmp_path / f"{name}.ply", max_memory=memory))
+        assert "1 of 4 classes stand where the others that stand do not" in caplog.text
+        results.append(columns(tmp_path / f"{name}.ply"))
+    assert (results[0]["label"] != results[1]["label"]).mean() <= 1e-4
+    assert (results[0]["state"] != results[1]["state"]).mean() <= 1e-4
+
+
 @pytest.mark.parametrize("method", ["geometry", "knn"])
 def test_other_methods_by_tile_differ_in_few_points(site, small_tiles, method):
     seeds = site / "seeds_for_others.ply"

@@ -1,5 +1,6 @@
-"""The demo's commands exist, and it ends at the first that fails."""
+"""The demo's commands exist, it ends at the first that fails, and says what came of it."""
 
+import json
 import subprocess
 import sys
 
@@ -9,10 +10,12 @@ from sc3d.cli import parse
 from tools import demo
 
 
-def test_commands_are_commands_of_sc3d(tmp_path):
-    for name, *arguments in demo.commands(tmp_path):
-        parse(name, arguments)
+@pytest.mark.parametrize("full", [False, True])
+def test_commands_are_commands_of_sc3d(tmp_path, full):
+    for name, *arguments in demo.commands(tmp_path, full):
+        command, _ = parse(name, arguments)
         assert (demo.TOOLS / f"{name}.py").is_file()
+        assert name != "run" or command.extract.method == ("tsdf" if full else "depth")
 
 
 @pytest.mark.parametrize("failing", [None, "run"])
@@ -23,6 +26,9 @@ def test_commands_run_in_turn_until_one_fails(tmp_path, monkeypatch, capsys, fai
         called.append(words[1].stem)
         return subprocess.CompletedProcess(words, 3 if words[1].stem == failing else 0)
 
+    (tmp_path / "scene").mkdir()
+    figures = {"masks": {"miou": 0.651}, "labels": {"miou": 0.874}}
+    (tmp_path / "scene" / "metrics.json").write_text(json.dumps(figures))
     monkeypatch.setattr(subprocess, "run", run)
     monkeypatch.setattr(sys, "argv", ["demo.py", str(tmp_path)])
     if failing:
@@ -31,4 +37,6 @@ def test_commands_run_in_turn_until_one_fails(tmp_path, monkeypatch, capsys, fai
     else:
         demo.main()
     assert called == (["synthesize", "run"] if failing else ["synthesize", "run", "view"])
-    assert (str(tmp_path / "labelled.png") in capsys.readouterr().out) is not bool(failing)
+    told = capsys.readouterr().out
+    assert (str(tmp_path / "labelled.png") in told) is not bool(failing)
+    assert ("65.1 % of the masks" in told and "87.4 % of the labels" in told) is not bool(failing)

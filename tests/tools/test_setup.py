@@ -2,6 +2,7 @@
 
 import configparser
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -203,3 +204,14 @@ def test_the_oldest_python_is_the_one_that_style_and_types_are_checked_for():
 def test_the_scripts_are_valid_bash():
     for file in (ROOT / "tools").glob("*.sh"):
         assert os.access(file, os.R_OK) and subprocess.run(["bash", "-n", file], check=False).returncode == 0
+
+
+def test_the_image_has_the_libraries_that_the_set_up_installs():
+    setup, image = (ROOT / "tools" / "setup.sh").read_text(), (ROOT / "Dockerfile").read_text()
+    libraries = re.search(r"^libraries=\((.*)\)$", setup, re.M)
+    assert libraries is not None and f"install-recommends {libraries[1]} \\\n" in image
+    assert all(
+        (ROOT / name).exists()
+        for line in re.findall(r"^COPY (.*) \S+$", image, re.M)
+        for name in line.split()
+    )

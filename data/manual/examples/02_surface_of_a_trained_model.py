@@ -3,7 +3,7 @@
     python data/manual/examples/02_surface_of_a_trained_model.py [FOLDER]
 
 Photos and cameras come from the synthetic generator, so that the mesh can be held against the true cloud. 120
-iterations at 160 px show the way, not the quality: the default is 3000 at 800 px.
+iterations at 160 px show the way, not the quality: the default is 1000 at least, at 800 px.
 """
 
 import sys

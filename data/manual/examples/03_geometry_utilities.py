@@ -2,8 +2,7 @@
 
     python data/manual/examples/03_geometry_utilities.py
 
-Cameras and rays, the first surface and what it hides, normals, curvature, a sparse voxel grid: numpy in, numpy
-out. `geometry-by-example.md` goes through them one by one, `geometry/` has every function.
+Cameras and rays, the first surface, normals, curvature, a sparse voxel grid; more in `geometry-by-example.md`.
 """
 
 import numpy as np
@@ -16,7 +15,7 @@ from sc3d.geometry.raycast import Surface, first_surface, see_points
 from sc3d.geometry.voxels import LabelGrid, sort_by_voxel
 
 
-def main() -> None:
+def main() -> tuple[np.ndarray, ...]:
     # a box of 4 x 4 x 3 m on a block of 20 x 20 m, far from the world's zero, as in UTM
     origin = np.array([500_000.0, 5_200_000.0, 100.0])
     mesh = o3d.geometry.TriangleMesh.create_box(20, 20, 2).translate((-10, -10, -2))
@@ -53,6 +52,7 @@ def main() -> None:
     grid.add(grid.find(points), np.ones((len(points), 1), np.int32))
     print(f"{(grid.votes[:, 0] > 0).sum()} voxels of 0.5 m hold points, {grid.votes[:, 0].max()} at most")
     assert grid.votes[:, 0].sum() == len(points) and grid.find(view.center[None])[0] == -1
+    return points, seen, bend
 
 
 if __name__ == "__main__":

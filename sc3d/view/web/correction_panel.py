@@ -50,6 +50,7 @@ class CorrectionPanel:
         self._lasso: viser.SceneNodeHandle | None = None
         self._marked: viser.SceneNodeHandle | None = None
         self._applying = threading.Lock()
+        self._on_start: list[Callable[[], None]] = []
         self._inside = dict[str, np.ndarray]()  # rows of the display, by correction
         self._world = page.inspector.cloud.point.positions.cpu().numpy().astype(np.float64)[page.display.rows]
         table, gui, spacing = page.display.class_table, page.server.gui, page.display.spacing
@@ -70,6 +71,15 @@ class CorrectionPanel:
         self._choose()
         self._try(self._mark)
 
+    def on_start(self, action: Callable[[], None]) -> None:
+        """Call an action when a tool is chosen: other tools answer the same clicks."""
+        self._on_start.append(action)
+
+    def stop(self) -> None:
+        """Put the tool away."""
+        if self._tool.value != OFF:
+            self._tool.value = OFF  # type: ignore[misc]  # viser types it as read-only
+
     def _try(self, action: Callable[[], None], lock: AbstractContextManager | None = None) -> None:
         """Do one thing at a time, and say why it failed."""
         with lock or self._busy:
@@ -84,6 +94,9 @@ class CorrectionPanel:
 
     def _choose(self) -> None:
         self._close.visible, self._radius.visible = self._tool.value == LASSO, self._tool.value == BRUSH
+        if self._tool.value != OFF:
+            for action in self._on_start:
+                action()
         self._draw([])
         self._say(HINTS[self._tool.value])
 

@@ -30,6 +30,7 @@ from sc3d.view.viewpoints import frustum_depth, overview, without_outliers
 from sc3d.view.web.correction_panel import CorrectionPanel
 from sc3d.view.web.guard import guarding
 from sc3d.view.web.layers import CameraLayer, CloudLayer, SplatLayer
+from sc3d.view.web.measure_panel import MeasurePanel
 from sc3d.view.web.orbit_camera import OrbitCamera
 from sc3d.view.web.panel import Page, PhotoPanel, PointPanel, ShowPanel, legend_html
 
@@ -102,8 +103,11 @@ def serving(view: WebView, host: str = LOCAL, port: int = 0) -> Iterator[str]:
         home = _start(server, view, display, views)
         show = ShowPanel(page, view.by, hidden, view.splats_first)
         PointPanel(page, show)
+        measure = MeasurePanel(page, show)
         if display.class_table is not None and host in LOOPBACK:
-            CorrectionPanel(page, show)
+            correct = CorrectionPanel(page, show)
+            measure.on_start(correct.stop)
+            correct.on_start(measure.stop)
         if views:
             photos = PhotoPanel(page, home)
             if view.photo is not None:

@@ -78,6 +78,11 @@ class ShowPanel:
                 cameras = gui.add_checkbox("cameras", True)
                 cameras.on_update(lambda _: page.cameras.show(cameras.value))
 
+    @property
+    def coloring(self) -> Coloring:
+        """What the colors show."""
+        return self._by.value
+
     def relabel(self) -> None:
         """Show the labels that the cloud has now."""
         self._page.cloud.relabel(self.hidden)
