@@ -206,7 +206,12 @@ def test_unfinished_tiles_go_with_the_content_of_their_inputs(tmp_path):
     ("stage", "tiled", "settings", "read_later"),
     [
         (label_stage, tiled_label, Label(), []),
-        (propagate_stage, tiled_propagate, Propagate(), []),
+        (
+            propagate_stage,
+            tiled_propagate,
+            Propagate(),
+            ["georeference.json"],
+        ),  # for objects, likewise at the end
         (evaluate_stage, tiled_evaluate, Evaluate(), ["masks"]),  # judged beside, when all tiles are done
     ],
 )
