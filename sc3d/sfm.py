@@ -59,7 +59,7 @@ def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) 
     with tempfile.TemporaryDirectory(prefix=temporary_name("work"), dir=output.parent) as folder:
         work = Path(folder)
         database = work / "database.db"
-        with telling_of_full_disk(database), ChildProcess("COLMAP") as colmap:
+        with telling_of_full_disk(output), ChildProcess("COLMAP") as colmap:
             colmap.call(begin, settings.seed, logger.isEnabledFor(logging.DEBUG))
             readable, masks = readable_photos(images, names, work)
             _extract(database, images, names, settings, readable, masks, colmap.call)
