@@ -19,7 +19,7 @@ from sc3d.exporters.geotiff import (
     set_palette,
 )
 from sc3d.exporters.packages import load
-from sc3d.exporters.projected_cloud import ProjectedCloud, read_projected_cloud
+from sc3d.exporters.projected_cloud import BYTES, ProjectedCloud, read_projected_cloud, require_whole
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.geometry.raster import Raster, close_gaps, highest_points, spacing_of_all
 from sc3d.geometry.raycast import Surface
@@ -30,6 +30,7 @@ from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import REACH
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
+from sc3d.tiling.memory import surface_bytes
 
 windows = load("rasterio.windows")
 
@@ -46,6 +47,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/orthophoto.tif` (RGB and alpha), `classes.tif` (ids, 0 = none, names and palette) and
     `height.tif` (float32 z, CRS), on one grid.
     """
+    require_whole(scene, settings, BYTES, surface_bytes([scene.mesh]))
     projected = read_projected_cloud(scene, settings)
     unit = projected.projection.unit
     pixel = (

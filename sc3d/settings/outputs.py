@@ -8,13 +8,14 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from sc3d.settings.common import Memory
 from sc3d.settings.labels import Label, Propagate, Segment
 from sc3d.settings.reconstruction import Depth, Extract, Reconstruct
 from sc3d.settings.train import Train
 
 
 @dataclass(frozen=True)
-class Export:
+class Export(Memory):
     """Results for other programs, in SCENE/export."""
 
     format: tuple[
@@ -114,7 +115,7 @@ class Compare:
 
 
 @dataclass(frozen=True)
-class Report:
+class Report(Memory):
     """One self-contained HTML page with figures and pictures."""
 
     output: Path | None = None
@@ -166,6 +167,7 @@ class ViewCommand:
     """Write a video (MP4) of the Gaussians along the flight instead of opening a window."""
     size: tuple[int, int] = (1600, 1000)
     """Width and height of the picture, px."""
+    memory: Annotated[Memory, arg(name="")] = Memory()
 
 
 @dataclass(frozen=True)

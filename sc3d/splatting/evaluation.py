@@ -77,7 +77,7 @@ def compare(
 
 def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
     """Peak signal-to-noise ratio of images in [0, 1], dB; at most 100."""
-    error = float((image.clamp(0, 1) - target).square().mean())
+    error = float(losses.steady_mean((image.clamp(0, 1) - target).square()))
     return -10 * float(np.log10(max(error, 1e-10)))
 
 

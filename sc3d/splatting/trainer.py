@@ -145,7 +145,7 @@ class Trainer:
             flatness = losses.flatten_loss(gaussians.log_scales, rendering.radii > 0, self.extent)
             loss = loss + settings.flatten_weight * flatness
         if stereo is not None and settings.sky_weight and stereo[1].any():
-            loss = loss + settings.sky_weight * (rendering.alpha * stereo[1]).mean()
+            loss = loss + settings.sky_weight * losses.steady_mean(rendering.alpha * stereo[1])
         if shapes_surface:
             depth = surface_depth(rendering, view)
             if stereo is not None:
