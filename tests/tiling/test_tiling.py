@@ -18,6 +18,7 @@ import open3d as o3d
 import pytest
 
 from sc3d.errors import InputError
+from sc3d.exporters import orthophoto, projected_cloud
 from sc3d.geometry.cameras import undistorted
 from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.clouds import read_cloud, read_mesh, write_geometry
@@ -516,3 +517,45 @@ def test_a_thinned_cloud_is_even_and_has_all_attributes(site):
         assert some.point[name].dtype == cloud.point[name].dtype, name
     middle = np.median(cloud.point.positions.numpy(), axis=0)
     assert (some.point.positions.numpy() < middle).mean(axis=0) == pytest.approx([0.5] * 3, abs=0.03)
+
+
+@pytest.mark.parametrize("has_mesh", [True, False])
+def test_an_orthophoto_in_strips_is_that_of_the_whole(site, tmp_path, monkeypatch, has_mesh):
+    rasterio = pytest.importorskip("rasterio")
+    folder = tmp_path / "scene"
+    labelled_site(site)
+    for name in ("classes.json", "labelled.ply", *(["mesh.ply"] if has_mesh else [])):
+        folder.mkdir(exist_ok=True)
+        shutil.copy(site / name, folder / name)
+    monkeypatch.setattr(orthophoto, "TILE", 64)
+    for module in (orthophoto, projected_cloud):
+        monkeypatch.setattr(module, "fits", lambda _, resources: resources.max_memory != "2G")
+    monkeypatch.setattr(orthophoto, "memory_of", lambda _: orthophoto.BASE + (10 << 20))
+    found = []
+    for memory in ("", "2G"):
+        settings = Export(format=("orthophoto",), pixel_size=0.5, max_memory=memory)
+        strips = orthophoto.strips_of(Scene(folder), settings)
+        export.run(Scene(folder), settings)
+        images = []
+        for name in (orthophoto.COLOR, orthophoto.CLASSES, orthophoto.HEIGHT):
+            with rasterio.open(folder / "export" / name) as file:
+                images.append(file.read())
+        found.append((strips._size, images))
+    assert found[0][0] >= found[0][1][0].shape[1] > found[1][0]  # one strip, several
+    whole, parts = found[0][1], found[1][1]
+    assert (whole[1] > 0).mean() > 0.8 and (whole[1] == parts[1]).mean() > 0.998
+    assert (whole[0] == parts[0]).all(axis=0).mean() > 0.998
+    np.testing.assert_allclose(parts[2], whole[2], atol=1e-3)
+
+
+def test_clouds_in_parts_are_those_of_the_whole(site, monkeypatch):
+    scene, found = labelled_site(site), []
+    monkeypatch.setattr(projected_cloud, "fits", lambda _, resources: resources.max_memory != "2G")
+    monkeypatch.setattr("sc3d.io.chunked_clouds.RECORDS_AT_ONCE", 7000)
+    for memory in ("", "2G"):
+        figures = export.run(scene, Export(format=("clouds",), max_memory=memory))
+        files = sorted((scene.export / "clouds").glob("*.ply"))
+        found.append((figures, {file.name: columns(file) for file in files}))
+    assert found[0][0] == found[1][0] and found[0][1].keys() == found[1][1].keys() and len(found[0][1]) == 5
+    for name, whole in found[0][1].items():
+        assert_same(whole, found[1][1][name])
