@@ -120,7 +120,7 @@ def _open_window(command: ViewCommand, scene: Scene, views: list[View]) -> None:
         command.unconfirmed,
         command.memory,
     )
-    inspector = Inspector.from_scene(scene, cloud, views)
+    inspector = Inspector.from_scene(scene, cloud, views, command.memory)
     classes = class_ids(inspector.class_table, command.classes)
     show(inspector, views if command.cameras else [], command.by, classes)
 
@@ -143,7 +143,7 @@ def _show_page(command: ViewCommand, scene: Scene, views: list[View]) -> None:
         if splats is None or has_cloud
         else splats.centers()
     )
-    inspector = Inspector.from_scene(scene, cloud, views)
+    inspector = Inspector.from_scene(scene, cloud, views, command.memory)
     if splats_first and not can_color(cloud, by):
         by = "photo"
         logger.info("there are no labels yet, the colors are those of the photos")

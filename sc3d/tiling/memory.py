@@ -15,6 +15,7 @@ from sc3d.settings.common import Memory, Workers
 
 TRIANGLE = 300  # bytes of a triangle while rays are cast, with half a vertex
 VERTEX = 150  # bytes of a vertex beyond these, as where triangles share none
+SHOWN_BYTES = 300  # of a point of a cloud that a viewer has
 LEAST = 20_000  # points of a tile; with fewer, most of the work would be on margins
 
 

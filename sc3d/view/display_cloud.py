@@ -20,7 +20,7 @@ from sc3d.scene.cloud_parts import read_thinned
 from sc3d.scene.labelled_cloud import VOTES, confirmed_only, spacing_of
 from sc3d.scene.scene import Scene
 from sc3d.settings.common import Memory
-from sc3d.tiling.memory import fits, max_points, num_points
+from sc3d.tiling.memory import SHOWN_BYTES, fits, max_points, num_points
 from sc3d.view.colors import COLORINGS, Coloring, can_color, color_points, shaded
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ logger = logging.getLogger(__name__)
 
 _CHUNKS = 16  # steps in which points come and go; each is a node per class
 _SMALLEST_CHUNK = 20_000
-BYTES = 300  # of a point of a cloud that is shown
 _SAMPLE = 50_000  # points from which the spacing is found
 
 
@@ -191,7 +190,7 @@ def load_cloud(
     if path is None:
         raise InputError(f"{scene.path} has no cloud to show: run `sc3d extract SCENE`, or pass --file FILE")
     count = num_points(path)
-    if count is not None and not fits(count * BYTES, memory):
+    if count is not None and not fits(count * SHOWN_BYTES, memory):
         return _some_points(path, count, memory, unconfirmed or file is not None)
     cloud = read_cloud(path)
     if file is not None:
@@ -203,7 +202,7 @@ def load_cloud(
 
 
 def _some_points(path: Path, count: int, memory: Memory, unconfirmed: bool) -> o3d.t.geometry.PointCloud:
-    cloud = read_thinned(path, max_points(memory, BYTES))
+    cloud = read_thinned(path, max_points(memory, SHOWN_BYTES))
     logger.warning(
         "%s: %.2f of its %.2f million points are shown, evenly, as no more fit into %s",
         path,
