@@ -77,7 +77,9 @@ def memory_limit(text: str, name: str) -> Iterator[None]:
             found = watch.stdout.readline() if watch.stdout is not None else b"0"
             raise Sc3dError(line.format(int(found) >> 20)) from None
         finally:
+            signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # the watch may just be sending it
             watch.kill()
+            watch.wait()
             signal.signal(signal.SIGUSR1, before or signal.SIG_DFL)
 
 

@@ -145,7 +145,10 @@ def cloud_section(data: ReportData) -> str:
             f'<figure id="cloud-{name}" class="panel" {"" if position == 0 else "hidden"}>'
             f'<figcaption class="print-only">{title}</figcaption><div class="pair">{images}</div>{_legend(data, name)}</figure>'
         )
-    return f'<div class="tabs" role="tablist">{"".join(tabs)}</div>{"".join(panels)}' if names else ""
+    shown = 0 if data.cloud is None else len(data.cloud.point.positions)
+    note = f'<p class="note">Pictures show {_short(shown)} of {_short(data.num_points)} points.</p>'
+    tablist = f'<div class="tabs" role="tablist">{"".join(tabs)}</div>{"".join(panels)}'
+    return (note if shown < data.num_points else "") + tablist if names else ""
 
 
 def _zoomable(uri: str, aspect: float, text: str) -> str:
