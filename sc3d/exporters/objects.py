@@ -13,7 +13,13 @@ from sc3d.errors import InputError
 from sc3d.exporters.buildings import roof_heights, roof_tops, split_buildings
 from sc3d.exporters.packages import load
 from sc3d.exporters.polygonize import orthogonalized, polygonize, simplified
-from sc3d.exporters.projected_cloud import ProjectedCloud, find_projection, read_projected_cloud
+from sc3d.exporters.projected_cloud import (
+    BYTES,
+    ProjectedCloud,
+    find_projection,
+    read_projected_cloud,
+    require_whole,
+)
 from sc3d.exporters.regions import cells_by_number
 from sc3d.exporters.terrain import ground_height
 from sc3d.exporters.trees import MIN_CROWN, canopy_height, split_crowns
@@ -73,6 +79,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/buildings.geojson` and `trees.geojson` (`*_local.geojson` without a CRS), and both as
     `objects.gpkg` where pyogrio is installed.
     """
+    require_whole(scene, settings, BYTES)
     projected = read_projected_cloud(scene, settings)
     layers = find_objects(projected, scene.class_table(), settings)
     paths = outputs(scene, settings)
