@@ -54,7 +54,7 @@ Then look at SCENE/report.html (sc3d report SCENE), or: sc3d view SCENE --web
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run one command and exit: 0 done, 1 failed, 2 bad input, 130 interrupted by Ctrl-C."""
+    """Run one command and exit: 0 done, 1 failed, 2 bad input, 130 interrupted by Ctrl-C, 143 by SIGTERM."""
     open_closed_streams()
     arguments = expanded(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -145,12 +145,14 @@ def reporting_errors() -> Iterator[None]:
             write_to_log_file(traceback.format_exc())
             raise
         sys.exit(_fail(reason, status=1))
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
+        told, number = (
+            ("ended by SIGTERM", signal.SIGTERM)
+            if isinstance(error, Terminated)
+            else ("interrupted", signal.SIGINT)
+        )
         sys.exit(
-            _fail(
-                "interrupted; finished work is kept, run the same command again to go on",
-                status=128 + signal.SIGINT,
-            )
+            _fail(f"{told}; finished work is kept, run the same command again to go on", status=128 + number)
         )
 
 
@@ -234,12 +236,36 @@ def _describe(record: type) -> str:
 
 def _dispatch(name: str, command: Any) -> None:
     if name in COMMANDS:
-        importlib.import_module(MODULES.get(name, f"sc3d.commands.{name}")).main(command)
+        module = importlib.import_module(MODULES.get(name, f"sc3d.commands.{name}"))
+        with ending_when_told():
+            module.main(command)
         return
     from sc3d.runner import execute
     from sc3d.scene.scene import Scene
 
-    execute(name, Scene(command.scene), command.settings, command.overwrite)
+    with ending_when_told():
+        execute(name, Scene(command.scene), command.settings, command.overwrite)
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM."""
+
+
+@contextmanager
+def ending_when_told() -> Iterator[None]:
+    """SIGTERM ends the block like Ctrl-C, once the call into a library that is under way comes back. Without this
+    it is for the handler that pycolmap brings when it is imported (so this comes after), which prints a stack
+    trace and may wait for ever for a lock that the interrupted thread holds.
+    """
+
+    def end(*_: object) -> None:
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
 def _fail(message: str, status: int = 2) -> int:

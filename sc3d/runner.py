@@ -35,10 +35,11 @@ from sc3d.io.atomic import (
     temporary_name,
 )
 from sc3d.io.json_files import read_json, write_json
+from sc3d.io.memory_limit import memory_limit
 from sc3d.io.progress import under_way
 from sc3d.io.provenance import Input, PhotoFrames, digest, peak_memory_mb, reset_peak_memory, versions
 from sc3d.scene.scene import Scene
-from sc3d.settings.common import Resources
+from sc3d.settings.common import Memory, Resources
 
 logger = logging.getLogger(__name__)
 
@@ -96,7 +97,8 @@ def _execute(name: str, scene: Scene, settings: object, overwrite: bool) -> dict
     _prepare(scene, outputs, besides, getattr(settings, "output", None))
     started = time.perf_counter()
     reset_peak_memory()
-    with _replacing(outputs), _room(scene, outputs):
+    asked = settings.max_memory if isinstance(settings, Memory) else ""
+    with _replacing(outputs), _room(scene, outputs), memory_limit(asked, name):
         summary = _plain(stage.run(scene, settings))
     record |= {
         "versions": versions(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sqlite3
 import tempfile
+from collections.abc import Callable
 from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,8 @@ import pycolmap
 from sc3d.errors import InputError, Sc3dError, left_out
 from sc3d.geometry.shortlist import neighbors_by_look, neighbors_in_order
 from sc3d.georeferencing.gps import Flight, read_flight
-from sc3d.io.atomic import require_room, telling_of_full_disk, temporary_name
+from sc3d.io.atomic import atomic_path, require_room, telling_of_full_disk, temporary_name
+from sc3d.io.child_process import ChildProcess, Run, run_here
 from sc3d.io.colmap import registered_images, write_model
 from sc3d.io.limits import FARTHEST
 from sc3d.io.progress import Progress, polled
@@ -25,6 +27,7 @@ from sc3d.settings.reconstruction import Mapping, Matching
 
 logger = logging.getLogger(__name__)
 
+MODEL = "model"  # folder of the largest model in that of the work
 # in the database: of a keypoint with its descriptor, of the matches of two photos
 FEATURE_BYTES, PAIR_BYTES = 160, 20_000
 MATCH_ALL = 100  # photos up to which auto matches every pair
@@ -34,13 +37,15 @@ PARTNERS: dict[Matching, int] = {"sequential": 10, "spatial": 50, "vocabulary": 
 DESCRIPTORS = 1000  # of each photo, that its look is made of
 
 
+class NoModelError(Sc3dError):
+    """No two photos fit together."""
+
+
 def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) -> dict[str, object]:
     """Photos to a COLMAP model, not yet brought to its place, in the folder `output`; returns figures.
 
     images: folder; names: photos relative to it
     """
-    pycolmap.set_random_seed(settings.seed)
-    pycolmap.logging.minloglevel = 0 if logger.isEnabledFor(logging.DEBUG) else 2
     if settings.camera_model not in pycolmap.CameraModelId.__members__ or settings.camera_model == "INVALID":
         raise InputError(
             f"unknown camera model {settings.camera_model!r}: one of {', '.join(list(pycolmap.CameraModelId.__members__)[1:])}"
@@ -50,30 +55,53 @@ def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) 
     if settings.matching == "spatial":
         _check_spatial(names, flight)
     output.parent.mkdir(parents=True, exist_ok=True)
-    require_room(output, _database_size(len(names), settings))  # COLMAP's threads would end the process
+    require_room(output, _database_size(len(names), settings))
     with tempfile.TemporaryDirectory(prefix=temporary_name("work"), dir=output.parent) as folder:
         work = Path(folder)
         database = work / "database.db"
-        with telling_of_full_disk(database):
+        with telling_of_full_disk(output), ChildProcess("COLMAP") as colmap:
+            colmap.call(begin, settings.seed, logger.isEnabledFor(logging.DEBUG))
             readable, masks = readable_photos(images, names, work)
-            _extract(database, images, names, settings, readable, masks)
-            _write_priors(database, flight)
-            _match(database, len(names), settings)
-            model, parts = map_database(database, readable, work, settings, len(names), flight is not None)
-            reasons = _reasons(database, names, model, parts)
+            _extract(database, images, names, settings, readable, masks, colmap.call)
+            colmap.call(_write_priors, database, flight)
+            _match(database, len(names), settings, colmap.call)
+            parts = map_database(
+                database, readable, work, settings, len(names), flight is not None, colmap.call
+            )
+            reasons = _reasons(database, names, parts)
             clear = transparent_photos({name: images / name for name in reasons})
             reasons |= dict.fromkeys(clear, "wholly transparent")
-        write_model(output, model)
+        with atomic_path(output) as temporary:
+            (work / MODEL).rename(temporary)
     if reasons:
         unregistered = [f"{name} ({why})" for name, why in reasons.items()]
         logger.warning(left_out(unregistered, len(names), "photos could not be registered"))
-    return {"photos": len(names), "registered": model.num_reg_images(), "left_out": reasons}
+    return {"photos": len(names), "registered": len(parts[0]), "left_out": reasons}
+
+
+def begin(seed: int, verbose: bool) -> None:
+    """Before all else in the process that COLMAP works in."""
+    pycolmap.set_random_seed(seed)
+    pycolmap.logging.minloglevel = 0 if verbose else 2
 
 
 def _extract(
-    database: Path, images: Path, names: list[str], settings: Mapping, readable: Path, masks: Path | None
+    database: Path,
+    images: Path,
+    names: list[str],
+    settings: Mapping,
+    readable: Path,
+    masks: Path | None,
+    run: Run = run_here,
 ) -> None:
     """Cameras from the photos in `images`, features from those in `readable` where `masks` are not 0."""
+    with _polled(database, "keypoints", len(names), "features", "photo"):
+        run(_extract_features, database, images, names, settings, readable, masks)
+
+
+def _extract_features(
+    database: Path, images: Path, names: list[str], settings: Mapping, readable: Path, masks: Path | None
+) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = settings.max_size
     options.sift.max_num_features = settings.max_features
@@ -83,10 +111,9 @@ def _extract(
     # else ids follow the threads that are done first
     pycolmap.import_images(database, images, pycolmap.CameraMode.AUTO, names, reader)
     reader.mask_path = masks or ""
-    with _polled(database, "keypoints", len(names), "features", "photo"):
-        pycolmap.extract_features(
-            database, readable, names, pycolmap.CameraMode.AUTO, reader, options, pycolmap.Device.cpu
-        )
+    pycolmap.extract_features(
+        database, readable, names, pycolmap.CameraMode.AUTO, reader, options, pycolmap.Device.cpu
+    )
 
 
 def _database_size(num_photos: int, settings: Mapping) -> int:
@@ -160,22 +187,26 @@ def num_pairs(num_photos: int, matching: Matching) -> float:
     return num_photos * min(partners, num_photos - 1) / (2 if partners == num_photos else 1)
 
 
-def _match(database: Path, num_photos: int, settings: Mapping) -> None:
+def _match(database: Path, num_photos: int, settings: Mapping, run: Run = run_here) -> None:
+    total = num_photos * (num_photos - 1) // 2 if settings.matching == "exhaustive" else None
+    with _polled(database, "two_view_geometries", total, "matching", "pair"):
+        run(_match_pairs, database, settings)
+
+
+def _match_pairs(database: Path, settings: Mapping) -> None:
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = settings.seed  # for each pair, whichever thread it falls to
     given = {"verification_options": verification, "device": pycolmap.Device.cpu}
-    total = num_photos * (num_photos - 1) // 2 if settings.matching == "exhaustive" else None
-    with _polled(database, "two_view_geometries", total, "matching", "pair"):
-        if settings.matching == "vocabulary":
-            _match_alike(database, given)
-        elif settings.matching == "spatial":
-            nearest = pycolmap.SpatialPairingOptions()
-            nearest.max_num_neighbors, nearest.max_distance = PARTNERS["spatial"], FARTHEST
-            pycolmap.match_spatial(database, pairing_options=nearest, **given)
-        elif settings.matching == "sequential":
-            pycolmap.match_sequential(database, **given)
-        else:
-            pycolmap.match_exhaustive(database, **given)
+    if settings.matching == "vocabulary":
+        _match_alike(database, given)
+    elif settings.matching == "spatial":
+        nearest = pycolmap.SpatialPairingOptions()
+        nearest.max_num_neighbors, nearest.max_distance = PARTNERS["spatial"], FARTHEST
+        pycolmap.match_spatial(database, pairing_options=nearest, **given)
+    elif settings.matching == "sequential":
+        pycolmap.match_sequential(database, **given)
+    else:
+        pycolmap.match_exhaustive(database, **given)
 
 
 def _match_alike(database: Path, given: dict[str, Any]) -> None:
@@ -214,33 +245,54 @@ def _some_descriptors(database: pycolmap.Database, image_id: int) -> np.ndarray:
 
 
 def map_database(
-    database: Path, images: Path, work: Path, settings: Mapping, num_photos: int, has_gps: bool
-) -> tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction]]:
-    """The largest model of what a COLMAP database holds, and the others; Sc3dError if there is none."""
+    database: Path,
+    images: Path,
+    work: Path,
+    settings: Mapping,
+    num_photos: int,
+    has_gps: bool,
+    run: Run = run_here,
+) -> list[list[str]]:
+    """Models of what a COLMAP database holds: the photos of each, the largest first, which is written to `work /
+    MODEL`; NoModelError if there is none.
+    """
+    with Progress(num_photos, "cameras", "photo") as bar:
+        parts = run(_map, database, images, work, settings, num_photos, has_gps, step=bar.update)
+    if not parts:
+        raise NoModelError(
+            "no two photos could be matched: they need at least 60 % overlap and texture; try a larger --max-size"
+        )
+    return parts
+
+
+def _map(
+    database: Path,
+    images: Path,
+    work: Path,
+    settings: Mapping,
+    num_photos: int,
+    has_gps: bool,
+    step: Callable[[], object],
+) -> list[list[str]]:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = settings.seed
     options.num_threads = 1  # with more, sums of larger scenes are rounded otherwise in each run
     options.use_prior_position = has_gps
     options.use_robust_loss_on_prior_position = has_gps
     options.min_model_size = min(10, num_photos)
-    with Progress(num_photos, "cameras", "photo") as bar:
-        models = pycolmap.incremental_mapping(database, images, work, options, next_image_callback=bar.update)
-    if not models:
-        raise Sc3dError(
-            "no two photos could be matched: they need at least 60 % overlap and texture; try a larger --max-size"
-        )
+    models = pycolmap.incremental_mapping(database, images, work, options, next_image_callback=step)
     ordered = sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-    return ordered[0], ordered[1:]
+    if ordered:
+        write_model(work / MODEL, ordered[0])
+    return [[image.name for image in registered_images(model)] for model in ordered]
 
 
-def _reasons(
-    database: Path, names: list[str], model: pycolmap.Reconstruction, parts: list[pycolmap.Reconstruction]
-) -> dict[str, str]:
+def _reasons(database: Path, names: list[str], parts: list[list[str]]) -> dict[str, str]:
     """Why photos have no pose, by name: how many matches (inliers of the two-view geometry) they share with
-    photos that have one.
+    photos that have one. parts: photos of each model, that of the scene first
     """
-    registered = {image.name for image in registered_images(model)}
-    elsewhere = {image.name: part.num_reg_images() for part in parts for image in registered_images(part)}
+    registered = set(parts[0])
+    elsewhere = {name: len(part) for part in parts[1:] for name in part}
     with pycolmap.Database.open(database) as opened:
         ids = {image.image_id: image.name for image in opened.read_all_images()}
         features = {name: opened.num_keypoints_for_image(image_id) for image_id, name in ids.items()}

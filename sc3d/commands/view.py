@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from sc3d.errors import InputError
 from sc3d.io.images import write_image
+from sc3d.io.memory_limit import memory_limit
 from sc3d.io.photo_folder import IMAGE_SUFFIXES
 from sc3d.scene.photo_names import PhotoNames
 from sc3d.scene.scene import Scene
@@ -32,13 +33,14 @@ def main(command: ViewCommand) -> None:
         command = replace(command, photo=photo.name)
     if command.flight is not None:
         _write_flight(command, scene, command.flight)
-    if command.web or command.html is not None:
-        _show_page(command, scene, views)
-    elif command.screenshot is not None:
-        write_image(command.screenshot, _picture(command, scene, views, photo))
-        logger.info("wrote %s", command.screenshot)
-    elif command.flight is None:
-        _open_window(command, scene, views)
+    with memory_limit(command.memory.max_memory, "view"):
+        if command.web or command.html is not None:
+            _show_page(command, scene, views)
+        elif command.screenshot is not None:
+            write_image(command.screenshot, _picture(command, scene, views, photo))
+            logger.info("wrote %s", command.screenshot)
+        elif command.flight is None:
+            _open_window(command, scene, views)
 
 
 def _check(command: ViewCommand) -> None:
@@ -98,7 +100,7 @@ def _picture(command: ViewCommand, scene: Scene, views: list[View], photo: View 
         pixels = None if photo is None else scene.read_photo(photo.name)
         return screenshot_splats(splats, photo, pixels, command.size, style)
     table = scene.class_table() if scene.classes.exists() else None
-    cloud = load_cloud(scene, command.file, command.by == "disagreement", command.unconfirmed)
+    cloud = load_cloud(scene, command.file, command.by == "disagreement", command.unconfirmed, command.memory)
     cloud = only_classes(cloud, class_ids(table, command.classes))
     return screenshot(cloud, photo, command.size, style, table)
 
@@ -112,9 +114,13 @@ def _open_window(command: ViewCommand, scene: Scene, views: list[View]) -> None:
     from sc3d.view.window import show
 
     cloud = load_cloud(
-        scene, command.file, True if command.by == "disagreement" else None, command.unconfirmed
+        scene,
+        command.file,
+        True if command.by == "disagreement" else None,
+        command.unconfirmed,
+        command.memory,
     )
-    inspector = Inspector.from_scene(scene, cloud, views)
+    inspector = Inspector.from_scene(scene, cloud, views, command.memory)
     classes = class_ids(inspector.class_table, command.classes)
     show(inspector, views if command.cameras else [], command.by, classes)
 
@@ -133,11 +139,11 @@ def _show_page(command: ViewCommand, scene: Scene, views: list[View]) -> None:
     splats = best_splats(scene) if splats_first else None
     votes = True if by == "disagreement" else None
     cloud = (
-        load_cloud(scene, command.file, votes, command.unconfirmed)
+        load_cloud(scene, command.file, votes, command.unconfirmed, command.memory)
         if splats is None or has_cloud
         else splats.centers()
     )
-    inspector = Inspector.from_scene(scene, cloud, views)
+    inspector = Inspector.from_scene(scene, cloud, views, command.memory)
     if splats_first and not can_color(cloud, by):
         by = "photo"
         logger.info("there are no labels yet, the colors are those of the photos")

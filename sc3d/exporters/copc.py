@@ -22,7 +22,6 @@ from sc3d.exporters.laz import Survey, records, survey
 from sc3d.exporters.octree import BYTES, Node, Octree
 from sc3d.io.atomic import atomic_path, require_room, temporary_name
 from sc3d.scene.scene import Scene
-from sc3d.settings.common import Resources
 from sc3d.settings.outputs import Export
 from sc3d.tiling.memory import max_points
 
@@ -60,7 +59,7 @@ def octree_folder(path: Path, found: Survey) -> Iterator[Path]:
 
 def part_size(settings: Export) -> int:
     """Points of an octree that are worked on at a time."""
-    return min(LARGEST_PART, max_points(Resources(max_memory=settings.max_memory), BYTES))
+    return min(LARGEST_PART, max_points(settings, BYTES))
 
 
 def _write(

@@ -13,9 +13,10 @@ from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
 from sc3d.io.images import read_orientation, write_image
 from sc3d.io.progress import progress
-from sc3d.scene.labelled_cloud import LabelledSurface, read_labelled
+from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
+from sc3d.tiling.seen_points import SeenPoints, labelled_sight
 from sc3d.view.contact_sheet import side_by_side
 
 SHOWN, PANEL = 4, 600  # photos in masks.jpg, and the width of each picture there, px
@@ -31,17 +32,20 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """A mask in `export/masks` and a confidence map in `export/confidence` for every photo, named like it;
     usable as `segment --masks`, `--confidence`.
     """
-    cloud, labels = read_labelled(settings.labelled or scene.labelled, "propagate")
-    views = scene.model.views
-    surface = LabelledSurface.build(cloud, views, scene.surface)
-    covered = []
+    views, covered = scene.model.views, []
+    sizes = {view.name: mask_size(view, settings.max_size) for view in views}
     masks, confidences, sheet = outputs(scene, settings)
-    with atomic_path(masks) as mask_folder, atomic_path(confidences) as confidence_folder:
+    with (
+        labelled_sight(scene, settings, settings.labelled or scene.labelled, sizes, masks) as seen,
+        atomic_path(masks) as mask_folder,
+        atomic_path(confidences) as confidence_folder,
+    ):
+        labels = seen.labels
         mask_folder.mkdir()
         confidence_folder.mkdir()
         for view in progress(views, "rendering masks", "photo"):
             mask, confidence = render_mask(
-                surface, labels.confidence, view, settings.max_size, labels.of_no_class
+                seen.surface, labels.confidence, view, settings.max_size, labels.of_no_class
             )
             orientation = read_orientation(scene.photo(view.name))
             write_image(scene.photo_names.path(mask_folder, view.name), mask, orientation)
@@ -80,8 +84,14 @@ def _comparison(scene: Scene, views: list[View]) -> np.ndarray:
     )
 
 
+def mask_size(view: View, max_size: int) -> tuple[int, int]:
+    """(width, height) of a mask, px; max_size: longest side, 0 = the photo's"""
+    scale = min(1.0, max_size / max(view.width, view.height)) if max_size else 1.0
+    return max(1, round(view.width * scale)), max(1, round(view.height * scale))
+
+
 def render_mask(
-    surface: LabelledSurface,
+    surface: LabelledSurface | SeenPoints,
     confidence: np.ndarray,
     view: View,
     max_size: int = 0,
@@ -94,8 +104,7 @@ def render_mask(
     returns: (H, W) uint8 ids, 0 = no label; (H, W) uint8, 255 = sure, at least 1 where there is a label or
         none is known, else 0: nothing is known there
     """
-    scale = min(1.0, max_size / max(view.width, view.height)) if max_size else 1.0
-    rows, _ = surface.rows(view, (max(1, round(view.width * scale)), max(1, round(view.height * scale))))
+    rows, _ = surface.rows(view, mask_size(view, max_size))
     mask = np.where(rows >= 0, surface.label[rows], 0).astype(np.uint8)
     sure = np.clip(np.rint(confidence[rows] * 255), 1, 255)
     known = mask > 0 if none is None else (mask > 0) | ((rows >= 0) & none[rows])

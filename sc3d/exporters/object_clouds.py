@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import open3d as o3d
 
 from sc3d.errors import InputError
-from sc3d.exporters.clouds import file_name, write_parts
+from sc3d.exporters.clouds import file_name, in_crs
 from sc3d.exporters.objects import most_common
-from sc3d.exporters.projected_cloud import chosen_classes, read_projected_cloud
+from sc3d.exporters.projected_cloud import BYTES, chosen_classes, read_projected_cloud, require_whole
+from sc3d.io.atomic import atomic_path
+from sc3d.io.clouds import write_geometry
 from sc3d.scene.labelled_cloud import instances_of
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
@@ -23,6 +26,7 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/object_clouds/<instance>_<class>.ply` for each object of the chosen classes; float64
     positions in the CRS, points in their order.
     """
+    require_whole(scene, settings, BYTES)
     projected, path = read_projected_cloud(scene, settings), settings.labelled or scene.labelled
     instance = instances_of(projected.cloud, path)
     if instance is None:
@@ -32,9 +36,12 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     numbers = [int(number) for number in np.unique(kept[kept > 0])]
     if not numbers:
         raise InputError(f"{path} has no object of the chosen classes: nothing to write")
-    parts = (
-        (f"{number}_{file_name(table.name(most_common(labels[kept == number])))}.ply", kept == number)
-        for number in numbers
-    )
-    counts = write_parts(outputs(scene, settings)[0], projected, parts)
-    return {**projected.projection.figures(), "objects": len(counts), "points": sum(counts)}
+    cloud, _ = in_crs(projected)
+    with atomic_path(outputs(scene, settings)[0]) as folder:
+        folder.mkdir()
+        for number in numbers:
+            own = kept == number
+            name = f"{number}_{file_name(table.name(most_common(labels[own])))}.ply"
+            write_geometry(folder / name, cloud.select_by_mask(o3d.core.Tensor(own)))
+    figures = {"objects": len(numbers), "points": int((kept > 0).sum())}
+    return {**projected.projection.figures(), **figures}

@@ -15,7 +15,13 @@ from sc3d.errors import InputError
 from sc3d.exporters.best_photo import best_photos
 from sc3d.exporters.packages import load
 from sc3d.exporters.polygonize import orthogonalized, polygonize, simplified
-from sc3d.exporters.projected_cloud import ProjectedCloud, find_projection, read_projected_cloud
+from sc3d.exporters.projected_cloud import (
+    BYTES,
+    ProjectedCloud,
+    find_projection,
+    read_projected_cloud,
+    require_whole,
+)
 from sc3d.exporters.vector_files import Feature, has_geopackage, write_geojson, write_geopackage
 from sc3d.geometry.cameras import View
 from sc3d.geometry.raster import Raster, highest_points, spacing_of_all
@@ -79,6 +85,8 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     """`export/buildings.geojson`, `trees.geojson` and, with all countable classes, `objects.geojson`
     (`*_local.geojson` without a CRS), and buildings and trees as `objects.gpkg` where pyogrio is installed.
     """
+    require_whole(scene, settings, BYTES)
+    require_whole(scene, settings, BYTES)
     projected = read_projected_cloud(scene, settings)
     views = scene.model.views if scene.sparse.is_dir() else []
     layers, everything = find_objects(projected, scene.class_table(), settings, views)

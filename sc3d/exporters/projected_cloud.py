@@ -25,21 +25,14 @@ from sc3d.georeferencing.georeference import (
     write_georeference,
 )
 from sc3d.georeferencing.up_direction import tell_tilt
-from sc3d.io.chunked_clouds import CloudFile, columns, positions
+from sc3d.io.chunked_clouds import CloudFile, positions
 from sc3d.scene.class_table import ClassTable
-from sc3d.scene.labelled_cloud import (
-    INSTANCE,
-    UNCONFIRMED,
-    confirmed_only,
-    is_confirmed,
-    read_labelled,
-    take_labels,
-)
+from sc3d.scene.cloud_parts import cloud_of
+from sc3d.scene.labelled_cloud import UNCONFIRMED, confirmed_only, is_confirmed, read_labelled, take_labels
 from sc3d.scene.labels import Labels
 from sc3d.scene.scene import Scene
-from sc3d.settings.common import Resources
 from sc3d.settings.outputs import Export
-from sc3d.tiling.memory import fits, num_points
+from sc3d.tiling.memory import fits, num_points, require_fit
 
 if TYPE_CHECKING:
     import pyproj
@@ -188,35 +181,47 @@ def _require_known(table: ClassTable, labels: Labels, path: Path, scene: Scene) 
         raise InputError(f"{path} has class id {unknown[0]}, which is not in {scene.classes}: add it there")
 
 
-def projected_chunks(scene: Scene, settings: Export) -> Iterator[ProjectedCloud]:
-    """The same in parts, in order; as a whole if that fits into --max-memory."""
-    path = settings.labelled or scene.labelled
+def fits_whole(path: Path, settings: Export) -> bool:
+    """Whether a cloud fits into memory as a whole, or cannot be read in parts."""
     count = num_points(path) if path.exists() else None
-    if count is None or fits(count * BYTES, Resources(max_memory=settings.max_memory)):
+    return count is None or fits(count * BYTES, settings)
+
+
+def require_whole(scene: Scene, settings: Export, bytes_per_point: int, surface: int = 0) -> None:
+    """InputError, before the work, if the labelled cloud, with so many bytes of surface, does not fit into memory,
+    for formats that need all of it.
+    """
+    path = settings.labelled or scene.labelled
+    count = (num_points(path) if path.exists() else None) or 0
+    require_fit(
+        count * bytes_per_point + surface,
+        settings,
+        f"{' and '.join(settings.format)} of {count / 1e6:.1f} million points",
+        "allow more, or export laz, copc, 3dtiles, clouds, masks, dtm, dsm, ndsm or contours, which are written part by part",
+    )
+
+
+def projected_chunks(scene: Scene, settings: Export) -> Iterator[ProjectedCloud]:
+    """The same in parts, in order; as a whole if that fits into memory."""
+    path = settings.labelled or scene.labelled
+    if fits_whole(path, settings):
         yield read_projected_cloud(scene, settings)
         return
     projection, table = find_projection(scene, settings), scene.class_table()
-    left = 0
-    for _, records in CloudFile.open(path).chunks():
-        names = records.dtype.names or ()
-        if UNCONFIRMED in names and not settings.unconfirmed:
+    left, file = 0, CloudFile.open(path)
+    for _, records in file.chunks():
+        if UNCONFIRMED in file.names and not settings.unconfirmed:
             kept = records[UNCONFIRMED] == 0
             left += int((~kept).sum())
             records = records[kept]
         if not len(records):
             continue
-        cloud = o3d.t.geometry.PointCloud(positions(records))
-        for name in ("label", "confidence", "state", "num_views", UNCONFIRMED, INSTANCE):
-            if name in names:
-                cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(records[name])[:, None])
-        colors = columns(records, ("red", "green", "blue"))
-        if colors is not None:
-            cloud.point.colors = o3d.core.Tensor(colors)
+        cloud = cloud_of(records)
         labels = take_labels(cloud, path, "propagate")
         _require_known(table, labels, path, scene)
         yield ProjectedCloud(cloud, labels, projection.to_crs(positions(records)), projection)
     if left:
-        _tell_unconfirmed(path, left, count)
+        _tell_unconfirmed(path, left, file.num_points)
 
 
 def chosen_classes(scene: Scene, settings: Export) -> set[int]:

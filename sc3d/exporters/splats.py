@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,12 @@ from sc3d.geometry.cameras import undistorted
 from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.io.splats import origin_comment, write_splat_ply
 from sc3d.scene.channels import Channels
-from sc3d.scene.labelled_cloud import REACH, LabelledSurface, read_labelled
+from sc3d.scene.labelled_cloud import REACH, require_labelled
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Export
 from sc3d.splatting.dataset import load_gaussians
 from sc3d.splatting.lifting import lift, winners
+from sc3d.tiling.seen_points import labelled_sight
 from sc3d.view.display_splats import DisplaySplats
 
 # longest side of the masks whose labels are lifted, px; Gaussians are trained at about that size
@@ -44,27 +46,30 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
 def label_splats(scene: Scene, settings: Export) -> DisplaySplats:
     """Lift the fused labels, as every photo sees them on the surface, to all Gaussians of the scene."""
     source, table = settings.labelled or scene.labelled, scene.class_table()
-    cloud, labels = read_labelled(source, "propagate")
-    unknown = table.unknown(labels.label)
-    if unknown:
-        raise InputError(f"{source} has class id {unknown[0]}, which is not in {scene.classes}: add it there")
     channels = table.channels
+    require_labelled(source, "propagate")
     gaussians, origin = load_gaussians(scene)
-    surface = LabelledSurface.build(cloud, scene.model.views, scene.surface)
     views = [undistorted(view.shifted(origin), LIFTED_SIZE) for view in scene.model.views]
-    evidence = lift(
-        gaussians,
-        views,
-        lambda view: _channel_mask(channels, render_mask(surface, labels.confidence, view.shifted(-origin))),
-        channels.count,
-    )
-    winner, confidence = winners(evidence)
-    label = channels.to_ids(winner)
-    points = cloud.point.positions.numpy().astype(np.float64)
-    floating = (
-        distance_to_class(gaussians.means.numpy() + origin, label, points, surface.label)
-        > GUARD / REACH * surface.reach
-    )
+    sizes = {view.name: (view.width, view.height) for view in views}
+    with labelled_sight(scene, settings, source, sizes, scene.labelled_splats, LIFTED_SIZE) as seen:
+        surface, labels = seen.surface, seen.labels
+        unknown = table.unknown(labels.label)
+        if unknown:
+            raise InputError(
+                f"{source} has class id {unknown[0]}, which is not in {scene.classes}: add it there"
+            )
+        evidence = lift(
+            gaussians,
+            views,
+            lambda view: _channel_mask(
+                channels, render_mask(surface, labels.confidence, view.shifted(-origin))
+            ),
+            channels.count,
+        )
+        winner, confidence = winners(evidence)
+        label, means = channels.to_ids(winner), gaussians.means.numpy() + origin
+        distances = (distance_to_class(means, label, *part) for part in seen.parts())
+        floating = reduce(np.minimum, distances) > GUARD / REACH * surface.reach
     if not (label > 0)[~floating].any():
         raise InputError(
             f"no splat shows a label of {source}: check that gaussians.ply and this cloud belong together"

@@ -98,14 +98,27 @@ def versions() -> dict[str, str]:
     return found
 
 
+_children = [0]  # MB, largest of the processes that work was left to
+
+
+def note_peak_of_child(megabytes: int) -> None:
+    """Another process that works for this one needed as much."""
+    _children[0] = max(_children[0], megabytes)
+
+
 def reset_peak_memory() -> None:
     """Start measuring the peak anew (Linux; elsewhere it stays that of the whole process)."""
+    _children[0] = 0
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 
 
 def peak_memory_mb() -> int:
-    """Largest resident memory since `reset_peak_memory`, MB."""
+    """Largest resident memory since `reset_peak_memory`, MB: of this process, or of one whose peak was noted."""
+    return max(_own_peak_mb(), _children[0])
+
+
+def _own_peak_mb() -> int:
     with suppress(OSError, StopIteration):
         lines = Path("/proc/self/status").read_text().splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) // 1024

@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sc3d.errors import Sc3dError
-from sc3d.io.atomic import temporary_name
-from sc3d.io.colmap import write_model
+from sc3d.io.atomic import telling_of_full_disk, temporary_name
+from sc3d.io.child_process import ChildProcess
 from sc3d.preflight.pairs import Pair
 from sc3d.scene.scene import SparseModel, read_sparse_model
 from sc3d.settings.reconstruction import Mapping
-from sc3d.sfm import map_database
+from sc3d.sfm import MODEL, NoModelError, begin, map_database
 
 logger = logging.getLogger(__name__)
 
@@ -26,22 +25,26 @@ def rough_model(folder: Path, names: list[str], pairs: list[Pair]) -> SparseMode
 
     names: relative to `folder`, in the order of the rows of `pairs`
     """
-    pycolmap.set_random_seed(0)
-    pycolmap.logging.minloglevel = 0 if logger.isEnabledFor(logging.DEBUG) else 3
     with tempfile.TemporaryDirectory(prefix=temporary_name("work")) as temporary:
         work = Path(temporary)
         database = work / "database.db"
-        pycolmap.Database.open(database).close()
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = Mapping.camera_model
-        pycolmap.import_images(database, folder, pycolmap.CameraMode.AUTO, names, reader)
-        _write_matches(database, names, pairs)
-        try:
-            model, _ = map_database(database, folder, work, Mapping(), len(names), has_gps=False)
-        except Sc3dError:
-            return None
-        write_model(work / "model", model)
-        return read_sparse_model(work / "model")
+        with telling_of_full_disk(database), ChildProcess("COLMAP") as colmap:
+            colmap.call(_prepare, database, folder, names, pairs, logger.isEnabledFor(logging.DEBUG))
+            try:
+                map_database(database, folder, work, Mapping(), len(names), False, colmap.call)
+            except NoModelError:
+                return None
+        return read_sparse_model(work / MODEL)
+
+
+def _prepare(database: Path, folder: Path, names: list[str], pairs: list[Pair], verbose: bool) -> None:
+    """A database of the photos and of the pairs that were found."""
+    begin(0, verbose)
+    pycolmap.Database.open(database).close()
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = Mapping.camera_model
+    pycolmap.import_images(database, folder, pycolmap.CameraMode.AUTO, names, reader)
+    _write_matches(database, names, pairs)
 
 
 def _write_matches(database: Path, names: list[str], pairs: list[Pair]) -> None:

@@ -13,21 +13,22 @@ from sc3d.io.folders import resolved
 from sc3d.report.data import load_report_data
 from sc3d.report.sections import headline, sections, summary_line
 from sc3d.scene.scene import Scene
+from sc3d.settings.common import Memory
 
 __all__ = ["write_report"]
 
 logger = logging.getLogger(__name__)
 
 
-def write_report(scene: Scene, path: Path) -> None:
+def write_report(scene: Scene, path: Path, settings: Memory = Memory()) -> None:
     """Write one self-contained HTML page about a scene: figures, pictures, comparison in photos, settings.
 
     Every part is made from files of the scene; parts whose files are missing are left out.
-    path: the page to write, replaced only when it is complete
+    path: the page to write, replaced only when it is complete; settings: what fits into memory
     Raises InputError if the scene folder does not exist or a file in it is broken.
     """
     scene.require(hint="")
-    data = load_report_data(scene)
+    data = load_report_data(scene, settings)
     parts = [(anchor, title, body) for anchor, title, body in sections(data) if body]
     template = string.Template(_resource("page.html"))
     page = template.substitute(

@@ -56,12 +56,11 @@ def paired_bars(rows: Sequence[tuple[str, Color, float | None, float | None]]) -
     return _svg("".join(parts), len(rows) * step, "IoU per class")
 
 
-def histogram(values: np.ndarray, colors: np.ndarray) -> str:
-    """Distribution of values from 0 to 1 in as many bins as there are colors.
+def histogram(counts: np.ndarray, colors: np.ndarray) -> str:
+    """Distribution of values from 0 to 1.
 
-    values: (N,); colors: (B, 3) uint8 RGB
+    counts: (B,) how many values lie in each of equal parts; colors: (B, 3) uint8 RGB
     """
-    counts = np.histogram(np.clip(np.nan_to_num(values), 0, 1), bins=len(colors), range=(0, 1))[0]
     shares = counts / max(counts.sum(), 1)
     height, width = 150, 100 / len(colors)
     parts = [f'<line class="axis" x1="0" x2="100%" y1="{height}" y2="{height}"/>']

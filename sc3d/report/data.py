@@ -13,13 +13,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.geometry.raster import Raster, highest_points, spacing_of_all
-from sc3d.io.clouds import read_cloud, read_mesh
+from sc3d.io.chunked_clouds import CloudFile
+from sc3d.io.clouds import read_cloud
 from sc3d.io.json_files import read_json
+from sc3d.io.ply import num_triangles
 from sc3d.report.charts import number
+from sc3d.report.tally import CloudTally, tally, tally_by_parts
 from sc3d.runner import MAX_SIDECAR, sidecar
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.cloud_parts import read_thinned
 from sc3d.scene.scene import Scene, find_masks
+from sc3d.settings.common import Memory
+from sc3d.tiling.memory import fits, max_points, num_points, surface_bytes
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -28,7 +33,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_CELL = 2.0  # side of the cells that areas are counted in, point spacings
+BYTES = 230  # of a point of a cloud that is reported as a whole
+DRAWN = 1_500_000  # points in pictures
 _STAGES = (
     "synthesize",
     "map_photos",
@@ -48,7 +54,8 @@ _STAGES = (
 class ReportData:
     """Everything a report may show.
 
-    cloud: the labelled cloud, else the seeds, else the bare cloud; mesh: the surface
+    cloud: the labelled cloud, else the seeds, else the bare cloud, or some of its points if it does not fit into
+        memory; tally: of all of them; mesh: file of the surface, where that fits too; settings: of the stage
     views: cameras by name order; metrics, check: content of metrics.json and check.json; records: sidecars in the order of the
         stages
     """
@@ -56,11 +63,13 @@ class ReportData:
     scene: Scene
     class_table: ClassTable | None = None
     cloud: o3d.t.geometry.PointCloud | None = None
-    mesh: o3d.t.geometry.TriangleMesh | None = None
+    mesh: Path | None = None
     views: list[View] = field(default_factory=list)
     metrics: dict = field(default_factory=dict)
     check: dict = field(default_factory=dict)
     records: list[dict] = field(default_factory=list)
+    tally: CloudTally | None = None
+    settings: Memory = Memory()
 
     def values(self, name: str) -> np.ndarray | None:
         """(N,) values of an attribute of the cloud; None if it has none."""
@@ -75,11 +84,15 @@ class ReportData:
             np.empty((0, 3)) if self.cloud is None else self.cloud.point.positions.numpy().astype(np.float64)
         )
 
-    @cached_property
+    @property
+    def num_points(self) -> int:
+        """Of the whole cloud."""
+        return 0 if self.tally is None else self.tally.size
+
+    @property
     def label_counts(self) -> np.ndarray | None:
         """(256,) points per id; None without labels."""
-        labels = self.values("label")
-        return None if labels is None else np.bincount(labels.astype(np.uint8), minlength=256)
+        return None if self.tally is None else self.tally.labels
 
     @cached_property
     def truth(self) -> Path:
@@ -113,23 +126,52 @@ class ReportData:
         return found if isinstance(found, dict) else {}
 
 
-def load_report_data(scene: Scene) -> ReportData:
+def load_report_data(scene: Scene, settings: Memory = Memory()) -> ReportData:
     """Read whatever of a scene exists; InputError for files that exist and are broken."""
     metrics, check = (read_json(file) if file.exists() else {} for file in (scene.metrics, scene.check))
     if not isinstance(metrics, dict):
         raise InputError(f"{scene.metrics} must hold an object: run `sc3d evaluate {scene.path} --overwrite`")
     if not isinstance(check, dict):
         raise InputError(f"{scene.check} must hold an object: run `sc3d check {scene.path}`")
+    cloud, tally = _read_cloud(scene, settings)
+    has_mesh, held = scene.mesh.exists(), 0 if cloud is None else len(cloud.point.positions) * BYTES
+    if has_mesh and not fits(held + surface_bytes([scene.mesh]), settings):
+        logger.warning(
+            "the report has no picture of the mesh: its %.1f million triangles do not fit into --max-memory",
+            num_triangles([scene.mesh]) / 1e6,
+        )
+        has_mesh = False
     return ReportData(
         scene=scene,
         class_table=scene.class_table() if scene.classes.exists() else None,
-        cloud=None if scene.best_cloud is None else read_cloud(scene.best_cloud),
-        mesh=read_mesh(scene.mesh) if scene.mesh.exists() else None,
+        cloud=cloud,
+        mesh=scene.mesh if has_mesh else None,
         views=scene.model.views if scene.sparse.is_dir() else [],
         metrics=metrics,
         check=check,
         records=_read_sidecars(scene.path),
+        tally=tally,
+        settings=settings,
     )
+
+
+def _read_cloud(scene: Scene, settings: Memory) -> tuple[o3d.t.geometry.PointCloud | None, CloudTally | None]:
+    """The cloud, or what is drawn of it, and the tally of all of it."""
+    path = scene.best_cloud
+    if path is None:
+        return None, None
+    count = num_points(path)
+    if count is None or fits(count * BYTES + surface_bytes(scene.surface), settings):
+        cloud = read_cloud(path)
+        return cloud, tally(cloud)
+    some = read_thinned(path, min(DRAWN, max_points(settings, BYTES)))
+    logger.info(
+        "%s is counted from disk; pictures show %.1f of its %.1f million points (--max-memory)",
+        path,
+        len(some.point.positions) / 1e6,
+        count / 1e6,
+    )
+    return some, tally_by_parts(CloudFile.open(path), some.point.positions.numpy())
 
 
 def evaluated_truth(scene: Scene) -> Path:
@@ -171,17 +213,6 @@ def _read_sidecars(folder: Path) -> list[dict]:
         records.values(),
         key=lambda record: (order.get(record["stage"], len(order)), record["stage"], record["outputs"]),
     )
-
-
-def class_areas(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """(256,) float64 area of each class seen from above, squared world units: cells of the ground plane, by
-    the label of their highest point.
-
-    points: (N, 3) world, z up; labels: (N,) uint8
-    """
-    grid = Raster.around(points, _CELL * spacing_of_all(points))
-    rows = highest_points(grid, points).ravel()
-    return np.bincount(labels[rows[rows >= 0]], minlength=256) * grid.pixel**2
 
 
 def read_features(file: Path) -> list[dict] | None:

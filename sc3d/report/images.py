@@ -11,9 +11,11 @@ import numpy as np
 
 from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View
+from sc3d.io.clouds import read_mesh
 from sc3d.io.images import data_uri
-from sc3d.report.data import ReportData
+from sc3d.report.data import DRAWN, ReportData
 from sc3d.scene.labelled_cloud import LabelledSurface, is_confirmed
+from sc3d.tiling.seen_points import SeenPoints
 from sc3d.view.colors import COLORINGS, color_points
 from sc3d.view.screenshot import Style, draw_points, screenshot
 
@@ -22,18 +24,17 @@ logger = logging.getLogger(__name__)
 BACKGROUND = (238, 240, 242)
 _SIZES = {"oblique": (1280, 760), "above": (900, 900)}  # px
 _PHOTO_SIZE = 640  # px, longest side of a photo in the comparison
-_MAX_POINTS = 1_500_000
 
 
 def cloud_pictures(data: ReportData) -> dict[tuple[str, str], tuple[str, float]]:
     """Data URIs and width/height by (coloring or "mesh", "oblique" or "above"), of what the cloud has; empty
     where no renderer works.
     """
-    pictures = {}
+    pictures, mesh = {}, None if data.mesh is None else read_mesh(data.mesh)
     try:
         for direction, size in _SIZES.items():
             style = Style(
-                from_above=direction == "above", legend=False, background=BACKGROUND, max_points=_MAX_POINTS
+                from_above=direction == "above", legend=False, background=BACKGROUND, max_points=DRAWN
             )
             if data.cloud is not None:
                 shown = is_confirmed(data.cloud)
@@ -43,8 +44,8 @@ def cloud_pictures(data: ReportData) -> dict[tuple[str, str], tuple[str, float]]
                         colors[shown], replace(style, shading=0.0 if by == "photo" else 0.6)
                     )
                     pictures[by, direction] = _picture(painted)
-            if data.mesh is not None:
-                pictures["mesh", direction] = _picture(screenshot(data.mesh, None, size, style))
+            if mesh is not None:
+                pictures["mesh", direction] = _picture(screenshot(mesh, None, size, style))
     except Sc3dError as error:
         logger.warning("the report has no pictures of the cloud: %s", error)
     return pictures
@@ -59,14 +60,20 @@ def _colorings(data: ReportData) -> dict[str, np.ndarray]:
     return found
 
 
-def comparison(data: ReportData, view: View, labelled: LabelledSurface | None) -> list[tuple[str, str]]:
+def comparison_size(view: View) -> tuple[int, int]:
+    """(width, height) of the pictures of a photo, px."""
+    scale = min(1.0, _PHOTO_SIZE / max(view.width, view.height))
+    return max(1, round(view.width * scale)), max(1, round(view.height * scale))
+
+
+def comparison(
+    data: ReportData, view: View, labelled: LabelledSurface | SeenPoints | None
+) -> list[tuple[str, str]]:
     """Captions and data URIs of one photo: the photo, the given mask, the fused labels and the truth, as far
     as they exist.
     """
     scene = data.scene
-    scale = min(1.0, _PHOTO_SIZE / max(view.width, view.height))
-    size = max(1, round(view.width * scale)), max(1, round(view.height * scale))
-    panels = []
+    size, panels = comparison_size(view), []
     if scene.photo(view.name).exists():
         panels.append(
             (

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from sc3d.errors import examples
+from sc3d.geometry.cameras import View
 from sc3d.io.images import data_uri, read_image
 from sc3d.report.charts import (
     count_map,
@@ -23,11 +24,13 @@ from sc3d.report.charts import (
     reliability_curve,
     stacked_bar,
 )
-from sc3d.report.data import ReportData, class_areas, read_features
-from sc3d.report.images import cloud_pictures, comparison, ground_picture
+from sc3d.report.data import BYTES, ReportData, read_features
+from sc3d.report.images import cloud_pictures, comparison, comparison_size, ground_picture
+from sc3d.report.tally import BINS, CloudTally
 from sc3d.scene.class_table import OTHER
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.scene.labels import CORRECTED
+from sc3d.tiling.seen_points import labelled_sight, surface_fits
 from sc3d.view.colors import STATES, Coloring, color_points, confidence_colors, legend_entries
 
 _NUM_PHOTOS = 4
@@ -84,7 +87,7 @@ def summary_line(data: ReportData) -> str:
     """One sentence about the scene."""
     parts = []
     if data.cloud is not None:
-        parts.append(f"{len(data.points):,} points")
+        parts.append(f"{data.num_points:,} points")
     if data.views:
         parts.append(f"from {_count(len(data.views), 'photo')}")
     counts = data.label_counts
@@ -123,7 +126,7 @@ def headline(data: ReportData) -> str:
     elif counts is not None:
         tiles.append(("Labelled", f"{1 - counts[0] / max(counts.sum(), 1):.1%}", "of the points"))
     if data.cloud is not None:
-        tiles.append(("Points", _short(len(data.points)), ""))
+        tiles.append(("Points", _short(data.num_points), ""))
     if data.views:
         tiles.append(("Photos", f"{len(data.views):,}", ""))
     return "".join(
@@ -151,7 +154,10 @@ def cloud_section(data: ReportData) -> str:
             f'<figure id="cloud-{name}" class="panel" {"" if position == 0 else "hidden"}>'
             f'<figcaption class="print-only">{title}</figcaption><div class="pair">{images}</div>{_legend(data, name)}</figure>'
         )
-    return f'<div class="tabs" role="tablist">{"".join(tabs)}</div>{"".join(panels)}' if names else ""
+    shown = 0 if data.cloud is None else len(data.cloud.point.positions)
+    note = f'<p class="note">Pictures show {_short(shown)} of {_short(data.num_points)} points.</p>'
+    tablist = f'<div class="tabs" role="tablist">{"".join(tabs)}</div>{"".join(panels)}'
+    return (note if shown < data.num_points else "") + tablist if names else ""
 
 
 def _zoomable(uri: str, aspect: float, text: str) -> str:
@@ -227,11 +233,9 @@ def _told_of_empty(data: ReportData) -> str:
 def photo_section(data: ReportData) -> str:
     """A handful of photos with mask, fused labels and truth."""
     chosen, rows = _choose_views(data), []
-    labelled = None
-    if chosen and data.label_counts is not None:
-        labelled = LabelledSurface.build(data.cloud, data.views, data.scene.surface)
+    panels_of = {view.name: panels for view, panels in _comparisons(data, chosen)}
     for view in chosen:
-        panels = comparison(data, view, labelled)
+        panels = panels_of[view.name]
         if len(panels) > 1:
             images = "".join(
                 f'<figure><img src="{uri}" alt="{caption} of {escape(view.name)}"><figcaption>{caption}</figcaption></figure>'
@@ -241,6 +245,22 @@ def photo_section(data: ReportData) -> str:
                 f'<h3>{escape(view.name)}{_photo_figures(data, view.name)}</h3><div class="row">{images}</div>'
             )
     return "".join(rows) + _legend(data, "label", everything=True) if rows else ""
+
+
+def _comparisons(data: ReportData, chosen: list) -> Iterator[tuple[View, list[tuple[str, str]]]]:
+    """Each view with its `comparison`; the labels as the photos see them from memory or from disk."""
+    if not chosen or data.label_counts is None or data.scene.best_cloud is None:
+        yield from ((view, comparison(data, view, None)) for view in chosen)
+    elif surface_fits(data.scene, data.scene.best_cloud, data.settings):
+        surface = LabelledSurface.build(data.cloud, data.views, data.scene.surface)
+        yield from ((view, comparison(data, view, surface)) for view in chosen)
+    else:
+        sizes = {view.name: comparison_size(view) for view in chosen}
+        held = 0 if data.cloud is None else len(data.cloud.point.positions) * BYTES
+        with labelled_sight(
+            data.scene, data.settings, data.scene.best_cloud, sizes, data.scene.report, held=held
+        ) as seen:
+            yield from ((view, comparison(data, view, seen.surface)) for view in chosen)
 
 
 def flight_section(data: ReportData) -> str:
@@ -367,8 +387,10 @@ def _legend(data: ReportData, by: Coloring | Literal["mesh"], everything: bool =
         return f'<p class="legend">confidence 0 <i class="ramp" style="background:linear-gradient(90deg, {stops})"></i> 1</p>'
     if by == "mesh":
         return ""
-    values = data.values(by) if by in ("label", "state") else None
-    present = None if values is None or everything else set(np.unique(values).tolist())
+    counts = None
+    if data.tally is not None and by in ("label", "state"):
+        counts = data.tally.labels if by == "label" else data.tally.states
+    present = None if counts is None or everything else set(np.flatnonzero(counts).tolist())
     entries = legend_entries(by, data.class_table, present)
     if everything and given_class(data.figures("labels")) is not None:
         entries += legend_entries(by, data.class_table, {OTHER})
@@ -441,15 +463,12 @@ def of_classes(figures: object, key: str) -> dict[str, float | None]:
 
 
 def _class_table(data: ReportData) -> str:
-    counts, labels, confidence = data.label_counts, data.values("label"), data.values("confidence")
-    if counts is None or labels is None or data.class_table is None or not len(data.points):
+    counts = data.label_counts
+    if data.tally is None or counts is None or data.class_table is None or not data.num_points:
         return ""
     iou = iou_of(data, "labels")
-    areas = class_areas(data.points, labels.astype(np.uint8))
-    sums, rows = (
-        None if confidence is None else np.bincount(labels, np.nan_to_num(confidence), minlength=256),
-        [],
-    )
+    areas, sums, rows = data.tally.areas, data.tally.sums, []
+    assert areas is not None
     for label in [*(entry.id for entry in data.class_table), *([0] if counts[0] else [])]:
         name = data.class_table.name(label)
         mean = "–" if sums is None or not counts[label] else f"{sums[label] / counts[label]:.2f}"
@@ -531,16 +550,17 @@ def _table(heads: list[str], rows: list[list[str]]) -> str:
 
 def certainty_section(data: ReportData) -> str:
     """Confidence of the points, whether it can be believed, and how their labels came about."""
-    confidence, states, parts = data.values("confidence"), data.values("state"), []
-    if confidence is not None:
-        colors = confidence_colors((np.arange(20) + 0.5) / 20)
+    tally, parts = data.tally or CloudTally(0), []
+    states = tally.states
+    if tally.distribution is not None:
+        colors = confidence_colors((np.arange(BINS) + 0.5) / BINS)
         parts.append(
-            f'<div><h3>Confidence</h3><p class="note">Share of the points by confidence; median {np.nanmedian(confidence):.2f}.</p>'
-            f"{histogram(confidence, colors)}</div>"
+            f'<div><h3>Confidence</h3><p class="note">Share of the points by confidence; median {tally.median:.2f}.</p>'
+            f"{histogram(tally.distribution, colors)}</div>"
         )
     parts += _reliability(data)
-    if states is not None and len(states):
-        shares = np.bincount(states.astype(np.uint8), minlength=256)[: len(STATES)] / len(states)
+    if states is not None and tally.size:
+        shares = states[: len(STATES)] / tally.size
         rows = [(state.name, state.color, float(share)) for state, share in zip(STATES, shares, strict=True)]
         rows = [row for row in rows if row[2] or row[0] != STATES[CORRECTED].name]
         items = "".join(

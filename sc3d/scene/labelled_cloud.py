@@ -146,10 +146,15 @@ def with_labels(
 
 def read_labelled(path: Path, made_by: str) -> tuple[o3d.t.geometry.PointCloud, Labels]:
     """Read a cloud that has labels; `made_by` names the command that writes it, for the error."""
-    if not path.exists():
-        raise InputError(f"{path} is missing: run `sc3d {made_by} SCENE` first")
+    require_labelled(path, made_by)
     cloud = read_cloud(path)
     return cloud, take_labels(cloud, path, made_by)
+
+
+def require_labelled(path: Path, made_by: str) -> None:
+    """InputError that names the command which writes a labelled cloud, if it is missing."""
+    if not path.exists():
+        raise InputError(f"{path} is missing: run `sc3d {made_by} SCENE` first")
 
 
 def take_labels(cloud: o3d.t.geometry.PointCloud, path: Path, made_by: str) -> Labels:

@@ -35,10 +35,16 @@ class Workers:
 
 
 @dataclass(frozen=True)
-class Resources(Workers):
-    """What a stage may use; results do not depend on it."""
+class Memory:
+    """What a stage may use; results do not depend on it, but for pictures of clouds that do not fit."""
 
     max_memory: str = ""
-    """Memory to stay below, such as 6G; what does not fit is worked on tile by tile, from disk. Half of this
-    machine's memory otherwise. Each worker of a --cluster may use as much.
+    """Memory to stay below, such as 6G; what does not fit is worked on part by part, from disk, or refused. A
+    stage that passes it all the same ends with one line. Half of this machine's memory otherwise, for plans only.
+    Each worker of a --cluster may use as much.
     """
+
+
+@dataclass(frozen=True)
+class Resources(Memory, Workers):
+    """What a stage may use; results do not depend on it."""

@@ -8,13 +8,14 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from sc3d.settings.common import Memory
 from sc3d.settings.labels import Label, Propagate, Segment
 from sc3d.settings.reconstruction import Depth, Extract, Reconstruct
 from sc3d.settings.train import Train
 
 
 @dataclass(frozen=True)
-class Export:
+class Export(Memory):
     """Results for other programs, in SCENE/export."""
 
     format: tuple[
@@ -72,8 +73,7 @@ class Export:
     """Height between contour lines, units of the CRS; 0 = one that gives up to 25 levels (contours)."""
     ground_as_2: bool = False
     """Write all ground-like classes (ASPRS codes 2, 9, 10, 11, and 3 beside trees) as ASPRS class 2, ground,
-    which terrain programs look for (laz, copc,
-    3dtiles).
+    which terrain programs look for (laz, copc, 3dtiles).
     """
     min_height: float = 2.0
     """Lower buildings and plants are left out, m (objects); below 2 objects are told apart anew."""
@@ -82,10 +82,6 @@ class Export:
     rectangular: bool = True
     """Draw buildings with right angles where that fits; --no-rectangular keeps the simplified outline
     (objects).
-    """
-    max_memory: str = ""
-    """Memory to stay below, such as 6G; a cloud that does not fit is written in parts, from disk. Half of this
-    machine's memory otherwise (laz, copc, 3dtiles, dtm, dsm, ndsm, contours).
     """
 
 
@@ -127,7 +123,7 @@ class Compare:
 
 
 @dataclass(frozen=True)
-class Report:
+class Report(Memory):
     """One self-contained HTML page with figures and pictures."""
 
     output: Path | None = None
@@ -179,6 +175,7 @@ class ViewCommand:
     """Write a video (MP4) of the Gaussians along the flight instead of opening a window."""
     size: tuple[int, int] = (1600, 1000)
     """Width and height of the picture, px."""
+    memory: Annotated[Memory, arg(name="")] = Memory()
 
 
 @dataclass(frozen=True)

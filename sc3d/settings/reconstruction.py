@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, Suppress, arg
 
 from sc3d.errors import InputError
-from sc3d.settings.common import DepthMode, Workers
+from sc3d.settings.common import DepthMode, Memory, Workers
 
 Matching = Literal["auto", "exhaustive", "sequential", "spatial", "vocabulary"]
 Fill = Literal["nothing", "continued", "occluders"]
@@ -89,7 +89,7 @@ class GeoreferenceOptions:
 
 
 @dataclass(frozen=True)
-class Depth(Workers):
+class Depth(Memory, Workers):
     """Photos and cameras to a depth map per photo (PatchMatch stereo)."""
 
     max_size: int = 800
@@ -110,7 +110,7 @@ class Depth(Workers):
 
 
 @dataclass(frozen=True)
-class Extract:
+class Extract(Memory):
     """Gaussians or depth maps to mesh and cloud."""
 
     method: Annotated[Literal["tsdf", "depth", "centers"], arg(name="from")] = "tsdf"

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from sc3d.errors import InputError
-from sc3d.settings.common import DepthMode, Workers
+from sc3d.settings.common import DepthMode, Memory, Workers
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ class TrainSettings:
 
 
 @dataclass(frozen=True)
-class Train(Workers, TrainSettings):
+class Train(Memory, Workers, TrainSettings):
     """Gaussian training. Times are fractions of the run, so that a short run goes through all phases of a
     long one.
     """

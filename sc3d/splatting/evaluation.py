@@ -15,6 +15,7 @@ from sc3d.settings.common import DepthMode
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses
 from sc3d.splatting.consistency import pixel_rays
+from sc3d.splatting.cpu.steady_sums import steady_mean
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.rendering import render, surface_depth
@@ -77,8 +78,7 @@ def compare(
 
 def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
     """Peak signal-to-noise ratio of images in [0, 1], dB; at most 100."""
-    error = float((image.clamp(0, 1) - target).square().mean())
-    return -10 * float(np.log10(max(error, 1e-10)))
+    return -10 * float(np.log10(max(float(steady_mean((image.clamp(0, 1) - target).square())), 1e-10)))
 
 
 @torch.no_grad()

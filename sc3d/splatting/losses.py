@@ -16,6 +16,7 @@ from sc3d.geometry.cameras import View
 from sc3d.splatting import device
 from sc3d.splatting.consistency import pinhole, pixel_rays, relative_pose, reprojection_error
 from sc3d.splatting.cpu import normal_loss, patch_ncc, ssim
+from sc3d.splatting.cpu.steady_sums import per_row, steady_mean
 from sc3d.splatting.gpu import losses as gpu_losses
 from sc3d.splatting.rendered_view import Rendering
 
@@ -39,16 +40,16 @@ def apply_exposure(image: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
     change nothing.
     """
     exposure = exposure.to(image.device)
-    return exposure[0].exp() * image + exposure[1]
+    return per_row(exposure[0].exp(), image) * image + per_row(exposure[1], image)
 
 
 def fit_exposure(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """(2,) the exposure that brings `image` closest to `target` (least squares), for photos that were not
     trained on.
     """
-    mean_image, mean_target = image.mean(), target.mean()
-    covariance = ((image - mean_image) * (target - mean_target)).mean()
-    gain = covariance / (image - mean_image).square().mean().clamp_min(1e-12)
+    mean_image, mean_target = steady_mean(image), steady_mean(target)
+    covariance = steady_mean((image - mean_image) * (target - mean_target))
+    gain = covariance / steady_mean((image - mean_image).square()).clamp_min(1e-12)
     gain = gain.clamp(0.25, 4.0)
     return torch.stack([gain.log(), mean_target - gain * mean_image])
 
@@ -70,7 +71,7 @@ def flatten_loss(log_scales: torch.Tensor, visible: torch.Tensor, extent: float)
     """
     chosen = log_scales[visible]
     # min, not amin: of equal scales only one may shrink, or a sphere would stay a sphere
-    return chosen.min(1).values.exp().mean() / extent if len(chosen) else log_scales.sum() * 0
+    return steady_mean(chosen.min(1).values.exp()) / extent if len(chosen) else log_scales.sum() * 0
 
 
 def single_view_normal_loss(
@@ -123,7 +124,7 @@ def geometric_loss(error: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     used = valid & (error.detach() < 1)
     if not used.any():
         return error.sum() * 0
-    return (error[used] * torch.exp(-error[used].detach())).mean()
+    return steady_mean(error[used] * torch.exp(-error[used].detach()))
 
 
 def photometric_loss(
@@ -144,7 +145,7 @@ def photometric_loss(
     used = inside & (dissimilarity.detach() < 0.9)
     if not used.any():
         return dissimilarity.sum() * 0
-    return (weights.detach()[used] * dissimilarity[used]).mean()
+    return steady_mean(weights.detach()[used] * dissimilarity[used])
 
 
 def patch_dissimilarity(
@@ -172,7 +173,7 @@ def depth_loss(depth: torch.Tensor, alpha: torch.Tensor, known: torch.Tensor) ->
     used = (alpha > 0.5) & (depth > 0) & (known > 0)
     if not used.any():
         return depth.sum() * 0
-    return (depth[used] / known[used]).log().abs().clamp_max(FAR_OFF).mean()
+    return steady_mean((depth[used] / known[used]).log().abs().clamp_max(FAR_OFF))
 
 
 def image_edges(image: torch.Tensor) -> torch.Tensor:

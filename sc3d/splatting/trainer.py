@@ -18,6 +18,7 @@ from sc3d.scene.held_out import HeldOutPhoto
 from sc3d.settings.train import TrainSettings
 from sc3d.splatting import losses, strategy
 from sc3d.splatting.checkpoint import check_state, optimizer_state, restore_optimizer
+from sc3d.splatting.cpu.steady_sums import steady_mean
 from sc3d.splatting.dataset import TrainingData
 from sc3d.splatting.device import pick_device
 from sc3d.splatting.evaluation import depth_map, held_out_scores, psnr
@@ -75,8 +76,7 @@ def train(
             row = trainer.step()
             bar.update()
             if row is not None:
-                loss, quality = f"loss {row['loss']:.4f}", f"PSNR {row['psnr']:.2f}"
-                bar.show(f"{loss}, {quality}, {row['num_gaussians']} Gaussians")
+                bar.show("loss {loss:.4f}, PSNR {psnr:.2f}, {num_gaussians} Gaussians".format(**row))
             saves = settings.checkpoint_every
             if checkpoint is not None and saves and trainer.iteration % saves == 0:
                 trainer.save(checkpoint)
@@ -145,7 +145,7 @@ class Trainer:
             flatness = losses.flatten_loss(gaussians.log_scales, rendering.radii > 0, self.extent)
             loss = loss + settings.flatten_weight * flatness
         if stereo is not None and settings.sky_weight and stereo[1].any():
-            loss = loss + settings.sky_weight * (rendering.alpha * stereo[1]).mean()
+            loss = loss + settings.sky_weight * steady_mean(rendering.alpha * stereo[1])
         if shapes_surface:
             depth = surface_depth(rendering, view)
             if stereo is not None:

@@ -36,5 +36,5 @@ def outputs(scene: Scene, settings: Report) -> list[Path]:
 def run(scene: Scene, settings: Report) -> dict[str, object]:
     scene.require(scene.classes, hint="the report needs the class table")
     output = settings.output or scene.report
-    write_report(scene, output)
+    write_report(scene, output, settings)
     return {"kilobytes": output.stat().st_size // 1024}

@@ -16,14 +16,15 @@ import numba
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import View, camera_rays, may_see
+from sc3d.geometry.cameras import View, camera_rays, may_see, undistorted
 from sc3d.geometry.raycast import Surface, surfels
 from sc3d.io.atomic import atomic_path
 from sc3d.io.chunked_clouds import RECORDS_AT_ONCE, CloudFile, columns, positions
+from sc3d.io.memory_limit import BASE
 from sc3d.io.ply import Property, check_ply, num_triangles
 from sc3d.scene.scene import Scene
 from sc3d.tiling.executor import Executor
-from sc3d.tiling.memory import BASE, TRIANGLE
+from sc3d.tiling.memory import TRIANGLE
 from sc3d.tiling.store import CloudStatistics, TileGrid, TileStore
 
 SLACK = 1e-5  # of the box around a part, and of a range: rays that only just reach it are cast
@@ -214,13 +215,14 @@ SURFEL_MARGIN = 8.0  # of a tile, in point spacings: room for the neighbors of i
 @dataclass(frozen=True)
 class RangeJob:
     """What a task needs to know: where the scene and the parts of its surface are, and the size of each view
-    (width, height).
+    (width, height). pinhole: longest side of views without distortion that are looked through instead, 0 = none
     """
 
     scene: Path
     parts: MeshParts
     maps: RangeMaps
     sizes: dict[str, tuple[int, int]]
+    pinhole: int = 0
 
 
 def compute_ranges(job: RangeJob, executor: Executor) -> RangeMaps:
@@ -237,8 +239,14 @@ def compute_ranges(job: RangeJob, executor: Executor) -> RangeMaps:
 
 
 def _range_task(job: RangeJob, names: list[str]) -> None:
-    views = views_of(job.scene)
-    write_ranges(job.parts, [views[name].resized(*job.sizes[name]) for name in names], job.maps)
+    views = [sized_view(job.scene, name, job.sizes[name], job.pinhole) for name in names]
+    write_ranges(job.parts, views, job.maps)
+
+
+def sized_view(scene: Path, name: str, size: tuple[int, int], pinhole: int) -> View:
+    """A view of a scene as it is looked through, see `RangeJob`."""
+    view = views_of(scene)[name]
+    return undistorted(view, pinhole) if pinhole else view.resized(*size)
 
 
 def _by_place(job: RangeJob) -> list[str]:

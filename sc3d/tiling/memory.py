@@ -4,38 +4,30 @@ from __future__ import annotations
 
 import ctypes
 import os
-import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from sc3d.errors import InputError
 from sc3d.io.chunked_clouds import CloudFile
-from sc3d.io.ply import read_header
-from sc3d.settings.common import Resources
+from sc3d.io.memory_limit import BASE, amount
+from sc3d.io.ply import num_triangles, read_header
+from sc3d.settings.common import Memory, Workers
 
-BASE = 900 << 20  # bytes of a process without points: libraries, a photo's masks, a few range maps
-TRIANGLE = 300  # bytes of a triangle while rays are cast
+TRIANGLE = 300  # bytes of a triangle while rays are cast, with half a vertex
+VERTEX = 150  # bytes of a vertex beyond these, as where triangles share none
+SHOWN_BYTES = 300  # of a point of a cloud that a viewer has
 LEAST = 20_000  # points of a tile; with fewer, most of the work would be on margins
-UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 
-def memory_of(resources: Resources) -> int:
+def memory_of(resources: Memory) -> int:
     """Bytes that one process may use; InputError if the option is no amount of memory, or too small."""
-    if resources.max_memory:
-        found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?", resources.max_memory.strip(), re.IGNORECASE)
-        if not found:
-            raise InputError(f"--max-memory {resources.max_memory}: an amount such as 6G or 800M is expected")
-        if not found[2] and float(found[1]) < UNITS["M"]:
-            raise InputError(
-                f"--max-memory {resources.max_memory}: the unit is missing, such as {found[1]}M or {found[1]}G"
-            )
-        total = int(float(found[1]) * UNITS[found[2].upper()])
-    else:
-        total = system_memory() // 2
+    total = amount(resources.max_memory) if resources.max_memory else system_memory() // 2
+    workers, cluster = _elsewhere(resources)
     # this process is there beside its workers
-    share = total // max(resources.workers + 1, 1) if not resources.cluster else total
+    share = total // max(workers + 1, 1) if not cluster else total
     if share <= BASE + (100 << 20):
         raise InputError(
-            f"--max-memory: {total >> 20} MiB are too little for {resources.workers + 1} processes of at least {(BASE >> 20) + 100} MiB"
+            f"--max-memory: {total >> 20} MiB are too little for {workers + 1} processes of at least {(BASE >> 20) + 100} MiB"
         )
     return share
 
@@ -62,14 +54,35 @@ def system_memory() -> int:
     return status.memory
 
 
-def fits(needed: int, resources: Resources) -> bool:
+def _elsewhere(resources: Memory) -> tuple[int, str]:
+    """Workers on this machine, and address of a cluster, of stages that can have them."""
+    return (resources.workers, resources.cluster) if isinstance(resources, Workers) else (0, "")
+
+
+def fits(needed: int, resources: Memory) -> bool:
     """Whether work of so many bytes fits into memory as a whole, and nobody asked for workers."""
-    return resources.workers < 1 and not resources.cluster and needed + BASE <= memory_of(resources)
+    workers, cluster = _elsewhere(resources)
+    return workers < 1 and not cluster and needed + BASE <= memory_of(resources)
 
 
-def max_points(resources: Resources, bytes_per_point: int) -> int:
+def require_fit(needed: int, resources: Memory, what: str, advice: str) -> None:
+    """InputError, before the work, if it takes the whole of something in memory, and that does not fit."""
+    if not fits(needed, resources):
+        raise InputError(
+            f"{what} needs about {(needed + BASE) >> 20} MiB, and --max-memory leaves {memory_of(resources) >> 20}: {advice}"
+        )
+
+
+def max_points(resources: Memory, bytes_per_point: int) -> int:
     """Points that a process has room for."""
     return max((memory_of(resources) - BASE) // bytes_per_point, LEAST)
+
+
+def surface_bytes(files: Sequence[Path]) -> int:
+    """What a surface takes in memory while rays are cast or it is drawn."""
+    triangles, there = num_triangles(files), [path for path in files if path.is_file()]
+    vertices = sum(vertex.rows for path in there if (vertex := read_header(path).element("vertex")))
+    return triangles * TRIANGLE + max(0, vertices - triangles // 2) * VERTEX
 
 
 def num_points(path: Path) -> int | None:

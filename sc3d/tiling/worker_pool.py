@@ -7,17 +7,15 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
-import signal
-import threading
-import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any, cast
 
 from sc3d.errors import Sc3dError
-from sc3d.io.progress import Progress, show_bars
+from sc3d.io.child_process import environment, live_with_parent, told
+from sc3d.io.progress import Progress
 
 RETRIES = 3  # of a task whose worker is lost; more, and the task itself is what kills it
 Message = tuple[str, int, str]  # name of the logger, level, text
@@ -33,19 +31,10 @@ class LostTaskError(Sc3dError):
         )
 
 
-@contextmanager
-def _environment(threads: int) -> Iterator[None]:
-    """Of a process that is started in the block: so many threads, and no modules from the folder in which the
-    command was called, which may be somebody else's scene. Not longer than that: numba here looks at it too.
-    """
-    given = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), str(threads)) | {"PYTHONSAFEPATH": "1"}
-    before = {name: os.environ.get(name) for name in given}
-    os.environ.update(given)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
+def _environment(threads: int) -> AbstractContextManager[None]:
+    """Of a process that is started in the block: so many threads, and no modules from a scene."""
+    given = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), str(threads))
+    return environment(given | {"PYTHONSAFEPATH": "1"})
 
 
 class _Worker:
@@ -173,12 +162,10 @@ def _value(name: str, done: bool, value: Any) -> Any:
 
 def _work(connection: Connection) -> None:
     """A worker's life: until the pipe ends, or the process that started it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl + C is for the process that started it
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    live_with_parent()
     messages = _Messages()
     logging.getLogger().addHandler(messages)
     logging.captureWarnings(True)
-    show_bars(False)  # its parent has one
     function: Callable | None = None
     while True:
         try:
@@ -189,21 +176,8 @@ def _work(connection: Connection) -> None:
         except EOFError:
             return
         except Exception as error:
-            answer = False, _told(error)
+            answer = False, told(error)
         try:
             connection.send((*answer, messages.take()))
         except OSError:
             return
-
-
-def _told(error: Exception) -> Exception | str:
-    """What is for the user as it is, anything else with its place in the code."""
-    known = isinstance(error, Sc3dError | OSError | MemoryError)
-    return error if known else "".join(traceback.format_exception(error))
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-    os._exit(1)

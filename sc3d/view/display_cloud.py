@@ -4,6 +4,7 @@ colors.
 
 from __future__ import annotations
 
+import logging
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,12 +16,17 @@ from sc3d.errors import InputError
 from sc3d.geometry.graph import MORTON_BITS, morton_codes
 from sc3d.io.clouds import read_cloud
 from sc3d.scene.class_table import ClassTable
+from sc3d.scene.cloud_parts import read_thinned
 from sc3d.scene.labelled_cloud import INSTANCE, VOTES, confirmed_only, spacing_of
 from sc3d.scene.scene import Scene
+from sc3d.settings.common import Memory
+from sc3d.tiling.memory import SHOWN_BYTES, fits, max_points, num_points
 from sc3d.view.colors import COLORINGS, Coloring, can_color, color_points, shaded
 
 if TYPE_CHECKING:
     import open3d as o3d
+
+logger = logging.getLogger(__name__)
 
 _CHUNKS = 16  # steps in which points come and go; each is a node per class
 _SMALLEST_CHUNK = 20_000
@@ -175,9 +181,14 @@ def only_classes(cloud: o3d.t.geometry.PointCloud, ids: set[int] | None) -> o3d.
 
 
 def load_cloud(
-    scene: Scene, file: Path | None = None, votes: bool | None = False, unconfirmed: bool = True
+    scene: Scene,
+    file: Path | None = None,
+    votes: bool | None = False,
+    unconfirmed: bool = True,
+    memory: Memory = Memory(),
 ) -> o3d.t.geometry.PointCloud:
-    """The cloud of a file, else the best of the scene; InputError if there is none.
+    """The cloud of a file, else the best of the scene; InputError if there is none. Of one that does not fit into
+    memory, as many points as do, evenly, which is told.
 
     unconfirmed: of the scene, with what no second photo confirms
     votes: add those of seeds.ply to a cloud of the scene that has none; None = where that is possible
@@ -185,12 +196,27 @@ def load_cloud(
     path = file or scene.best_cloud
     if path is None:
         raise InputError(f"{scene.path} has no cloud to show: run `sc3d extract SCENE`, or pass --file FILE")
+    count = num_points(path)
+    if count is not None and not fits(count * SHOWN_BYTES, memory):
+        return _some_points(path, count, memory, unconfirmed or file is not None)
     cloud = read_cloud(path)
     if file is not None:
         return cloud
     if votes is not False and not can_color(cloud, "disagreement") and scene.seeds.exists():
         with nullcontext() if votes else suppress(InputError):
             cloud = with_votes(cloud, read_cloud(scene.seeds))
+    return cloud if unconfirmed else confirmed_only(cloud)
+
+
+def _some_points(path: Path, count: int, memory: Memory, unconfirmed: bool) -> o3d.t.geometry.PointCloud:
+    cloud = read_thinned(path, max_points(memory, SHOWN_BYTES))
+    logger.warning(
+        "%s: %.2f of its %.2f million points are shown, evenly, as no more fit into %s",
+        path,
+        len(cloud.point.positions) / 1e6,
+        count / 1e6,
+        f"--max-memory {memory.max_memory}" if memory.max_memory else "half of this machine's memory",
+    )
     return cloud if unconfirmed else confirmed_only(cloud)
 
 

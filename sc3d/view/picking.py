@@ -24,6 +24,8 @@ from sc3d.runner import sidecar
 from sc3d.scene.class_table import ClassTable
 from sc3d.scene.labelled_cloud import INSTANCE, NORMAL_NEIGHBORS, Votes, read_surface, read_votes, spacing_of
 from sc3d.scene.scene import Scene
+from sc3d.settings.common import Memory
+from sc3d.tiling.memory import SHOWN_BYTES, TRIANGLE, fits, surface_bytes
 from sc3d.view.catalog import Catalog
 from sc3d.view.colors import STATES
 
@@ -82,6 +84,7 @@ class Inspector:
     views: photos that may have seen the points; surface: `Scene.surface`, surfels of the cloud if there is
         no mesh
     voxel_size: of the labels, which is the tolerance of visibility, world units; None = 2 point spacings
+    memory: in which the surface must fit, or nobody is told which photos see a point
     catalog: of the objects that the cloud has
     """
 
@@ -92,21 +95,28 @@ class Inspector:
         class_table: ClassTable | None,
         surface: Sequence[Path],
         voxel_size: float | None = None,
+        memory: Memory = Memory(),
         catalog: Catalog | None = None,
     ) -> None:
-        self._catalog = catalog
+        self._memory, self._catalog = memory, catalog
         self.cloud, self.views, self.class_table, self._files = cloud, list(views), class_table, surface
         self._points = cloud.point.positions.cpu().numpy().astype(np.float64)
         self._given_voxel_size = voxel_size
 
     @classmethod
-    def from_scene(cls, scene: Scene, cloud: o3d.t.geometry.PointCloud, views: Sequence[View]) -> Inspector:
+    def from_scene(
+        cls,
+        scene: Scene,
+        cloud: o3d.t.geometry.PointCloud,
+        views: Sequence[View],
+        memory: Memory = Memory(),
+    ) -> Inspector:
         """Looks points up as `label` saw them: with the voxel size that it wrote down."""
         table, voxel_size = scene.class_table() if scene.classes.exists() else None, None
         with suppress(InputError, KeyError, TypeError, ValueError):
             record: Any = read_json(sidecar(scene.seeds))
             voxel_size = float(record["summary"]["voxel_size"])
-        return cls(cloud, views, table, scene.surface, voxel_size, Catalog(scene))
+        return cls(cloud, views, table, scene.surface, voxel_size, memory, Catalog(scene))
 
     def nearest(self, position: np.ndarray) -> int:
         """Row of the point nearest to a (3,) world position."""
@@ -137,7 +147,7 @@ class Inspector:
         )
         photos = (
             photos_that_see(self._points[row], self._normal(row), self.views, self._surface, self._voxel_size)
-            if self.views
+            if self.views and self._surface_fits
             else []
         )
         number = int(attributes[INSTANCE][row].item()) if INSTANCE in attributes else None
@@ -181,6 +191,20 @@ class Inspector:
     @cached_property
     def _voxel_size(self) -> float:
         return self._given_voxel_size or 2 * spacing_of(self._points)
+
+    @cached_property
+    def _surface_fits(self) -> bool:
+        held = len(self._points) * SHOWN_BYTES
+        surface = surface_bytes(self._files) or 2 * TRIANGLE * len(
+            self._points
+        )  # two triangles of each surfel
+        found = fits(held + surface, self._memory)
+        if not found:
+            logger.warning(
+                "which photos see a point is not told: the surface, %.1f GiB, does not fit into memory beside the cloud",
+                surface / (1 << 30),
+            )
+        return found
 
     @cached_property
     def _surface(self) -> RayTarget:

@@ -11,7 +11,7 @@ import shapely
 from scipy import ndimage
 
 from sc3d.errors import InputError
-from sc3d.exporters import objects
+from sc3d.exporters import objects, projected_cloud
 from sc3d.exporters.polygonize import main_direction, orthogonalized, polygonize, simplified
 from sc3d.geometry.raster import Raster
 from sc3d.instances.buildings import join_enclosed, roof_tops, split_buildings
@@ -342,3 +342,15 @@ def test_volume_above_the_ground_of_a_house_on_a_slope(tmp_path):
     buildings, _ = exported(write_scene(tmp_path, labelled_cloud(points, np.where(house, 1, 3))))
     # 80 m2, on average 6 m above the plane of the slope
     assert buildings[0]["properties"]["volume_m3"] == pytest.approx(480, rel=0.05)
+
+
+def test_a_cloud_that_does_not_fit_is_refused_with_the_number(tmp_path, monkeypatch):
+    scene = write_scene(
+        tmp_path, labelled_cloud(np.random.default_rng(0).uniform(0, 9, (400, 3)), np.ones(400))
+    )
+    monkeypatch.setattr(projected_cloud, "num_points", lambda path: 40_000_000)
+    told = (
+        r"objects of 40.0 million points needs about 10\d\d\d MiB, and --max-memory leaves 4096: allow more"
+    )
+    with pytest.raises(InputError, match=told):
+        objects.write(scene, Export(format=("objects",), max_memory="4G"))

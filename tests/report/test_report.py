@@ -22,7 +22,7 @@ from sc3d.io.images import write_image
 from sc3d.io.json_files import write_json
 from sc3d.report import write_report
 from sc3d.report.charts import flight_map, histogram, paired_bars, reliability_curve
-from sc3d.report.data import ReportData, class_areas, load_report_data
+from sc3d.report.data import ReportData, load_report_data
 from sc3d.report.images import comparison, ground_picture
 from sc3d.report.sections import (
     certainty_section,
@@ -32,6 +32,7 @@ from sc3d.report.sections import (
     quality_section,
     summary_line,
 )
+from sc3d.report.tally import class_areas, distribution
 from sc3d.runner import execute
 from sc3d.scene.labelled_cloud import LabelledSurface
 from sc3d.scene.scene import Scene
@@ -413,7 +414,7 @@ def test_bars_are_as_long_as_their_values():
 
 
 def test_histogram_counts_every_value_once():
-    chart = histogram(np.array([0.0, 0.05, 0.95, 1.0, np.nan]), np.zeros((10, 3), np.uint8))
+    chart = histogram(distribution(np.array([0.0, 0.05, 0.95, 1.0, np.nan]), 10), np.zeros((10, 3), np.uint8))
     assert re.findall(r": ([\d.]+)%</title>", chart) == ["60.0", *["0.0"] * 8, "40.0"]
 
 

@@ -157,11 +157,15 @@ def test_fifty_kills_of_a_whole_run(tmp_path):
 # ---- Ctrl-C
 
 
-def test_ctrl_c_is_one_clear_line(finished, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("number", "status", "line"),
+    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "ended by SIGTERM")],
+)
+def test_ctrl_c_and_sigterm_are_one_clear_line(finished, tmp_path, monkeypatch, capsys, number, status, line):
     scene = tmp_path / "scene"
     shutil.copytree(finished, scene)
     before = contents(scene)
-    monkeypatch.setattr("sc3d.labelling.label.fuse", lambda *_: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("sc3d.labelling.label.fuse", lambda *_: signal.raise_signal(number))
     # a shell starts background jobs deaf to Ctrl-C
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
@@ -170,8 +174,8 @@ def test_ctrl_c_is_one_clear_line(finished, tmp_path, monkeypatch, capsys):
     finally:
         signal.signal(signal.SIGINT, handler)
     told = capsys.readouterr().err
-    assert stopped.value.code == 130
-    assert told.count("\n") == 1 and "interrupted; finished work is kept" in told
+    assert stopped.value.code == status
+    assert told.count("\n") == 1 and f"{line}; finished work is kept" in told
     assert contents(scene) == before and not hidden(scene)
 
 

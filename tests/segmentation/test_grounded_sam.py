@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,22 @@ def test_masks_and_instances_fit_each_other(models, tmp_path, segmenter):
         photos, folders, GroundedSam(_tiny(models, segmenter, tile=64), TABLE), TABLE, overwrite=True
     )
     assert before == {file: file.read_bytes() for file in tmp_path.rglob("photo*.*")}
+
+
+@pytest.mark.parametrize("segmenter", ["sam", "sam2"])
+def test_half_precision_on_a_gpu_stays_close(models, segmenter):
+    import torch
+
+    if not torch.cuda.is_available():
+        pytest.skip("no GPU")
+    image = np.random.default_rng(1).integers(0, 256, (48, 80, 3)).astype(np.uint8)
+    found = []
+    for half in (False, True):
+        settings = replace(_tiny(models, segmenter, tile=64, half=half), device="cuda")
+        found.append(GroundedSam(settings, TABLE).segment(image))
+    (label, confidence, _), (other, other_confidence, _) = found
+    assert (label == other).mean() > 0.8
+    assert abs(confidence.astype(float).mean() - other_confidence.astype(float).mean()) < 10
 
 
 def test_nothing_found_is_unlabelled(models):

@@ -34,8 +34,9 @@ IMAGE = np.random.default_rng(5).integers(0, 256, (96, 128, 3)).astype(np.uint8)
 
 
 def _backend(models: Path, name: str = "sam3", **changes) -> Sam3:
+    changes = {"device": "cpu"} | changes
     return Sam3(
-        Segment(backend="sam3", concept_model=f"tiny/{name}", model_dir=models, device="cpu", **changes),
+        Segment(backend="sam3", concept_model=f"tiny/{name}", model_dir=models, **changes),
         TABLE,
     )
 
@@ -175,6 +176,16 @@ def test_half_precision_stays_close(models, monkeypatch):
         )
         < 0.05
     )
+
+
+def test_half_precision_on_a_gpu_stays_close(models):
+    import torch
+
+    if not torch.cuda.is_available():
+        pytest.skip("no GPU")
+    full, half = (_backend(models, half=half, device="cuda").find(IMAGE) for half in (False, True))
+    scores = [max(found.box_score for found in areas.instances) for areas in (full, half)]
+    assert abs(len(full.instances) - len(half.instances)) < 4 and abs(scores[0] - scores[1]) < 0.05
 
 
 def test_long_prompts_and_other_models_are_refused(models, tmp_path):

@@ -18,18 +18,25 @@ import open3d as o3d
 import pytest
 
 from sc3d.errors import InputError
+from sc3d.exporters import orthophoto, projected_cloud
+from sc3d.geometry.cameras import undistorted
 from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.clouds import read_cloud, read_mesh, write_geometry
+from sc3d.io.images import read_image
 from sc3d.io.ply import write_records
+from sc3d.report.tally import tally, tally_by_parts
+from sc3d.scene.cloud_parts import read_thinned
 from sc3d.scene.scene import Scene
+from sc3d.settings.common import Memory
 from sc3d.settings.labels import Evaluate, Label, PaperMechanisms, Propagate
+from sc3d.settings.outputs import Export
 from sc3d.settings.synthesize import Synthesize
-from sc3d.stages import evaluate, label, propagate
+from sc3d.stages import evaluate, export, label, propagate
 from sc3d.synthetic.generate import synthesize
-from sc3d.tiling import evaluate as tiled_evaluate
 from sc3d.tiling import label as tiled_label
 from sc3d.tiling import memory as plan
 from sc3d.tiling import propagate as tiled_propagate
+from sc3d.tiling import seen_points
 from sc3d.tiling.first_surfaces import MeshParts, RangeMaps, read_triangles, write_ranges
 from sc3d.tiling.memory import memory_of
 from sc3d.tiling.store import CloudStatistics, TileStore
@@ -56,7 +63,7 @@ def small_tiles(monkeypatch):
     def room(resources, _):
         return TILES if resources.max_memory == "2G" else 10**9
 
-    for module in (tiled_label, tiled_propagate, tiled_evaluate):
+    for module in (tiled_label, tiled_propagate, seen_points):
         monkeypatch.setattr(module, "max_points", room)
         monkeypatch.setattr(module, "fits", lambda _, resources: resources.max_memory != "2G")
 
@@ -468,3 +475,108 @@ def test_a_laz_cloud_is_labelled(site, tmp_path):
     both = (found["label"] > 0) & (expected["label"] > 0)
     assert both.mean() > 0.7 and (found["label"] == expected["label"])[both].mean() > 0.98
     np.testing.assert_allclose(found["positions"], source.point.positions.numpy(), atol=1e-3)
+
+
+def labelled_site(site: Path) -> Scene:
+    """The scene with its points and their true labels as labelled.ply."""
+    cloud = read_cloud(site / "cloud.ply")
+    label = np.where(cloud.point["label"].numpy() > 4, 0, cloud.point["label"].numpy()).astype(np.uint8)
+    confidence = np.random.default_rng(0).random(label.shape, np.float32)
+    named = {"label": label, "confidence": confidence, "state": label > 0, "num_views": 3 * (label > 0)}
+    for name, kind in zip(NAMES, (np.uint8, np.float32, np.uint8, np.int32), strict=True):
+        cloud.point[name] = o3d.core.Tensor(named[name].astype(kind))
+    write_geometry(site / "labelled.ply", cloud)
+    return Scene(site)
+
+
+def test_masks_by_tile_are_those_of_the_whole(site, small_tiles):
+    scene, found = labelled_site(site), []
+    for memory in ("", "2G"):
+        export.run(scene, Export(format=("masks",), max_size=120, max_memory=memory))
+        found.append([read_image(file) for file in sorted((scene.export / "masks").glob("*.png"))])
+    assert len(found[0]) == 8 and (found[0][0] > 0).mean() > 0.5
+    for whole, tiled in zip(*found, strict=True):
+        np.testing.assert_array_equal(whole, tiled)
+    assert not list(scene.export.glob(".*"))
+
+
+def test_a_pinhole_photo_by_tile_shows_the_same_points(site, small_tiles):
+    scene = labelled_site(site)
+    views = [undistorted(view, 100) for view in scene.model.views]
+    sizes = {view.name: (view.width, view.height) for view in views}
+    found = []
+    for memory in ("", "2G"):
+        with seen_points.labelled_sight(
+            scene, Memory(memory), scene.labelled, sizes, site / "seen", pinhole=100
+        ) as seen:
+            found.append([seen.surface.rows(view, sizes[view.name])[0] for view in views])
+            points = np.concatenate([part for part, _ in seen.parts()])
+    for whole, tiled in zip(*found, strict=True):
+        np.testing.assert_array_equal(whole, tiled)
+    np.testing.assert_array_equal(points, read_cloud(scene.labelled).point.positions.numpy())
+
+
+def test_the_report_counts_a_cloud_on_disk_as_in_memory(site):
+    scene = labelled_site(site)
+    cloud = read_cloud(scene.labelled)
+    whole = tally(cloud)
+    parts = tally_by_parts(CloudFile.open(scene.labelled), cloud.point.positions.numpy()[::3])
+    assert parts.size == whole.size == POINTS
+    for name in ("labels", "states", "distribution"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+    np.testing.assert_allclose(parts.sums, whole.sums, rtol=1e-6)
+    assert abs(parts.median - whole.median) < 2e-4
+    shares = [found.areas / found.areas.sum() for found in (whole, parts)]
+    np.testing.assert_allclose(shares[1], shares[0], atol=0.01)
+
+
+def test_a_thinned_cloud_is_even_and_has_all_attributes(site):
+    scene = labelled_site(site)
+    cloud, some = read_cloud(scene.labelled), read_thinned(scene.labelled, 6000)
+    assert set(some.point) == set(cloud.point) and abs(len(some.point.positions) - 6000) < 400
+    for name in some.point:
+        assert some.point[name].dtype == cloud.point[name].dtype, name
+    middle = np.median(cloud.point.positions.numpy(), axis=0)
+    assert (some.point.positions.numpy() < middle).mean(axis=0) == pytest.approx([0.5] * 3, abs=0.03)
+
+
+@pytest.mark.parametrize("has_mesh", [True, False])
+def test_an_orthophoto_in_strips_is_that_of_the_whole(site, tmp_path, monkeypatch, has_mesh):
+    rasterio = pytest.importorskip("rasterio")
+    folder = tmp_path / "scene"
+    labelled_site(site)
+    for name in ("classes.json", "labelled.ply", *(["mesh.ply"] if has_mesh else [])):
+        folder.mkdir(exist_ok=True)
+        shutil.copy(site / name, folder / name)
+    monkeypatch.setattr(orthophoto, "TILE", 64)
+    for module in (orthophoto, projected_cloud):
+        monkeypatch.setattr(module, "fits", lambda _, resources: resources.max_memory != "2G")
+    monkeypatch.setattr(orthophoto, "memory_of", lambda _: orthophoto.BASE + (10 << 20))
+    found = []
+    for memory in ("", "2G"):
+        settings = Export(format=("orthophoto",), pixel_size=0.5, max_memory=memory)
+        strips = orthophoto.strips_of(Scene(folder), settings)
+        export.run(Scene(folder), settings)
+        images = []
+        for name in (orthophoto.COLOR, orthophoto.CLASSES, orthophoto.HEIGHT):
+            with rasterio.open(folder / "export" / name) as file:
+                images.append(file.read())
+        found.append((strips._size, images))
+    assert found[0][0] >= found[0][1][0].shape[1] > found[1][0]  # one strip, several
+    whole, parts = found[0][1], found[1][1]
+    assert (whole[1] > 0).mean() > 0.8 and (whole[1] == parts[1]).mean() > 0.998
+    assert (whole[0] == parts[0]).all(axis=0).mean() > 0.998
+    np.testing.assert_allclose(parts[2], whole[2], atol=1e-3)
+
+
+def test_clouds_in_parts_are_those_of_the_whole(site, monkeypatch):
+    scene, found = labelled_site(site), []
+    monkeypatch.setattr(projected_cloud, "fits", lambda _, resources: resources.max_memory != "2G")
+    monkeypatch.setattr("sc3d.io.chunked_clouds.RECORDS_AT_ONCE", 7000)
+    for memory in ("", "2G"):
+        figures = export.run(scene, Export(format=("clouds",), max_memory=memory))
+        files = sorted((scene.export / "clouds").glob("*.ply"))
+        found.append((figures, {file.name: columns(file) for file in files}))
+    assert found[0][0] == found[1][0] and found[0][1].keys() == found[1][1].keys() and len(found[0][1]) == 5
+    for name, whole in found[0][1].items():
+        assert_same(whole, found[1][1][name])

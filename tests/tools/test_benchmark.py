@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from sc3d.errors import InputError
 from sc3d.geometry.cameras import look_at, pinhole_view
 from sc3d.io.images import read_image
 from sc3d.io.splats import read_splat_ply
@@ -20,10 +21,11 @@ from sc3d.splatting.gaussians import Gaussians
 from tests.builders import write_bare_scene
 from tests.reference.splatting import _alphas, rotation_matrices
 from tests.test_cli import fails as command_fails
-from tools.benchmark import opensplat, training
+from tools.benchmark import gpu, opensplat, training
 from tools.benchmark.__main__ import main
 from tools.benchmark.fragments import count_fragments
 from tools.benchmark.machine import Stopwatch, fma_gflops, replaced
+from tools.benchmark.settings import BenchmarkGpu
 from tools.benchmark.speed_table import markdown, reference_ratio
 from tools.benchmark.workload import FRAGMENTS, VISIBLE_SHARE, build_workload, synthetic_ground
 
@@ -257,3 +259,27 @@ def write_points_scene(path: Path, ground) -> Path:
     (path / "sparse" / "0").mkdir(parents=True)
     model.write_binary(str(path / "sparse" / "0"))
     return path
+
+
+def test_the_check_of_a_gpu_tells_what_does_not_pass(tmp_path, monkeypatch):
+    command = BenchmarkGpu(tmp_path, device="cpu", gaussians=(500,), size=96, steps=1)
+    monkeypatch.setattr(gpu, "COMPARED", 400)
+    monkeypatch.setattr(gpu, "SMALL", (160, 120))
+    monkeypatch.setattr(gpu, "trainings", lambda command: iter([gpu.Row("site on cpu", "PSNR 20.00 dB")]))
+    gpu.run_gpu(command)
+    table = (tmp_path / "gpu.md").read_text()
+    assert table.startswith("On the CPU against itself") and table.count("| yes |") == 11
+    assert "step, 500 Gaussians, 96x64 px" in table and "| NO |" not in table
+    found = iter([np.eye(5)[[1]].repeat(400, 0), np.eye(5)[[2]].repeat(400, 0)])
+    monkeypatch.setattr(gpu, "lift", lambda *_: next(found))
+    monkeypatch.setattr(gpu, "LARGEST_IMAGE", -1.0)
+    with pytest.raises(InputError, match=r"5 of 13 lines do not pass: color.*, lifted labels"):
+        gpu.run_gpu(command)
+    assert (tmp_path / "gpu.md").read_text().count("| NO |") == 5
+
+
+def test_what_both_devices_render_is_worth_comparing():
+    gaussians, view = gpu.scene_of(2000, (160, 120))
+    images, gradients = gpu.rendered(gaussians, view, torch.device("cpu"))
+    assert (images["alpha"] > 0.5).float().mean() > 0.4
+    assert all(gradient.norm() > 0 for gradient in gradients.values()) and len(gradients) == 6

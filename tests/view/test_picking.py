@@ -11,6 +11,7 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, local_origin, look_at, pinhole_view, project
 from sc3d.geometry.raycast import Surface, first_surface, see_points
 from sc3d.scene.class_table import parse_classes
+from sc3d.view import picking
 from sc3d.view.display_cloud import DisplayCloud, class_ids, only_classes, progressive_order, with_votes
 from sc3d.view.picking import Inspector, photos_that_see, point_on_ray, position_at
 
@@ -116,6 +117,13 @@ def test_everything_known_of_a_point_is_told(tmp_path):
     assert all(
         word in str(looked_up) for word in ("point 301", "a / b 3.5, road 1.2", "locked", "photo_0.jpg")
     )
+
+
+def test_a_surface_that_does_not_fit_is_told_and_not_read(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(picking, "fits", lambda *_: False)
+    found = inspector(tmp_path)
+    assert found.look_up(0).photos == () and found.look_up(1).photos == ()
+    assert caplog.text.count("which photos see a point is not told") == 1
 
 
 def test_nearest_is_the_nearest_at_utm_size(tmp_path):

@@ -1,4 +1,4 @@
-"""Measurements: `python -m tools.benchmark {speed,surface,tables,fusion-speed,questions,few-labels,city} --help`."""
+"""Measurements: `python -m tools.benchmark {speed,gpu,surface,tables,fusion-speed,questions,few-labels,city} --help`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from tools.benchmark import settings
 
 RUNS: dict[type, tuple[str, str]] = {
     settings.BenchmarkSpeed: ("speed", "run_speed"),
+    settings.BenchmarkGpu: ("gpu", "run_gpu"),
     settings.BenchmarkTables: ("tables", "run_tables"),
     settings.BenchmarkFusionSpeed: ("fusion_speed", "run_fusion_speed"),
     settings.BenchmarkSurface: ("surface_page", "run_surface"),

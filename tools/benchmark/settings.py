@@ -36,6 +36,33 @@ class BenchmarkSpeed:
 
 
 @dataclass(frozen=True)
+class BenchmarkGpu:
+    """Hold the GPU path against the CPU's: image, gradients, lifted labels, a training to the end, time and memory of
+    a step. Ends with status 2 if a line does not pass.
+    """
+
+    workdir: Annotated[Positional[Path], arg(help="Folder for the table, gpu.md, and for what is trained.")]
+    device: str = "cuda"
+    """cuda, or cpu to try this command without a GPU."""
+    gaussians: tuple[int, ...] = (200_000, 1_000_000, 5_000_000)
+    """Numbers of Gaussians of which a step is timed."""
+    size: int = 1600
+    """Longest side of the view of a step, px."""
+    steps: int = 20
+    """Steps that are timed, after three that are not."""
+    scenes: tuple[Path, ...] = ()
+    """Scene folders with cameras and photos to train too, such as Brighton Beach."""
+    views: int = 24
+    """Photos of the synthetic site."""
+    width: int = 800
+    """Their width, px."""
+    iterations: int = 0
+    """Steps of a training; 0 = as `sc3d train` has it."""
+    against_cpu: bool = True
+    """Train on the CPU too, which takes minutes, and compare the scores."""
+
+
+@dataclass(frozen=True)
 class BenchmarkTables:
     """The paper's tables and an ablation: every method and switch on synthetic scenes and on scenes with
     truth, judged on the same pixels.
@@ -149,6 +176,7 @@ class BenchmarkFewLabels:
 
 Benchmark = (
     Annotated[BenchmarkSpeed, subcommand("speed")]
+    | Annotated[BenchmarkGpu, subcommand("gpu")]
     | Annotated[BenchmarkTables, subcommand("tables")]
     | Annotated[BenchmarkFusionSpeed, subcommand("fusion-speed")]
     | Annotated[BenchmarkSurface, subcommand("surface")]
