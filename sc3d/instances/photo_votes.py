@@ -39,7 +39,9 @@ SURE = 0.5  # of the points of a place that a photo shows, more are on one of it
 
 @dataclass(frozen=True)
 class PhotoVotes:
-    """views: those that have a file of objects, with the file; read: reads it; broken: files that it refused"""
+    """views: those that have a file of objects, with the file; read: reads it; broken: files that it
+    refused
+    """
 
     scene: Scene
     frame: SiteFrame
@@ -59,7 +61,9 @@ class PhotoVotes:
         return cls(scene, frame, found, read) if found else None
 
     def refine(self, tops: Tops, number: int, kind: Kind, regions: np.ndarray) -> np.ndarray:
-        """(H, W) int32 regions from 1 of one of the kinds of `tops`, parted and joined as the photos have it."""
+        """(H, W) int32 regions from 1 of one of the kinds of `tops`, parted and joined as the photos have
+        it.
+        """
         atoms = _atoms(regions, round(BLOCK / tops.grid.pixel) or 1)
         edges = _edges(atoms)
         if not len(edges):
@@ -138,8 +142,8 @@ def _edges(atoms: np.ndarray) -> np.ndarray:
 
 
 def _samples(tops: Tops, number: int, atoms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(K, 3) points of one of the kinds on the cells of atoms, m: on top and, of walls, down to the lowest; and the
-    atom (K,) of each.
+    """(K, 3) points of one of the kinds on the cells of atoms, m: on top and, of walls, down to the lowest;
+    and the atom (K,) of each.
     """
     step = max(1, round(SAMPLE / tops.grid.pixel))
     chosen = np.zeros(atoms.shape, bool)

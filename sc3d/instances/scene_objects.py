@@ -38,8 +38,8 @@ class SceneObjects:
     def tell_apart(
         cls, scene: Scene, parts: Parts, read_objects: ReadObjects | None = None
     ) -> SceneObjects | None:
-        """Those of countable classes; None without a class table, or if it has no such class. read_objects: of
-        the photos, which then have a say
+        """Those of countable classes; None without a class table, or if it has no such class. read_objects:
+        of the photos, which then have a say
         """
         if not scene.classes.exists():
             return None

@@ -153,8 +153,8 @@ def _listed(objects: dict[str, int]) -> str:
 def propagate_scene(
     scene: Scene, settings: Propagate, read_objects: ReadObjects | None = None
 ) -> PropagateSummary:
-    """Complete the labels of a scene's seeds (or of `settings.seeds`) and write the labelled cloud. read_objects:
-    as `SceneObjects.tell_apart` takes it
+    """Complete the labels of a scene's seeds (or of `settings.seeds`) and write the labelled cloud.
+    read_objects: as `SceneObjects.tell_apart` takes it
     """
     saved = _saved_appearance(scene, settings)
     meters = _meters(scene) if settings.model or settings.save_model else None

@@ -1,4 +1,6 @@
-"""Measurements: `python -m tools.benchmark {speed,gpu,surface,tables,fusion-speed,questions,few-labels,city} --help`."""
+"""Measurements: `python -m tools.benchmark
+{speed,gpu,surface,tables,fusion-speed,questions,few-labels,city} --help`.
+"""
 
 from __future__ import annotations
 

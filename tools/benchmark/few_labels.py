@@ -1,5 +1,5 @@
-"""What a few photos labelled by hand are worth: the truth masks of some photos are all the masks that there are, and
-others are judged, beside the given masks of all photos.
+"""What a few photos labelled by hand are worth: the truth masks of some photos are all the masks that there
+are, and others are judged, beside the given masks of all photos.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Fold:
 
 
 def folds_of(names: list[str], labelled: int, judged: int, folds: int) -> list[Fold]:
-    """So many photos of each kind, spread evenly over the names; other ones are judged in each fold. InputError if
-    there are too few.
+    """So many photos of each kind, spread evenly over the names; other ones are judged in each fold.
+    InputError if there are too few.
     """
     if labelled + judged > len(names):
         raise InputError(

@@ -153,8 +153,9 @@ class BenchmarkQuestions:
 
 @dataclass(frozen=True)
 class BenchmarkFewLabels:
-    """Measure what a few photos labelled by hand are worth (their truth masks are the only masks), on other photos,
-    beside the given masks of all photos; of scenes with sparse/0, cloud.ply, mesh.ply and truth masks.
+    """Measure what a few photos labelled by hand are worth (their truth masks are the only masks), on other
+    photos, beside the given masks of all photos; of scenes with sparse/0, cloud.ply, mesh.ply and truth
+    masks.
     """
 
     scenes: Annotated[Positional[tuple[Path, ...]], arg(help="Scene folders.")]
