@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from sc3d.errors import left_out
+from sc3d.exporters.mask_edges import follow_edges
 from sc3d.geometry.cameras import View
 from sc3d.io.atomic import atomic_path
 from sc3d.io.images import read_orientation, write_image
@@ -47,11 +48,20 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
             mask, confidence = render_mask(
                 seen.surface, labels.confidence, view, settings.max_size, labels.of_no_class
             )
-            orientation = read_orientation(scene.photo(view.name))
+            photo = scene.photo(view.name)
+            if settings.follow_edges and photo.exists():
+                mask, confidence = cleaned(mask, confidence, scene.read_photo(view.name))
+            orientation = read_orientation(photo)
             write_image(scene.photo_names.path(mask_folder, view.name), mask, orientation)
             write_image(scene.photo_names.path(confidence_folder, view.name), confidence, orientation)
             covered.append(float((mask > 0).mean()))
     write_image(sheet, _comparison(scene, views))
+    if settings.follow_edges and (
+        gone := [view.name for view in views if not scene.photo(view.name).exists()]
+    ):
+        logger.warning(
+            left_out(gone, len(views), "photos are not there; their masks keep the surface's edges")
+        )
     empty = [view.name for view, share in zip(views, covered, strict=True) if not share]
     if empty:
         logger.warning(left_out(empty, len(views), "photos see no label; their masks are empty"))
@@ -82,6 +92,18 @@ def _comparison(scene: Scene, views: list[View]) -> np.ndarray:
     return np.concatenate(
         [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
     )
+
+
+def cleaned(mask: np.ndarray, confidence: np.ndarray, photo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What `render_mask` gives, with the edges of the photo (see `mask_edges`). Where that changes a label, the
+    confidence is how clear the new one is. photo: (H', W', 3) uint8 RGB
+    """
+    colors = cv2.resize(photo, mask.shape[::-1], interpolation=cv2.INTER_AREA)
+    # what is known to be of none of the classes, and what nobody knows, are labels of their own
+    given = np.where(mask > 0, mask.astype(np.int16), np.where(confidence > 0, 0, -1))
+    found, clear = follow_edges(given, colors)
+    sure = np.where(found == given, confidence, np.clip(np.rint(255 * clear), 1, 255)).astype(np.uint8)
+    return found.clip(0).astype(np.uint8), np.where(found < 0, 0, sure).astype(np.uint8)
 
 
 def mask_size(view: View, max_size: int) -> tuple[int, int]:

@@ -61,6 +61,10 @@ class Export(Memory):
     """
     max_size: int = 0
     """Longest side of the masks, px; 0 = as the photo (masks)."""
+    follow_edges: bool = True
+    """Let the borders of masks follow the edges of the photos (guided filter), as surfaces are ragged there
+    (masks).
+    """
     epsg: int = 0
     """EPSG code of a projected CRS for the coordinates (laz, copc, clouds, maps, objects, csv); 0 = that of the
     scene. Without a georeference it says which CRS the scene's coordinates are in.
