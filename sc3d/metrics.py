@@ -177,7 +177,7 @@ class EvaluationPixels:
         return np.where(self.rows >= 0, values[self.rows], values.dtype.type(0))
 
     def confusions(self, predicted: np.ndarray, num_ids: int) -> tuple[Confusion, Confusion]:
-        """Confusion of (P,) uint8 predictions inside and outside the band; their sum is that of all pixels."""
+        """Confusion of (P,) uint8 predictions inside and outside the band; the sum is that of all pixels."""
         flat = (self.band.astype(np.int64) * num_ids + _rows(self.truth, num_ids)) * num_ids + predicted
         inside, outside = np.bincount(flat, minlength=2 * num_ids**2).reshape(2, num_ids, num_ids)[::-1]
         return Confusion(inside), Confusion(outside)
@@ -268,8 +268,8 @@ class SeenCloud(Protocol):
     """What photos see of a labelled cloud: `LabelledSurface`, or by tiles `TiledSurface`."""
 
     def rows(self, view: View, size: tuple[int, int], wanted: np.ndarray) -> tuple[np.ndarray, FirstSurface]:
-        """(H, W) int row of the cloud at each wanted pixel (H, W) bool, -1 = nothing; the first surface. size: (width,
-        height).
+        """(H, W) int row of the cloud at each wanted pixel (H, W) bool, -1 = nothing; the first surface.
+        size: (width, height).
         """
 
 
@@ -277,7 +277,8 @@ class SeenCloud(Protocol):
 class EvaluationSummary:
     """totals: figures by source (SOURCES); calibration_error: expected error of the confidence, on pixels of
     classes and on all judged ones, None = no photo
-    empty: of the truth's pixels of classes without surface, by class, how many there are and how many hit nothing
+    empty: of the truth's pixels of classes without surface, by class, how many there are and how many hit
+    nothing
     objects: panoptic quality, where the truth tells objects apart
     """
 
@@ -337,8 +338,8 @@ def _listed(shares: dict[str, float]) -> str:
 
 
 def evaluate_scene(scene: Scene, settings: Evaluate) -> EvaluationSummary:
-    """Judge the labelled cloud of a scene (or `settings.labelled`) by its truth masks and write the figures. By tiles,
-    with the same signature: `tiling.evaluate`.
+    """Judge the labelled cloud of a scene (or `settings.labelled`) by its truth masks and write the
+    figures. By tiles, with the same signature: `tiling.evaluate`.
     """
     path = settings.labelled or scene.labelled
     cloud, labels = read_labelled(path, "propagate")
@@ -368,7 +369,8 @@ def judge_objects(
     path, table = scene.truth_cloud, scene.class_table()
     if instance is None:
         logger.warning(
-            "the labelled cloud tells no objects apart, so that they are not judged: run `sc3d propagate` again"
+            "the labelled cloud tells no objects apart, so that they are not judged: run `sc3d propagate`"
+            " again"
         )
         return None
     truth = read_cloud(path)
@@ -376,8 +378,8 @@ def judge_objects(
     near = distances[:, 0] <= reach
     if near.mean() < LEAST_NEAR:
         logger.warning(
-            "objects are not judged: %.0f%% of the points of %s have a labelled point nearby: it is in another frame,"
-            " or of another place",
+            "objects are not judged: %.0f%% of the points of %s have a labelled point nearby: it is in another"
+            " frame, or of another place",
             100 * near.mean(),
             path,
         )

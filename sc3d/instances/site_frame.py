@@ -43,8 +43,8 @@ class SiteFrame:
         """One line, where nothing says how long a meter is."""
         if not self.measured:
             logger.warning(
-                "%s has no georeference: its objects are told apart as if 1 unit were 1 m; if it is not, give it a "
-                "place with `sc3d georeference`",
+                "%s has no georeference: its objects are told apart as if 1 unit were 1 m; if it is not, give it "
+                "a place with `sc3d georeference`",
                 scene.path,
             )
 

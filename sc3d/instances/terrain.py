@@ -22,8 +22,8 @@ def require_ground(table: ClassTable) -> list[int]:
     ids = table.ground_classes
     if not ids:
         raise InputError(
-            "no class is ground by its ASPRS code (2 ground, 3 low vegetation beside trees, 9 water, 10 rail, "
-            '11 road): add "asprs" to the classes in classes.json'
+            "no class is ground by its ASPRS code (2 ground, 3 low vegetation beside trees, 9 water, "
+            '10 rail, 11 road): add "asprs" to the classes in classes.json'
         )
     return ids
 

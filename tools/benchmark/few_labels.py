@@ -43,7 +43,8 @@ def folds_of(names: list[str], labelled: int, judged: int, folds: int) -> list[F
     """
     if labelled + judged > len(names):
         raise InputError(
-            f"{len(names)} photos have truth, too few for {labelled} to label and {judged} to judge: ask for less"
+            f"{len(names)} photos have truth, too few for {labelled} to label and {judged} to judge:"
+            " ask for less"
         )
     result = []
     for fold in range(folds):
