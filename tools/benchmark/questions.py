@@ -17,7 +17,7 @@ from sc3d.georeferencing.up_direction import scene_up
 from sc3d.io.clouds import read_cloud
 from sc3d.io.provenance import versions
 from sc3d.propagation.labelled_points import LabelledPoints
-from sc3d.propagation.propagate import neighbor_graph, propagate, seeds_in_channels
+from sc3d.propagation.propagate import levels_of, neighbor_graph, propagate, seeds_in_channels
 from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import read_labelled, read_votes, spacing_of
 from sc3d.scene.labels import CORRECTED, Labels
@@ -60,7 +60,8 @@ class Site:
             raise InputError(f"{scene.path}: copy truth.ply to cloud.ply and run `sc3d label` first")
         seeds = seeds_in_channels(seeds, votes.channels, scene.seeds)
         colors, none = cloud.point.colors.numpy(), votes.channels.none
-        points = LabelledPoints(positions, seeds, votes.values, colors, scene_up(scene), none)
+        levels = levels_of(scene, votes.channels)
+        points = LabelledPoints(positions, seeds, votes.values, colors, scene_up(scene), none, levels=levels)
         normals, truth = cloud.point.normals.numpy(), exact.point["label"].numpy().ravel()
         graph = neighbor_graph(points, normals, Propagate())
         return cls(truth, points, normals, votes.channels, graph, spacing_of(positions))
