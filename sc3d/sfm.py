@@ -23,7 +23,7 @@ from sc3d.io.colmap import registered_images, write_model
 from sc3d.io.limits import FARTHEST
 from sc3d.io.progress import Progress, polled
 from sc3d.io.readable_photos import readable_photos, transparent_photos
-from sc3d.settings.reconstruction import Mapping, Matching
+from sc3d.settings.reconstruction import Mapper, Mapping, Matching
 
 logger = logging.getLogger(__name__)
 
@@ -31,6 +31,8 @@ MODEL = "model"  # folder of the largest model in that of the work; in it the ot
 # in the database: of a keypoint with its descriptor, of the matches of two photos
 FEATURE_BYTES, PAIR_BYTES = 160, 20_000
 MATCH_ALL = 100  # photos up to which auto matches every pair
+FEW = 100  # photos up to which auto maps one after the other
+MIN_MODEL = 10  # photos of a model beside another one
 IN_ORDER, ALIKE = 10, 30  # partners of each photo by name and by look
 # photos that each is matched with
 PARTNERS: dict[Matching, int] = {"sequential": 10, "spatial": 50, "vocabulary": IN_ORDER + ALIKE}
@@ -51,7 +53,11 @@ def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) 
             f"unknown camera model {settings.camera_model!r}: one of {', '.join(list(pycolmap.CameraModelId.__members__)[1:])}"
         )
     flight = read_flight(images, names) if settings.gps else None
-    settings = replace(settings, matching=choose_matching(settings.matching, names, flight))
+    settings = replace(
+        settings,
+        matching=choose_matching(settings.matching, names, flight),
+        mapper=choose_mapper(settings.mapper, len(names)),
+    )
     if settings.matching == "spatial":
         _check_spatial(names, flight)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -171,6 +177,13 @@ def choose_matching(matching: Matching, names: list[str], flight: Flight | None)
     return "vocabulary" if _without_place(names, flight) else "spatial"
 
 
+def choose_mapper(mapper: Mapper, num_photos: int) -> Mapper:
+    """What auto stands for with so many photos; anything else as it is."""
+    if mapper != "auto":
+        return mapper
+    return "incremental" if num_photos <= FEW else "global"
+
+
 def _without_place(names: list[str], flight: Flight | None) -> list[str]:
     """Photos without GPS that can be used; all without a flight."""
     return [name for name in names if not flight or name not in flight.tags or name in flight.astray]
@@ -287,17 +300,44 @@ def _map(
     has_gps: bool,
     step: Callable[[], object],
 ) -> list[list[str]]:
+    if settings.mapper == "global":
+        models = _map_at_once(database, images, work, settings, num_photos)
+    else:
+        models = _map_in_turn(database, images, work, settings, num_photos, has_gps, step)
+    ordered = sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    for number, model in enumerate(ordered, start=1):
+        write_model(work / MODEL / (str(number) if number > 1 else ""), model)
+    return [[image.name for image in registered_images(model)] for model in ordered]
+
+
+def _map_at_once(
+    database: Path, images: Path, work: Path, settings: Mapping, num_photos: int
+) -> dict[int, pycolmap.Reconstruction]:
+    """Rotations of all photos, then all positions, then all together (GLOMAP: Pan et al., ECCV 2024)."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = settings.seed
+    options.min_model_size = min(MIN_MODEL, num_photos)
+    options.mapper.global_positioning.use_gpu = options.mapper.bundle_adjustment.ceres.use_gpu = False
+    return pycolmap.global_mapping(database, images, work, options)
+
+
+def _map_in_turn(
+    database: Path,
+    images: Path,
+    work: Path,
+    settings: Mapping,
+    num_photos: int,
+    has_gps: bool,
+    step: Callable[[], object],
+) -> dict[int, pycolmap.Reconstruction]:
+    """Photo after photo, near their GPS; step: called after each."""
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = settings.seed
     options.num_threads = 1  # with more, sums of larger scenes are rounded otherwise in each run
     options.use_prior_position = has_gps
     options.use_robust_loss_on_prior_position = has_gps
-    options.min_model_size = min(10, num_photos)
-    models = pycolmap.incremental_mapping(database, images, work, options, next_image_callback=step)
-    ordered = sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-    for number, model in enumerate(ordered, start=1):
-        write_model(work / MODEL / (str(number) if number > 1 else ""), model)
-    return [[image.name for image in registered_images(model)] for model in ordered]
+    options.min_model_size = min(MIN_MODEL, num_photos)
+    return pycolmap.incremental_mapping(database, images, work, options, next_image_callback=step)
 
 
 def _reasons(database: Path, names: list[str], parts: list[list[str]]) -> dict[str, str]:

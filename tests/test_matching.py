@@ -17,7 +17,7 @@ from sc3d.runner import execute
 from sc3d.scene.scene import Scene
 from sc3d.settings.outputs import Run
 from sc3d.settings.reconstruction import Mapping, Reconstruct
-from sc3d.sfm import MATCH_ALL, choose_matching, map_photos, num_pairs
+from sc3d.sfm import FEW, MATCH_ALL, choose_mapper, choose_matching, map_photos, num_pairs
 from sc3d.stages import map_photos as map_photos_stage
 from sc3d.stages import reconstruct
 from sc3d.stages.reconstruct import prepare, steps
@@ -45,6 +45,11 @@ def test_auto_matches_all_of_few_photos_and_neighbors_of_many():
     assert choose_matching("exhaustive", names(many), None) == "exhaustive"
     assert num_pairs(few, "auto") == num_pairs(few, "exhaustive")
     assert num_pairs(many, "auto") == num_pairs(many, "spatial")
+
+
+def test_auto_maps_few_photos_in_turn_and_many_at_once():
+    assert [choose_mapper("auto", count) for count in (2, FEW, FEW + 1)] == ["incremental"] * 2 + ["global"]
+    assert choose_mapper("incremental", FEW + 1) == "incremental" and choose_mapper("global", 2) == "global"
 
 
 @pytest.fixture
@@ -120,7 +125,7 @@ def test_spatial_without_gps_is_refused_and_says_what_to_take(photos, tmp_path):
 def test_work_is_known_by_what_auto_stands_for(photos, tmp_path, monkeypatch, caplog):
     scene = Scene(tmp_path / "scene")
     settings = prepare(photos, scene, Reconstruct())
-    assert settings == replace(Reconstruct(), matching="exhaustive")
+    assert settings == replace(Reconstruct(), matching="exhaustive", mapper="incremental")
     assert {step.matching for _, step in steps(settings)} == {"exhaustive"}
     stages = dict(
         list_stages(Run(photos, scene.path, reconstruct=settings), scene, Run(photos, scene.path).segment)

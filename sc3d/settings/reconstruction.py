@@ -12,6 +12,7 @@ from sc3d.errors import InputError
 from sc3d.settings.common import DepthMode, Memory, Workers
 
 Matching = Literal["auto", "exhaustive", "sequential", "spatial", "vocabulary"]
+Mapper = Literal["auto", "incremental", "global"]
 Fill = Literal["nothing", "continued", "occluders"]
 
 
@@ -31,6 +32,10 @@ class Mapping:
     """Longest photo side for feature extraction, px."""
     max_features: int = 8192
     """SIFT features per photo."""
+    mapper: Mapper = "incremental"
+    """How cameras are found. incremental: photo after photo; global: all at once (GLOMAP), a fraction of the time with
+    hundreds of photos; auto: incremental up to 100 photos, beyond that global.
+    """
     gps: bool = True
     """Use GPS positions (EXIF, or XMP where it says more; RTK accuracies) for scale, orientation and
     position.
@@ -44,6 +49,7 @@ class Reconstruct(Mapping):
     """Photos to cameras and sparse points (pycolmap)."""
 
     matching: Matching = "auto"
+    mapper: Mapper = "auto"
     focal: Literal["auto", "refine", "exif"] = "auto"
     """Estimate the focal length, or keep that of EXIF. auto: estimate, unless all photos look the same way
     from one height (straight down), where focal length and flight height cannot be told apart.

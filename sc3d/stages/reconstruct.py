@@ -35,8 +35,8 @@ from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.runner import MAX_SIDECAR, execute, sidecar, up_to_date
 from sc3d.scene.photo_names import photo_name
 from sc3d.scene.scene import Scene
-from sc3d.settings.reconstruction import Mapping, Matching, Reconstruct, ReconstructCommand
-from sc3d.sfm import MATCH_ALL, choose_matching, num_pairs
+from sc3d.settings.reconstruction import Mapper, Mapping, Matching, Reconstruct, ReconstructCommand
+from sc3d.sfm import MATCH_ALL, choose_mapper, choose_matching, num_pairs
 
 logger = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ def steps(settings: Reconstruct) -> list[tuple[str, Mapping]]:
 
 def prepare(photos: Path, scene: Scene, settings: Reconstruct) -> Reconstruct:
     """Check all photos and control points, then make SCENE/images a link to the folder of photos. Returns the
-    settings with what --matching auto stands for, so that finished work is known as such by what was done.
+    settings with what auto stands for (--matching, --mapper), so that finished work is known as such by what was done.
     """
     files = find_photos(photos)
     sizes = {photo_name(file, photos): check_photo(file) for file in files}
@@ -84,21 +84,28 @@ def prepare(photos: Path, scene: Scene, settings: Reconstruct) -> Reconstruct:
     _check_place(photos, sizes, settings)
     require_writable(scene.path)
     link_photos(photos, scene.images)
-    finished = _finished(scene, settings)
-    return finished or replace(settings, matching=_matching(photos, list(sizes), settings))
+    return _finished(scene, settings) or replace(
+        settings,
+        matching=_matching(photos, list(sizes), settings),
+        mapper=choose_mapper(settings.mapper, len(sizes)),
+    )
 
 
 def _finished(scene: Scene, settings: Reconstruct) -> Reconstruct | None:
-    """The settings with the matching that the scene's cameras were made by, whatever auto would take today; None
-    if they would be made anew with it too.
+    """The settings with the matching and the mapper that the scene's cameras were made by, whatever auto would take
+    today; None if they would be made anew with these too, or nothing is left to auto.
     """
     with suppress(InputError):
         record: Any = read_json(sidecar(scene.mapped), MAX_SIDECAR)
         made = record.get("settings") if isinstance(record, dict) else None
-        used: Any = made.get("matching") if isinstance(made, dict) else None
-        if settings.matching == "auto" and used in get_args(Matching):
-            asked = replace(settings, matching=used)
-            return asked if up_to_date("map_photos", scene, steps(asked)[0][1]) else None
+        asked = settings
+        for name, known in (("matching", get_args(Matching)), ("mapper", get_args(Mapper))):
+            # records from before there was a choice say nothing
+            used = made.get(name, getattr(Mapping, name)) if isinstance(made, dict) else None
+            if getattr(settings, name) == "auto" and used in known:
+                asked = replace(asked, **{name: used})
+        if asked != settings and up_to_date("map_photos", scene, steps(asked)[0][1]):
+            return asked
     return None
 
 

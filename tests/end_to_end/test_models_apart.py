@@ -1,4 +1,4 @@
-"""Photos of two places that do not hang together: none of the models is lost."""
+"""Photos of two places that do not hang together, of which no model is lost; and the mapper of many photos."""
 
 import json
 import logging
@@ -25,7 +25,7 @@ def test_a_second_model_is_kept_and_becomes_a_scene_of_its_own(tmp_path, caplog)
     scene = Scene(tmp_path / "scene")
     with caplog.at_level(logging.WARNING):
         run("reconstruct", photos, scene.path, "--matching", "exhaustive")
-    found = json.loads(sidecar(scene.mapped).read_text())["figures"]
+    found = json.loads(sidecar(scene.mapped).read_text())["summary"]
     assert found["registered"] == 14 and {view.name[:2] for view in scene.model.views} == {"0/"}
     assert found["other_models"] == {str(scene.mapped / "2"): 11}
     assert f"{scene.mapped / '2'} (11 photos)" in caplog.text
@@ -34,3 +34,12 @@ def test_a_second_model_is_kept_and_becomes_a_scene_of_its_own(tmp_path, caplog)
     run("import", scene.mapped / "2", other.path, "--images", photos)
     run("georeference", other.path)
     assert {view.name[:2] for view in other.model.views} == {"1/"} and len(other.model.views) == 11
+
+
+@pytest.mark.slow  # 24 photos are mapped
+def test_all_cameras_at_once_are_where_the_photos_were_taken(tmp_path):
+    site, scene = tmp_path / "site", Scene(tmp_path / "scene")
+    run("synthesize", site, "--views", 24, "--width", 480, "--num-points", 20000)
+    run("reconstruct", site / "images", scene.path, "--mapper", "global")
+    found = json.loads(sidecar(scene.sparse).read_text())["summary"]
+    assert found["registered"] == 24 and found["rms_to_gps_m"] < 0.1
