@@ -24,6 +24,7 @@ from sc3d.propagation.labelled_points import views_to_agree
 from sc3d.propagation.misplaced import Misplaced, count_sides
 from sc3d.propagation.none_evidence import count_votes
 from sc3d.propagation.quantile_sketch import QuantileSketch
+from sc3d.propagation.saved_appearance import add_prior, has_examples
 from sc3d.propagation.terrain import WINDOWS, GroundModel, NormalStatistics
 from sc3d.propagation.trust import Trust
 from sc3d.propagation.vote_evidence import count_disagreement
@@ -67,17 +68,28 @@ def offered_classes(summaries: list[TileSummary]) -> np.ndarray:
 @dataclass(frozen=True)
 class LearnedFromTiles:
     """`LearnedAppearance` without its model, of which each tile has its own part; too_many: (C,) bool as of
-    `appearance.limited`, None = not known yet
+    `appearance.limited`, None = not known yet; prior: in the statistics, of another site, None = of none
     """
 
     statistics: AppearanceStatistics
     trust: Trust
     too_many: np.ndarray | None = None
+    prior: AppearanceStatistics | None = None
 
     @property
     def tells_apart(self) -> bool:
         """Whether there are examples of two looks."""
         return tells_apart(self.statistics, self.trust)
+
+    @property
+    def offers(self) -> np.ndarray:
+        """As `AppearanceModel.offers`."""
+        return has_examples(self.prior) if self.prior is not None else np.zeros(len(self.trust.look), bool)
+
+    def relearned(self, parts: list[AppearanceStatistics]) -> LearnedFromTiles:
+        """What other examples teach, of which the tiles give these parts."""
+        own = sum_statistics(parts)
+        return replace(self, statistics=own if self.prior is None else add_prior(self.prior, own))
 
     def of(self, model: AppearanceModel) -> LearnedAppearance:
         return LearnedAppearance(model, self.statistics, self.trust)
@@ -89,19 +101,7 @@ def learn_from_tiles(
     """The job without misplaced votes, its classes with seeds (C,) bool, and what the agreed points of all tiles
     teach, if that tells classes apart on points held out.
     """
-    tiles = job.store.tiles
-    lean = NormalStatistics.merge([summary.lean for summary in summaries])
-    terrain = GroundModel.from_statistics(lean, job.extent.low, job.extent.high, job.up)
-    for window, ground in zip(
-        WINDOWS,
-        terrain.grounds(executor.run("ground", partial(_lowest_task, job, terrain), tiles)),
-        strict=True,
-    ):
-        np.save(job.shared / f"ground{window}.npy", ground)
-    counts = [
-        QuantileSketch.merge(list(parts))
-        for parts in zip(*executor.run("relief", partial(_relief_task, job, terrain), tiles), strict=True)
-    ]
+    tiles, counts = job.store.tiles, measure_relief(job, executor, terrain_of_tiles(job, summaries))
     halves, least = _examples(job, executor, summaries, counts)
     if job.levels is not None:
         job = replace(job, misplaced=_misplaced(job, executor, halves, least, job.levels))
@@ -112,6 +112,24 @@ def learn_from_tiles(
     trust = trust_of(halves, contrasts, np.sum([summary.disagreement for summary in summaries], axis=0))
     learned = None if trust is None else LearnedFromTiles(sum_statistics(halves), trust)
     return job, offered_classes(summaries), learned
+
+
+def terrain_of_tiles(
+    job: PropagateJob, summaries: list[TileSummary], cell: float | None = None
+) -> GroundModel:
+    """As `terrain.terrain_of` the whole cloud."""
+    lean = NormalStatistics.merge([summary.lean for summary in summaries])
+    return GroundModel.from_statistics(lean, job.extent.low, job.extent.high, job.up, cell)
+
+
+def measure_relief(job: PropagateJob, executor: Executor, terrain: GroundModel) -> list[QuantileSketch]:
+    """`appearance.feature_counts` of the whole cloud; leaves an array `relief` of every tile."""
+    tiles = job.store.tiles
+    grounds = terrain.grounds(executor.run("ground", partial(_lowest_task, job, terrain), tiles))
+    for window, ground in zip(WINDOWS, grounds, strict=True):
+        np.save(job.shared / f"ground{window}.npy", ground)
+    parts = executor.run("relief", partial(_relief_task, job, terrain), tiles)
+    return [QuantileSketch.merge(list(feature)) for feature in zip(*parts, strict=True)]
 
 
 def _examples(

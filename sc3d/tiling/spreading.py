@@ -15,7 +15,6 @@ from sc3d.propagation.appearance import (
     limited,
     overruled,
     plausible_seeds,
-    sum_statistics,
 )
 from sc3d.propagation.potts import appearance_marginals, decided, sure_examples, vote_marginals
 from sc3d.propagation.propagate import fill_from_nearest, spread, with_states
@@ -36,7 +35,7 @@ def run_rounds(
                 break
             last = f"attempt{attempt}_round{turn}"
             parts = executor.run(f"round {turn + 1}", partial(_turn_task, job, offered, taught, last), tiles)
-            taught = replace(taught, statistics=sum_statistics([statistics for statistics, _ in parts]))
+            taught = taught.relearned([statistics for statistics, _ in parts])
             counts = np.sum([counts for _, counts in parts], axis=0)
         if not (too_many := overruled(counts, learned.trust)).any():
             return last
