@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.errors import InputError
-from sc3d.geometry.cameras import local_origin
+from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex, point_spacing
 from sc3d.geometry.voxels import BLOCK, VOXELS, file_header, sort_by_voxel, unpack_blocks, voxel_origin
 from sc3d.io.chunked_clouds import CloudFile, columns, positions, rows_at_once
@@ -30,6 +30,7 @@ from sc3d.labelling.inputs import (
 )
 from sc3d.labelling.label import LabelSummary, summarize
 from sc3d.labelling.normal_sides import Sides, judge_sides, sample_step, with_sides
+from sc3d.labelling.prior_cloud import PriorVotes
 from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import (
     INSTANCE,
@@ -37,23 +38,24 @@ from sc3d.scene.labelled_cloud import (
     SPACING_SAMPLE,
     VOTES,
     unit_normals,
-    usable_normals,
 )
 from sc3d.scene.labels import STATE_NAMES, Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
 from sc3d.tiling.executor import Executor, open_executor
 from sc3d.tiling.first_surfaces import RangeJob, RangeMaps, compute_ranges, split_mesh, split_surfels
+from sc3d.tiling.given_normals import NORMALS, has_usable_normals
 from sc3d.tiling.label_grid_file import write_field
 from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, num_points
+from sc3d.tiling.prior_votes import hear_prior
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
 from sc3d.tiling.work_folder import WorkFolder
 
 logger = logging.getLogger(__name__)
 
-NORMALS = ("nx", "ny", "nz")
 LEAST_BYTES = 420  # of a point while its tile votes
 BYTES, VOTE_BYTES = 180, 40  # the same without its votes, and of each channel of these
+PRIOR_BYTES = 150  # of a point of --prior, beside which the cloud is in memory
 VOXEL = 2.2  # of a label voxel, in point spacings, while neither is known exactly
 SAMPLE_MARGIN = 20.0  # around a tile whose spacing is measured, point spacings
 # margin of a tile: the rest of a block that its border cuts, and the block beyond, which verification looks
@@ -88,7 +90,8 @@ def label_fits(scene: Scene, settings: Label) -> bool:
     if count is None or not source.exists():
         return True  # cannot be read in parts
     needed = count * bytes_per_point(scene) + num_triangles(scene.surface) * TRIANGLE
-    return fits(needed, settings)
+    classified = num_points(settings.prior) if settings.prior is not None else None
+    return fits(needed + (classified or 0) * PRIOR_BYTES, settings)
 
 
 def bytes_per_point(scene: Scene) -> int:
@@ -98,7 +101,7 @@ def bytes_per_point(scene: Scene) -> int:
     return max(LEAST_BYTES, BYTES + VOTE_BYTES * scene.class_table().channels.count)
 
 
-def label_scene(scene: Scene, settings: Label) -> LabelSummary:
+def label_scene(scene: Scene, settings: Label, prior_name: Path | None = None) -> LabelSummary:
     """As `labelling.label.label_scene`, tile by tile, here or on the workers that the settings ask for."""
     settings = settings.resolved
     if settings.surface == "voxels" and settings.depth_filter:
@@ -107,7 +110,7 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         )
     cloud = CloudFile.open(settings.cloud or scene.cloud)
     confidence = best_confidence(scene) if settings.use_confidence else None
-    masks, output = Masks.load(scene, confidence, settings.unlabelled), settings.output or scene.seeds
+    masks, output = _masks(scene, confidence, settings), settings.output or scene.seeds
     decisive: list[Input] = [
         scene.sparse,
         scene.classes,
@@ -116,6 +119,7 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         *scene.surface,
         cloud.path,
         PhotoFrames(scene.images),
+        *([settings.prior] if settings.prior else []),
     ]
     folder = WorkFolder(output, "label", decisive, settings)
     statistics = CloudStatistics.from_cloud(cloud)
@@ -128,12 +132,15 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     spacing, sample = sample_spacing(store, statistics)
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=voxel_size_for(spacing, sample, masks))
-    sides = _judge_sides(cloud, masks)
+    sides = _judge_sides(cloud, masks.views or scene.model.views)
+    results = Results(folder.subfolder("results"), store)
     with open_executor(settings) as executor:
         maps = None
-        if settings.depth_filter:
+        if settings.depth_filter and masks.views:
             maps = _ranges(scene, masks, store, spacing, settings, folder, executor)
-        results = Results(folder.subfolder("results"), store)
+        name = prior_name or settings.prior
+        if name is not None:
+            hear_prior(settings, name, box, results, folder.subfolder("prior"), executor, masks)
         job = LabelJob(scene.path, settings, statistics.extent, store, results, maps, confidence, sides)
         executor.run("voting", partial(label_tile, job), store.tiles)
     header = file_header(settings.voxel_size, masks.channels.ids)
@@ -171,24 +178,17 @@ def _ranges(
     )
 
 
-def _judge_sides(cloud: CloudFile, masks: Masks) -> Sides:
+def _masks(scene: Scene, confidence: Path | None, settings: Label) -> Masks:
+    return Masks.load(scene, confidence, settings.unlabelled, needed=settings.prior is None)
+
+
+def _judge_sides(cloud: CloudFile, views: list[View]) -> Sides:
     """What to do with the cloud's own normals, by the points that `labelling.label` looks at."""
-    if not set(NORMALS) <= set(cloud.names):
+    if not has_usable_normals(cloud):
         return Sides.ESTIMATE
-    step, found, unusable = sample_step(cloud.num_points), [], 0
-    for start, records in cloud.chunks():
-        unusable += int((~usable_normals(_normals(records))).sum())
-        found.append(records[-start % step :: step])
-    if unusable:
-        logger.warning(
-            "%s: %d of %d normals have no length or are not finite: all are estimated",
-            cloud.path,
-            unusable,
-            cloud.num_points,
-        )
-        return Sides.ESTIMATE
-    sample = np.concatenate(found)
-    return judge_sides(positions(sample), _normals(sample), masks.views, cloud.path)
+    step = sample_step(cloud.num_points)
+    sample = np.concatenate([records[-start % step :: step] for start, records in cloud.chunks()])
+    return judge_sides(positions(sample), _normals(sample), views, cloud.path)
 
 
 def _normals(records: np.ndarray) -> np.ndarray:
@@ -229,20 +229,24 @@ def label_tile(job: LabelJob, tile: int) -> None:
     scene, store = Scene(job.scene), job.store
     halo = store.with_halo(tile, job.margin)
     records = halo.gather(store.records)
-    points, masks = positions(records), Masks.load(scene, job.confidence, job.settings.unlabelled)
+    points, masks = positions(records), _masks(scene, job.confidence, job.settings)
+    views = masks.views or scene.model.views
     normals = unit_normals(
         None if job.sides is Sides.ESTIMATE else columns(records, NORMALS),
         points,
-        np.array([view.center for view in masks.views]),
+        np.array([view.center for view in views]),
         job.extent.low,
     )
-    turned = with_sides(points, normals, masks.views, job.sides)
+    turned = with_sides(points, normals, views, job.sides)
     num_turned = (turned != normals)[halo.core].any(axis=1).sum()
     normals = turned
     origin = voxel_origin(job.extent.low, job.settings.voxel_size)
     density = None
     if job.settings.mechanisms.density:
         density = point_density(scene, points, job.settings.voxel_size, origin)
+    prior = None
+    if job.settings.prior is not None:
+        prior = PriorVotes(job.results.around(halo, "prior"), job.settings.prior_weight)
     fusion = fuse(
         Cloud(points, normals, density, job.extent),
         masks.views,
@@ -251,6 +255,7 @@ def label_tile(job: LabelJob, tile: int) -> None:
         masks.channels.count,
         job.settings,
         masks.channels.none,
+        prior,
     )
     core = halo.core
     labels = fusion.labels
