@@ -50,10 +50,10 @@ def read_prior(
     cloud = read_cloud(path)
     ids = classes_of(cloud, table, name)
     positions = cloud.point.positions.numpy().astype(np.float64)[ids > 0]
-    rows, distances = NeighborIndex(positions, positions.min(axis=0)).nearest(points, 1)
-    near = distances[:, 0] <= reach
+    rows, distances = NeighborIndex(positions, positions.min(axis=0)).nearest_first(points)
+    near = distances <= reach
     require_near(float(near.mean()), name, box_of(positions), box_of(points), reach, weight)
-    label = np.where(near, ids[ids > 0][rows[:, 0]], 0).astype(np.uint8)
+    label = np.where(near, ids[ids > 0][rows], 0).astype(np.uint8)
     return PriorVotes(channels.from_ids(label, name), weight)
 
 

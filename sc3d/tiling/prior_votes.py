@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.geometry.neighbors import NeighborIndex
 from sc3d.io.chunked_clouds import CloudFile, positions
 from sc3d.labelling.inputs import Masks
 from sc3d.labelling.prior_cloud import StatedClasses, codes_column, require_near
@@ -19,9 +18,9 @@ from sc3d.scene.channels import Channels
 from sc3d.scene.frame_check import Box
 from sc3d.settings.labels import Label
 from sc3d.tiling.executor import Executor
+from sc3d.tiling.nearest import AT_ONCE, NearestLabels
 from sc3d.tiling.store import Results, TileStore
 
-AT_ONCE = 200_000  # classified points that are searched at a time: bounds memory, not results
 ROUNDING = 1.001  # of the reach: distances are float32
 
 
@@ -90,16 +89,10 @@ def _census(file: CloudFile, column: str) -> tuple[dict[int, int], dict[int, Box
 
 def _hear_task(job: PriorJob, tile: int) -> int:
     """How many points of a tile hear something; leaves the channel that each one hears, 0 = none."""
-    points = positions(job.store.records(tile))
-    label = np.zeros(len(points), np.uint8)
-    best, rows = np.full(len(points), np.inf, np.float32), np.full(len(points), np.iinfo(np.int64).max)
-    for classified, ids, numbers in job.classified(tile):
-        nearest, distance = (
-            values[:, 0] for values in NeighborIndex(classified, job.origin).nearest(points, 1)
-        )
-        nearer = (distance < best) | ((distance == best) & (numbers[nearest] < rows))
-        best, rows = np.where(nearer, distance, best), np.where(nearer, numbers[nearest], rows)
-        label = np.where(nearer, ids[nearest], label)
-    label = np.where(best <= job.reach, label, 0).astype(np.uint8)
+    found = NearestLabels.of_points(positions(job.store.records(tile)), job.origin)
+    for part in job.classified(tile):
+        found.add(*part)
+    near = found.distance <= job.reach
+    label = np.where(near, found.label, 0).astype(np.uint8)
     job.results.write(tile, prior=job.channels.from_ids(label))
-    return int((best <= job.reach).sum())
+    return int(near.sum())
