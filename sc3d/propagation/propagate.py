@@ -40,6 +40,7 @@ from sc3d.scene.scene import Scene
 from sc3d.scene.site_model import ModelPart, read_model
 from sc3d.settings.labels import Propagate
 
+FILLED = 0.5  # confidence of what the nearest label fills
 MAKE_CLOUD = "run `sc3d extract SCENE` first, or `sc3d import` a cloud"
 
 Learner = Callable[[Graph, LabelledPoints], tuple[LabelledPoints, LearnedAppearance | None]]
@@ -102,7 +103,7 @@ def fill_from_nearest(
     if label.all() or not label.any():
         return label, confidence
     filled, share = vote_nearest(points, label.astype(np.uint8), 1)
-    return np.where(label == 0, filled, label), np.where(label == 0, 0.5 * share, confidence)
+    return np.where(label == 0, filled, label), np.where(label == 0, FILLED * share, confidence)
 
 
 def with_states(

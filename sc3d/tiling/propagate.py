@@ -44,6 +44,7 @@ from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
 from sc3d.tiling.connections import reached_groups
 from sc3d.tiling.executor import Executor, open_executor
+from sc3d.tiling.filling import fill_tiles
 from sc3d.tiling.given_normals import NORMALS
 from sc3d.tiling.label import sample_spacing
 from sc3d.tiling.learning import TileSummary, graph_task, learn_from_tiles, offered_classes
@@ -188,6 +189,8 @@ def _solve(job: PropagateJob, executor: Executor, path: Path, given: GivenModel 
         executor.run("labels", partial(once_task, job, offered, learned), tiles)
     # a model labels what no seed reaches, too
     reached = reached_groups(job, executor) if job.settings.method == "map" and given is None else None
+    if job.settings.fill:
+        source, reached = fill_tiles(job, executor, source, reached), None
     executor.run("states", partial(state_task, job, source, reached, learned), tiles)
     return first
 

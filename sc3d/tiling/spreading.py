@@ -17,7 +17,7 @@ from sc3d.propagation.appearance import (
     plausible_seeds,
 )
 from sc3d.propagation.potts import appearance_marginals, decided, sure_examples, vote_marginals
-from sc3d.propagation.propagate import fill_from_nearest, spread, with_states
+from sc3d.propagation.propagate import spread, with_states
 from sc3d.tiling.executor import Executor
 from sc3d.tiling.learning import LearnedFromTiles
 from sc3d.tiling.tile_graph import PropagateJob, TileGraph
@@ -114,8 +114,6 @@ def state_task(
     if reached is not None:
         groups = part.halo.gather(lambda other: reached[other][job.results.read(other, "group", mapped=True)])
         label = np.where(groups[part.graph.order], label, 0)
-    if job.settings.fill:
-        label, confidence = fill_from_nearest(part.known.points, label, confidence)
     final = with_states(part.known.seeds, _start(job, part, learned), (label, confidence), job.settings)
     label = job.channels.to_ids(final.label)
     job.results.write(
