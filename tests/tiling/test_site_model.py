@@ -19,7 +19,7 @@ from tests.propagation.test_appearance import evidence_of, village
 from tests.propagation.test_saved_appearance import CHANNELS, site
 
 FEW, MANY = "2G", "3G"  # --max-memory that stands for tiles of so many points
-ROOM = {FEW: 18_500, MANY: 14_500}
+ROOM = {FEW: 18_500, MANY: 9_000}
 
 
 @pytest.fixture(autouse=True)
@@ -77,7 +77,7 @@ def without_normals(scene: Scene) -> None:
 
 def test_a_model_saved_by_tiles_is_that_of_the_whole(first, model, made):
     table, wanted = first.class_table(), read_model(model, first.class_table(), "appearance")
-    for memory, tiles in ((FEW, 4), (MANY, 16)):
+    for memory, tiles in ((FEW, 4), (MANY, 9)):
         stage.run(first, Propagate(save_model=first.path / "tiles.npz", max_memory=memory))
         assert made[-1] == tiles
         found = read_model(first.path / "tiles.npz", table, "appearance")
