@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex, point_spacing
 from sc3d.geometry.voxels import BLOCK, VOXELS, file_header, sort_by_voxel, unpack_blocks, voxel_origin
-from sc3d.io.chunked_clouds import CloudFile, columns, positions, rows_at_once
+from sc3d.io.chunked_clouds import CloudFile, positions, rows_at_once
 from sc3d.io.ply import num_triangles, write_records
 from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.labelling.cloud import Cloud, CloudExtent
@@ -37,18 +36,25 @@ from sc3d.scene.labelled_cloud import (
     SPACING_NEIGHBORS,
     SPACING_SAMPLE,
     VOTES,
-    unit_normals,
 )
 from sc3d.scene.labels import STATE_NAMES, Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
 from sc3d.tiling.executor import Executor, open_executor
-from sc3d.tiling.first_surfaces import RangeJob, RangeMaps, compute_ranges, split_mesh, split_surfels
-from sc3d.tiling.given_normals import NORMALS, has_usable_normals
+from sc3d.tiling.first_surfaces import (
+    RangeJob,
+    RangeMaps,
+    SurfaceParts,
+    compute_ranges,
+    split_mesh,
+    split_surfels,
+)
+from sc3d.tiling.given_normals import NORMALS, TileNormals, has_usable_normals
 from sc3d.tiling.label_grid_file import write_field
 from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, num_points
 from sc3d.tiling.prior_votes import hear_prior
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
+from sc3d.tiling.voxel_parts import split_voxels
 from sc3d.tiling.work_folder import WorkFolder
 
 logger = logging.getLogger(__name__)
@@ -104,10 +110,6 @@ def bytes_per_point(scene: Scene) -> int:
 def label_scene(scene: Scene, settings: Label, prior_name: Path | None = None) -> LabelSummary:
     """As `labelling.label.label_scene`, tile by tile, here or on the workers that the settings ask for."""
     settings = settings.resolved
-    if settings.surface == "voxels" and settings.depth_filter:
-        raise InputError(
-            "--surface voxels needs the whole cloud in memory: take surfels, or raise --max-memory"
-        )
     cloud = CloudFile.open(settings.cloud or scene.cloud)
     confidence = best_confidence(scene) if settings.use_confidence else None
     masks, output = _masks(scene, confidence, settings), settings.output or scene.seeds
@@ -134,14 +136,14 @@ def label_scene(scene: Scene, settings: Label, prior_name: Path | None = None) -
         settings = replace(settings, voxel_size=voxel_size_for(spacing, sample, masks))
     sides = _judge_sides(cloud, masks.views or scene.model.views)
     results = Results(folder.subfolder("results"), store)
+    job = LabelJob(scene.path, settings, statistics.extent, store, results, None, confidence, sides)
     with open_executor(settings) as executor:
-        maps = None
+        executor.run("normals", partial(normals_of_tile, job), store.tiles)
         if settings.depth_filter and masks.views:
-            maps = _ranges(scene, masks, store, spacing, settings, folder, executor)
+            job = replace(job, maps=_ranges(scene, masks, job, spacing, folder, executor))
         name = prior_name or settings.prior
         if name is not None:
             hear_prior(settings, name, box, results, folder.subfolder("prior"), executor, masks)
-        job = LabelJob(scene.path, settings, statistics.extent, store, results, maps, confidence, sides)
         executor.run("voting", partial(label_tile, job), store.tiles)
     header = file_header(settings.voxel_size, masks.channels.ids)
     write_field(job.results, store.tiles, header, scene.votes_of(settings.output))
@@ -152,28 +154,23 @@ def label_scene(scene: Scene, settings: Label, prior_name: Path | None = None) -
 
 
 def _ranges(
-    scene: Scene,
-    masks: Masks,
-    store: TileStore,
-    spacing: float,
-    settings: Label,
-    parts: WorkFolder,
-    executor: Executor,
+    scene: Scene, masks: Masks, job: LabelJob, spacing: float, parts: WorkFolder, executor: Executor
 ) -> RangeMaps:
-    origin = local_origin(masks.views)
-    if scene.mesh.exists() and settings.surface == "auto":
-        mesh = split_mesh(scene.surface, parts.subfolder("surface"), origin, memory_of(settings))
-    elif {"nx", "ny", "nz"} <= set(store.names):
-        mesh = split_surfels(store, spacing, parts.subfolder("surface"), origin)
+    origin, folder = local_origin(masks.views), parts.subfolder("surface")
+    normals = partial(job.results.around, name="normals")
+    surface: SurfaceParts
+    if scene.mesh.exists() and job.settings.surface == "auto":
+        surface = split_mesh(scene.surface, folder, origin, memory_of(job.settings))
+    elif job.settings.surface == "surfels":
+        surface = split_surfels(job.store, normals, spacing, folder, origin)
     else:
-        raise InputError(
-            "the cloud has neither normals nor a mesh beside it, and does not fit into --max-memory: allow more, or give it normals"
-        )
+        low = job.extent.low
+        surface = split_voxels(job.store, normals, low, spacing, folder, executor, job.settings)
     maps = RangeMaps(
         parts.subfolder("ranges"), {view.name: number for number, view in enumerate(masks.views)}
     )
     return compute_ranges(
-        RangeJob(scene.path, mesh, maps, {view.name: masks.size(view) for view in masks.views}),
+        RangeJob(scene.path, surface, maps, {view.name: masks.size(view) for view in masks.views}),
         executor,
     )
 
@@ -220,6 +217,21 @@ def sample_spacing(store: TileStore, statistics: CloudStatistics) -> tuple[float
     return point_spacing(ordered[0]) or 1.0, ordered[1]
 
 
+def normals_of_tile(job: LabelJob, tile: int) -> None:
+    """Leaves the normals of a tile, turned to the right side, and how many were turned."""
+    if job.results.has(tile, "turned"):
+        return
+    scene, halo = Scene(job.scene), job.store.with_halo(tile, job.margin)
+    views = _masks(scene, job.confidence, job.settings).views or scene.model.views
+    centers = np.array([view.center for view in views])
+    given = TileNormals(job.store, centers, job.extent.low, job.sides is not Sides.ESTIMATE)(halo)
+    points = positions(halo.gather(job.store.records))
+    normals = with_sides(points, given, views, job.sides)[halo.core]
+    turned = (normals != given[halo.core]).any(axis=1).sum()
+    job.results.write(tile, normals=normals)
+    job.results.write(tile, turned=np.array([turned]))
+
+
 def label_tile(job: LabelJob, tile: int) -> None:
     """Fuse the masks on one tile and write its labels, votes and part of the voxel field; a finished tile is
     left alone.
@@ -228,18 +240,8 @@ def label_tile(job: LabelJob, tile: int) -> None:
         return
     scene, store = Scene(job.scene), job.store
     halo = store.with_halo(tile, job.margin)
-    records = halo.gather(store.records)
-    points, masks = positions(records), _masks(scene, job.confidence, job.settings)
-    views = masks.views or scene.model.views
-    normals = unit_normals(
-        None if job.sides is Sides.ESTIMATE else columns(records, NORMALS),
-        points,
-        np.array([view.center for view in views]),
-        job.extent.low,
-    )
-    turned = with_sides(points, normals, views, job.sides)
-    num_turned = (turned != normals)[halo.core].any(axis=1).sum()
-    normals = turned
+    points, masks = positions(halo.gather(store.records)), _masks(scene, job.confidence, job.settings)
+    normals = job.results.around(halo, "normals")
     origin = voxel_origin(job.extent.low, job.settings.voxel_size)
     density = None
     if job.settings.mechanisms.density:
@@ -266,10 +268,9 @@ def label_tile(job: LabelJob, tile: int) -> None:
         state=labels.state[core],
         num_views=labels.num_views[core].astype(np.int32),
         votes=fusion.votes[core],
-        normals=normals[core],
     )
     keys, votes = _blocks(fusion, points, core)
-    job.results.write(tile, turned=np.array([num_turned]), keys=keys, field=votes)
+    job.results.write(tile, keys=keys, field=votes)
 
 
 def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
