@@ -191,6 +191,8 @@ def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np
     """What is known of the window's points, by row, their normals, and how many lie in each correction."""
     records = halo.gather(job.store.records)
     points, colors = positions(records), columns(records, ("red", "green", "blue"))
+    votes: np.ndarray | None
+    normals: np.ndarray | None
     if job.start is not None:
         labels, votes, normals = job.start.know(records, job.extent.low, job.channels)
     else:
