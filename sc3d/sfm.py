@@ -27,7 +27,7 @@ from sc3d.settings.reconstruction import Mapping, Matching
 
 logger = logging.getLogger(__name__)
 
-MODEL = "model"  # folder of the largest model in that of the work
+MODEL = "model"  # folder of the largest model in that of the work; in it the others, from "2" on
 # in the database: of a keypoint with its descriptor, of the matches of two photos
 FEATURE_BYTES, PAIR_BYTES = 160, 20_000
 MATCH_ALL = 100  # photos up to which auto matches every pair
@@ -76,7 +76,20 @@ def map_photos(images: Path, names: list[str], output: Path, settings: Mapping) 
     if reasons:
         unregistered = [f"{name} ({why})" for name, why in reasons.items()]
         logger.warning(left_out(unregistered, len(names), "photos could not be registered"))
-    return {"photos": len(names), "registered": len(parts[0]), "left_out": reasons}
+    others = {str(output / str(number)): len(part) for number, part in enumerate(parts[1:], start=2)}
+    if others:
+        logger.warning(
+            "the photos make %d models that do not hang together; this scene is the largest. Kept: %s. A scene of"
+            " each: `sc3d import MODEL OTHER_SCENE --images PHOTOS`, and `sc3d georeference OTHER_SCENE` to its place",
+            len(parts),
+            ", ".join(f"{model} ({count} photos)" for model, count in others.items()),
+        )
+    return {
+        "photos": len(names),
+        "registered": len(parts[0]),
+        **({"other_models": others} if others else {}),
+        "left_out": reasons,
+    }
 
 
 def begin(seed: int, verbose: bool) -> None:
@@ -254,7 +267,7 @@ def map_database(
     run: Run = run_here,
 ) -> list[list[str]]:
     """Models of what a COLMAP database holds: the photos of each, the largest first, which is written to `work /
-    MODEL`; NoModelError if there is none.
+    MODEL`, the next ones to folders "2", "3" ... in it; NoModelError if there is none.
     """
     with Progress(num_photos, "cameras", "photo") as bar:
         parts = run(_map, database, images, work, settings, num_photos, has_gps, step=bar.update)
@@ -282,8 +295,8 @@ def _map(
     options.min_model_size = min(10, num_photos)
     models = pycolmap.incremental_mapping(database, images, work, options, next_image_callback=step)
     ordered = sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-    if ordered:
-        write_model(work / MODEL, ordered[0])
+    for number, model in enumerate(ordered, start=1):
+        write_model(work / MODEL / (str(number) if number > 1 else ""), model)
     return [[image.name for image in registered_images(model)] for model in ordered]
 
 

@@ -2,10 +2,10 @@
 or pages.
 
 A point is doubtful as far as its label is not sure, and as the views that voted on it name another class.
-Doubts hang together: a place is a region of doubtful points with one label and one rival, the class that
-speaks most against it, and about one color. All of it is likely right or wrong together, so one answer
-settles it, and what it changes is the sum of its doubts. Of classes with few sure examples each answer also
-teaches the look.
+Doubts hang together: a place is a region of doubtful points that are said to be of one class, by their label or,
+without one, by most of their votes, and of about one color, whatever speaks against it. All of it is likely right or
+wrong together, so one answer settles it, and what it changes is the sum of its doubts. Of classes with few sure
+examples each answer also teaches the look.
 """
 
 from __future__ import annotations
@@ -47,8 +47,9 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Place:
-    """A region to ask about. rows: (R,) of the cloud; label, rival: ids, 0 = none; gain: points that an
-    answer likely changes, more for rare classes
+    """A region to ask about. rows: (R,) of the cloud; label: id of most of its points, 0 = none; rival: id of the
+    class that speaks against it at most of them, 0 = none; gain: points that an answer likely changes, more for
+    rare classes
     """
 
     rows: np.ndarray
@@ -83,7 +84,7 @@ def rank_places(known: Evidence, doubt: np.ndarray | None = None) -> list[Place]
     doubt = doubt_of(known) if doubt is None else doubt
     rows = np.flatnonzero(doubt >= DOUBTFUL)
     rival, label = rivals_of(known)[rows], known.label[rows]
-    group = _regions(known, rows, label.astype(np.int64) * 256 + rival)
+    group = _regions(known, rows, np.where(label > 0, label, rival))
     order = np.argsort(group, kind="stable")
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))
     rare = _rarity(known)
@@ -91,15 +92,15 @@ def rank_places(known: Evidence, doubt: np.ndarray | None = None) -> list[Place]
     for part in np.split(order, starts[1:]) if len(rows) else []:
         if len(part) < LEAST:
             continue
-        first = part[0]
-        factor = max(rare[label[first]], rare[rival[first]])
-        gain = float(doubt[rows[part]].sum()) * factor
-        places.append(Place(rows[part], int(label[first]), int(rival[first]), gain))
+        own = int(np.bincount(label[part]).argmax())
+        other = int(np.bincount(np.where(rival[part] == own, label[part], rival[part])).argmax())
+        gain = float(doubt[rows[part]].sum()) * max(rare[own], rare[other])
+        places.append(Place(rows[part], own, other, gain))
     return sorted(places, key=lambda place: (-place.gain, int(place.rows[0])))
 
 
 def _regions(known: Evidence, rows: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """(R,) number of the region of each row: neighbors of one kind and about one color hang together."""
+    """(R,) number of the region of each row: neighbors of one kind (R,) and about one color hang together."""
     if not len(rows):
         return np.zeros(0, np.int64)
     points = known.points[rows]

@@ -57,6 +57,19 @@ def test_places_are_ranked_by_what_an_answer_changes():
     assert places[0].gain > places[1].gain > 0
 
 
+def test_an_object_is_one_place_whatever_speaks_against_its_class():
+    """Part of it has no label, because views disagreed; most votes there name the same class."""
+    evidence = known()
+    x, y = evidence.points[:, 0], evidence.points[:, 1]
+    large = (x >= 5) & (x < 11) & (y >= 5) & (y < 11)
+    votes = evidence.votes.copy()
+    votes[large] = np.where((x >= 9)[large, None], [2, 0], [2, 1.5])
+    label = np.where(large, np.where(x >= 9, 0, ROAD), evidence.label).astype(np.uint8)
+    places = rank_places(replace(evidence, label=label, votes=votes))
+    assert [len(place.rows) for place in places] == [36, 9]
+    assert (places[0].label, places[0].rival) == (ROAD, GRASS)
+
+
 def test_order_of_the_points_changes_nothing():
     evidence, order = known(), np.random.default_rng(0).permutation(1600)
     moved = Evidence(
