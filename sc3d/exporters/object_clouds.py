@@ -78,8 +78,8 @@ def _count(labels: np.ndarray, kept: np.ndarray, counts: dict[int, np.ndarray]) 
 
 
 def _write_parts(scene: Scene, settings: Export, files: dict[int, Path], counts: dict[int, int]) -> None:
-    """The same, part by part: all records go to one file, object by object, and from there to their own. counts:
-    points of each object
+    """The same, part by part: all records go to one file, object by object, and from there to their own.
+    counts: points of each object
     """
     numbers, sizes = np.array(list(files)), np.array([counts[number] for number in files])
     ends = np.cumsum(sizes)
@@ -92,7 +92,8 @@ def _write_parts(scene: Scene, settings: Export, files: dict[int, Path], counts:
 def _sort(
     scene: Scene, settings: Export, file: BinaryIO, numbers: np.ndarray, places: np.ndarray
 ) -> np.dtype:
-    """Write the records of objects `numbers` (K,), rising, one object after the other, each in the order of the cloud;
+    """Write the records of objects `numbers` (K,), rising, one object after the other, each in the order of
+    the cloud;
     places: (K,) its first record.
     """
     classes, places, dtype = sorted(chosen_classes(scene, settings)), places.copy(), np.dtype([])

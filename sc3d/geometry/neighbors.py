@@ -32,8 +32,8 @@ class NeighborIndex:
         self._search.knn_index()
 
     def nearest_first(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The nearest point of each query; of up to TIES equally near ones that of the lowest row, where `nearest`
-        leaves it to the tree.
+        """The nearest point of each query; of up to TIES equally near ones that of the lowest row, where
+        `nearest` leaves it to the tree.
 
         queries: (Q, 3) world
         returns: (Q,) int32 rows; (Q,) float32 distances

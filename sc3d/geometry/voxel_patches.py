@@ -67,8 +67,8 @@ class Patches:
 
 
 def patch_origin(low: np.ndarray, voxel_size: float) -> np.ndarray:
-    """(3,) world zero of the grid of a cloud whose smallest coordinates are `low` (3,): there is room for the voxels
-    around those with points.
+    """(3,) world zero of the grid of a cloud whose smallest coordinates are `low` (3,): there is room for the
+    voxels around those with points.
     """
     return np.asarray(low, np.float64) - (BLOCK + ORIGIN_SHIFT) * voxel_size
 

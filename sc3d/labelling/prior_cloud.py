@@ -58,8 +58,8 @@ def read_prior(
 
 
 def require_near(share: float, name: Path, classified: Box, cloud: Box, reach: float, weight: float) -> None:
-    """Say on which share of a cloud another one votes; InputError if on none. classified, cloud: boxes around the
-    classified points and those of the cloud, world; the rest as in `read_prior`
+    """Say on which share of a cloud another one votes; InputError if on none. classified, cloud: boxes around
+    the classified points and those of the cloud, world; the rest as in `read_prior`
     """
     if not share:
         raise InputError(
@@ -102,8 +102,8 @@ class StatedClasses:
 
     @classmethod
     def from_counts(cls, column: str, counts: dict[int, int], table: ClassTable, name: Path) -> StatedClasses:
-        """By the codes of a whole cloud and how many points have each. One line counts what is of no class of the
-        table; InputError if all is. column: of `codes_column`; name: of the cloud
+        """By the codes of a whole cloud and how many points have each. One line counts what is of no class of
+        the table; InputError if all is. column: of `codes_column`; name: of the cloud
         """
         if column == "label":
             told, known = "class id", {entry.id: entry.id for entry in table if entry.surface}

@@ -230,7 +230,9 @@ def _read_start(
 
 
 def start_of(scene: Scene, settings: Propagate) -> tuple[Path, bool]:
-    """The cloud to start from, and whether nothing is known of its points: that of the scene, which a model labels."""
+    """The cloud to start from, and whether nothing is known of its points: that of the scene, which a model
+    labels.
+    """
     path = settings.seeds or scene.seeds
     bare = settings.model is not None and settings.seeds is None and not path.exists()
     return (scene.cloud if bare else path), bare

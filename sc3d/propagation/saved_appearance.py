@@ -174,7 +174,9 @@ class SavedAppearance:
         return known, LearnedAppearance(model, statistics, trust)
 
     def scale_on(self, spacing: float, meters: float | None) -> Scale:
-        """Of the relief of another scene, in its world units. spacing: of its points; meters: as in `require_unit`"""
+        """Of the relief of another scene, in its world units. spacing: of its points; meters: as in
+        `require_unit`
+        """
         unit = spacing if meters is None else 1 / meters
         return Scale(self.cell * unit, unit)
 
@@ -184,8 +186,8 @@ class SavedAppearance:
             logger.warning("%s knows colors, but the cloud has none: relief alone is used", origin)
 
     def histograms(self, relief: np.ndarray, colors: np.ndarray | None) -> tuple[Histogram, ...]:
-        """Cells of points with the borders of the model, colors first, where it and the points have any. relief:
-        (N, 4) in `scale_on`; colors: (N, 3) uint8 or None
+        """Cells of points with the borders of the model, colors first, where it and the points have any.
+        relief: (N, 4) in `scale_on`; colors: (N, 3) uint8 or None
         """
         groups = [Histogram.from_features(relief, list(self.relief_edges), RELIEF_BLUR)]
         if self.color_edges is not None and colors is not None:
@@ -193,7 +195,9 @@ class SavedAppearance:
         return tuple(groups)
 
     def prior_beside(self, own: AppearanceStatistics, channels: Channels) -> AppearanceStatistics:
-        """What the model teaches a scene of these channels, whose own agreed points teach `own`, of as many groups."""
+        """What the model teaches a scene of these channels, whose own agreed points teach `own`, of as many
+        groups.
+        """
         return _no_heavier(_in_channels(self.statistics[-len(own) :], self.ids, channels), own)
 
 
@@ -230,7 +234,9 @@ def own_scale(terrain: GroundModel, meters: float | None) -> Scale:
 
 
 def sure_points(label: np.ndarray, confidence: np.ndarray, channels: Channels) -> np.ndarray:
-    """(N,) bool points of a finished site that are saved as examples; label: (N,) channels; confidence: (N,)"""
+    """(N,) bool points of a finished site that are saved as examples; label: (N,) channels; confidence:
+    (N,)
+    """
     return (label > 0) & (label < len(channels.ids)) & (confidence >= SURE)
 
 

@@ -1,5 +1,5 @@
-"""Labels for what no edge connects to a seed, by `propagate --fill`: those of the nearest labelled points, in whatever
-tile these are.
+"""Labels for what no edge connects to a seed, by `propagate --fill`: those of the nearest labelled points, in
+whatever tile these are.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def _fill_task(job: PropagateJob, boxes: Boxes, tile: int) -> None:
 
 
 def _nearest_labels(job: PropagateJob, boxes: Boxes, tile: int, points: np.ndarray) -> np.ndarray:
-    """(K,) uint8 labels of the labelled points nearest to points (K, 3) of a tile; of equally near ones, that of the
-    lowest row in the cloud.
+    """(K,) uint8 labels of the labelled points nearest to points (K, 3) of a tile; of equally near ones, that
+    of the lowest row in the cloud.
     """
     found = NearestLabels.of_points(points, job.extent.low)
     low, high = points.min(axis=0), points.max(axis=0)

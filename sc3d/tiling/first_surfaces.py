@@ -213,8 +213,8 @@ class SurfaceParts(Protocol):
 
 
 def write_ranges(parts: SurfaceParts, views: list[View], maps: RangeMaps) -> None:
-    """Ranges of a group of views, sized as they shall be. Memory: the maps of the group, and what of the surface is
-    looked at once.
+    """Ranges of a group of views, sized as they shall be. Memory: the maps of the group, and what of the
+    surface is looked at once.
     """
     views = [view for view in views if not maps.path(view).exists()]
     ranges = parts.first_ranges(views) if views else {}

@@ -21,8 +21,8 @@ logger = logging.getLogger(__name__)
 
 
 def has_usable_normals(cloud: CloudFile) -> bool:
-    """Whether all points have normals with a direction; a line if only some have, as `labelled_cloud.unit_normals`
-    says it of a cloud in memory.
+    """Whether all points have normals with a direction; a line if only some have, as
+    `labelled_cloud.unit_normals` says it of a cloud in memory.
     """
     if not set(NORMALS) <= set(cloud.names):
         return False
@@ -42,9 +42,9 @@ def has_usable_normals(cloud: CloudFile) -> bool:
 
 @dataclass(frozen=True)
 class TileNormals:
-    """`labelled_cloud.unit_normals` of a tile and its margin, of which the outermost points have others where they are
-    estimated. centers: (M, 3) of the cameras; origin: (3,) as in `NeighborIndex`; given: whether to take those of the
-    cloud
+    """`labelled_cloud.unit_normals` of a tile and its margin, of which the outermost points have others where
+    they are estimated. centers: (M, 3) of the cameras; origin: (3,) as in `NeighborIndex`; given: whether to
+    take those of the cloud
     """
 
     store: TileStore

@@ -1,5 +1,5 @@
-"""What the tiles of a cloud teach together of the looks of its classes: sums, minima and sketches over all of them, in
-passes, as `appearance.learn_appearance` has it of a cloud in one piece.
+"""What the tiles of a cloud teach together of the looks of its classes: sums, minima and sketches over all of
+them, in passes, as `appearance.learn_appearance` has it of a cloud in one piece.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from sc3d.tiling.tile_graph import PropagateJob, TileGraph, cells_of, relief_his
 
 @dataclass(frozen=True)
 class TileSummary:
-    """First look at a tile. seeds: (C,) int64 of each class; agreement: as `LabelledPoints.agreement`; lean: of its
-    surfaces; touched: as counts of `Corrections.apply`; found: as `none_evidence.count_votes`; disagreement: as
-    `vote_evidence.count_disagreement`
+    """First look at a tile. seeds: (C,) int64 of each class; agreement: as `LabelledPoints.agreement`; lean:
+    of its surfaces; touched: as counts of `Corrections.apply`; found: as `none_evidence.count_votes`;
+    disagreement: as `vote_evidence.count_disagreement`
     """
 
     seeds: np.ndarray
@@ -98,8 +98,8 @@ class LearnedFromTiles:
 def learn_from_tiles(
     job: PropagateJob, executor: Executor, summaries: list[TileSummary]
 ) -> tuple[PropagateJob, np.ndarray, LearnedFromTiles | None]:
-    """The job without misplaced votes, its classes with seeds (C,) bool, and what the agreed points of all tiles
-    teach, if that tells classes apart on points held out.
+    """The job without misplaced votes, its classes with seeds (C,) bool, and what the agreed points of all
+    tiles teach, if that tells classes apart on points held out.
     """
     tiles, counts = job.store.tiles, measure_relief(job, executor, terrain_of_tiles(job, summaries))
     halves, least = _examples(job, executor, summaries, counts)

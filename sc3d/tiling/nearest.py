@@ -13,8 +13,8 @@ AT_ONCE = 200_000  # points that are searched at a time: bounds memory, not resu
 
 @dataclass
 class NearestLabels:
-    """What the nearest labelled point says to each of N points; of equally near ones that of the lowest row, whatever
-    the order of the parts.
+    """What the nearest labelled point says to each of N points; of equally near ones that of the lowest row,
+    whatever the order of the parts.
 
     origin: (3,) as in `NeighborIndex`; label: (N,) uint8, 0 = nothing yet; distance: (N,) float32 world units
     """

@@ -1,5 +1,5 @@
-"""`labelling.prior_cloud` for clouds in tiles: what another program says of the points, when neither cloud need fit
-into memory.
+"""`labelling.prior_cloud` for clouds in tiles: what another program says of the points, when neither cloud
+need fit into memory.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ ROUNDING = 1.001  # of the reach: distances are float32
 
 @dataclass(frozen=True)
 class PriorJob:
-    """What the task of a tile needs to know. store, results: of the cloud; prior: the classified cloud in the same
-    tiles; column: of its codes; origin: (3,) as in `NeighborIndex`; reach: world units
+    """What the task of a tile needs to know. store, results: of the cloud; prior: the classified cloud in the
+    same tiles; column: of its codes; origin: (3,) as in `NeighborIndex`; reach: world units
     """
 
     store: TileStore
@@ -40,7 +40,9 @@ class PriorJob:
     reach: float
 
     def classified(self, tile: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Positions (K, 3), ids (K,) and rows (K,) of the classified points in a tile and around it, in parts."""
+        """Positions (K, 3), ids (K,) and rows (K,) of the classified points in a tile and around it, in
+        parts.
+        """
         margin = ROUNDING * self.reach
         for other in self.prior.grid.neighbors(tile, margin):
             for start in range(0, self.prior.counts.get(other, 0), AT_ONCE):
@@ -57,8 +59,8 @@ def hear_prior(
 ) -> None:
     """As `prior_cloud.read_prior`; leaves an array `prior` of every tile.
 
-    settings: with the voxel size; name: of the classified cloud, as the user knows it; cloud: box around the cloud of
-        the scene, world; folder: for the classified cloud in tiles
+    settings: with the voxel size; name: of the classified cloud, as the user knows it; cloud: box around the
+        cloud of the scene, world; folder: for the classified cloud in tiles
     """
     if settings.prior is None:
         return

@@ -165,7 +165,9 @@ def _channels_of(cloud: CloudFile) -> Channels:
 
 
 def _solve(job: PropagateJob, executor: Executor, path: Path, given: GivenModel | None) -> list[TileSummary]:
-    """All passes; leaves arrays `label`, `confidence` and `state` of every tile. Returns the first look at them."""
+    """All passes; leaves arrays `label`, `confidence` and `state` of every tile. Returns the first look at
+    them.
+    """
     tiles = job.store.tiles
     summaries = first = executor.run("graph", partial(graph_task, job), tiles)
     job.corrections.warn_of_missing(np.sum([summary.touched for summary in summaries], axis=0), path)

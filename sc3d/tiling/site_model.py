@@ -1,4 +1,6 @@
-"""What another site taught, on a cloud in tiles, and what this one teaches others: `saved_appearance` of all tiles."""
+"""What another site taught, on a cloud in tiles, and what this one teaches others: `saved_appearance` of all
+tiles.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Labels of each tile from what all of them taught: rounds of mean field, or what `geometry` and `knn` carry from
-the seeds, and what the labels mean.
+"""Labels of each tile from what all of them taught: rounds of mean field, or what `geometry` and `knn` carry
+from the seeds, and what the labels mean.
 """
 
 from __future__ import annotations

@@ -41,8 +41,8 @@ KNOWN = ("points", "votes", *(field.name for field in fields(Labels)), "colors")
 
 @dataclass(frozen=True)
 class BareStart:
-    """A cloud without labels and votes, which a model labels. centers: (M, 3) of the cameras; estimated: whether its
-    normals are
+    """A cloud without labels and votes, which a model labels. centers: (M, 3) of the cameras; estimated:
+    whether its normals are
     """
 
     centers: np.ndarray
@@ -55,8 +55,8 @@ class BareStart:
     def know(
         self, records: np.ndarray, origin: np.ndarray, channels: Channels
     ) -> tuple[Labels, np.ndarray, np.ndarray]:
-        """Labels and votes (N, channels) float32, which are empty, and normals (N, 3) float32 of records; origin: (3,)
-        as in `NeighborIndex`.
+        """Labels and votes (N, channels) float32, which are empty, and normals (N, 3) float32 of records;
+        origin: (3,) as in `NeighborIndex`.
         """
         empty, count = np.zeros(len(records), np.uint8), (len(records), channels.count)
         labels = Labels(empty, empty.astype(np.float32), empty + np.uint8(UNSEEN), empty.astype(np.int32))

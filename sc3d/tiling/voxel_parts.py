@@ -1,7 +1,8 @@
-"""First surfaces of a bare cloud that does not fit into memory: the patches of its voxels (`geometry.voxel_patches`),
-made tile by tile, are far fewer than its points, and are held as a whole.
+"""First surfaces of a bare cloud that does not fit into memory: the patches of its voxels
+(`geometry.voxel_patches`), made tile by tile, are far fewer than its points, and are held as a whole.
 
-A patch depends on the voxels around its own only, and on no order: those of the tiles are those of the whole cloud.
+A patch depends on the voxels around its own only, and on no order: those of the tiles are those of the whole
+cloud.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ KEYS, SHAPES = "keys.npy", "shapes.npy"
 
 @dataclass(frozen=True)
 class PatchJob:
-    """What the task of a tile needs to know. low: (3,) of the whole cloud; folder: for the patches of each tile"""
+    """What the task of a tile needs to know. low: (3,) of the whole cloud; folder: for the patches of each
+    tile
+    """
 
     store: TileStore
     normals: NormalsOf
@@ -50,7 +53,9 @@ class PatchJob:
 
 @dataclass(frozen=True)
 class VoxelParts:
-    """Patches of a whole cloud on disk: folder/keys.npy, (V,) int64 rising, and shapes.npy, as in `Patches`."""
+    """Patches of a whole cloud on disk: folder/keys.npy, (V,) int64 rising, and shapes.npy, as in
+    `Patches`.
+    """
 
     folder: Path
     voxel_size: float
@@ -74,7 +79,8 @@ def split_voxels(
 ) -> VoxelParts:
     """The patches of a cloud in tiles. low: (3,) of the cloud, world; spacing: of its points, world units
 
-    Patches that are there already are taken as they are. InputError, with the number, if they do not fit into memory.
+    Patches that are there already are taken as they are. InputError, with the number, if they do not fit into
+    memory.
     """
     voxel_size = SURFACE_VOXEL * spacing
     parts = VoxelParts(folder, voxel_size, patch_origin(low, voxel_size))

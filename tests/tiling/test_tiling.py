@@ -27,7 +27,7 @@ from sc3d.io.images import read_image
 from sc3d.io.ply import write_records
 from sc3d.report.tally import tally, tally_by_parts
 from sc3d.scene.cloud_parts import read_thinned
-from sc3d.scene.labelled_cloud import spacing_of
+from sc3d.scene.labelled_cloud import spacing_of, unit_normals
 from sc3d.scene.scene import Scene
 from sc3d.settings.common import Memory
 from sc3d.settings.labels import Evaluate, Label, PaperMechanisms, Propagate
@@ -155,7 +155,8 @@ def test_patches_of_the_tiles_are_those_of_the_whole(site, tmp_path, monkeypatch
     """Of all voxels, also of gaps that lie in tiles without points."""
     cloud = CloudFile.open(site / "cloud.ply")
     read, statistics = read_cloud(site / "cloud.ply").point, CloudStatistics.from_cloud(cloud)
-    points, normals = read.positions.numpy(), read.normals.numpy().astype(np.float32)
+    points, low = read.positions.numpy(), statistics.extent.low
+    normals = unit_normals(read.normals.numpy(), points, np.zeros((1, 3)), low)
     size = 2.5 * spacing_of(points)
     whole, tables = surface_patches(points, normals, size), []
     for room in (TILES, 4_000):
@@ -163,8 +164,8 @@ def test_patches_of_the_tiles_are_those_of_the_whole(site, tmp_path, monkeypatch
         store = TileStore.build(cloud, statistics.grid(room), folder / "tiles")
         assert len(store.tiles) >= 4
         (folder / "patches").mkdir()
-        own = TileNormals(store, np.zeros((1, 3)), statistics.extent.low, True)
-        arguments = (statistics.extent.low, spacing_of(points), folder / "patches", SerialExecutor())
+        own = TileNormals(store, np.zeros((1, 3)), low, True)
+        arguments = (low, spacing_of(points), folder / "patches", SerialExecutor())
         parts = split_voxels(store, own, *arguments, Memory())
         np.testing.assert_array_equal(parts.origin, whole.grid.origin)
         tables.append([np.load(parts.folder / name) for name in ("keys.npy", "shapes.npy")])
