@@ -86,7 +86,6 @@ def write(scene: Scene, settings: Export) -> dict[str, object]:
     (`*_local.geojson` without a CRS), and buildings and trees as `objects.gpkg` where pyogrio is installed.
     """
     require_whole(scene, settings, BYTES)
-    require_whole(scene, settings, BYTES)
     projected = read_projected_cloud(scene, settings)
     views = scene.model.views if scene.sparse.is_dir() else []
     layers, everything = find_objects(projected, scene.class_table(), settings, views)

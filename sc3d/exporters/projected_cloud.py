@@ -197,7 +197,8 @@ def require_whole(scene: Scene, settings: Export, bytes_per_point: int, surface:
         count * bytes_per_point + surface,
         settings,
         f"{' and '.join(settings.format)} of {count / 1e6:.1f} million points",
-        "allow more, or export laz, copc, 3dtiles, clouds, masks, dtm, dsm, ndsm or contours, which are written part by part",
+        "allow more, or export laz, copc, 3dtiles, clouds, object-clouds, masks, dtm, dsm, ndsm or contours, which are"
+        " written part by part",
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import open3d as o3d
 
 QUERIES_AT_ONCE = 500_000  # queries per batch: bounds memory, not results
+TIES = 8  # equally near points of which the first is found
 
 
 class NeighborIndex:
@@ -29,6 +30,17 @@ class NeighborIndex:
             o3d.core.Tensor(np.ascontiguousarray(points - self._origin, np.float32))
         )
         self._search.knn_index()
+
+    def nearest_first(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The nearest point of each query; of up to TIES equally near ones that of the lowest row, where
+        `nearest` leaves it to the tree.
+
+        queries: (Q, 3) world
+        returns: (Q,) int32 rows; (Q,) float32 distances
+        """
+        rows, distances = self.nearest(queries, TIES)
+        last = np.iinfo(rows.dtype).max
+        return np.where(distances == distances[:, :1], rows, last).min(axis=1), distances[:, 0]
 
     def nearest(self, queries: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """The `count` (at most N) nearest points of each query.

@@ -45,13 +45,14 @@ GAP_CENTER = 0.75
 class Patches:
     """What blocks rays in each of V voxels, one patch per side.
 
-    grid: the voxels, numbered; index: the same for kernels
+    keys: (V,) int64 voxel keys, rising; grid: the voxels, numbered; index: the same for kernels
     shapes: (V, 2, 12) float32 in voxels from the voxel's corner: mean of the points, unit normal, lowest and
         highest corner of a box that clips the plane.
     Mean NaN = no points on this side; normal 0 = the points scatter (leaves, edges): a ray that meets the box
     is stopped beside their mean.
     """
 
+    keys: np.ndarray
     grid: NumberedVoxels
     index: VoxelIndex
     shapes: np.ndarray
@@ -62,16 +63,24 @@ class Patches:
     ) -> Patches:
         """keys: (V,) int64 voxel keys, rising; shapes: (V, 2, 12), shared; origin: (3,) world zero of the grid."""
         grid = NumberedVoxels.from_keys(keys, voxel_size, origin)
-        return cls(grid, grid.index(), shapes)
+        return cls(keys, grid, grid.index(), shapes)
 
 
-def surface_patches(points: np.ndarray, normals: np.ndarray, voxel_size: float) -> Patches:
+def patch_origin(low: np.ndarray, voxel_size: float) -> np.ndarray:
+    """(3,) world zero of the grid of a cloud whose smallest coordinates are `low` (3,): there is room for the
+    voxels around those with points.
+    """
+    return np.asarray(low, np.float64) - (BLOCK + ORIGIN_SHIFT) * voxel_size
+
+
+def surface_patches(
+    points: np.ndarray, normals: np.ndarray, voxel_size: float, low: np.ndarray | None = None
+) -> Patches:
     """The patches of a cloud. points: (N, 3) float64 world, N >= 1; normals: (N, 3) float32 unit, towards the
-    outside.
+    outside; low: (3,) of the whole cloud that they are part of, None = their own.
     """
     points, normals = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(normals, np.float32)
-    # room for the voxels around those with points
-    origin = points.min(axis=0) - (BLOCK + ORIGIN_SHIFT) * voxel_size
+    origin = patch_origin(points.min(axis=0) if low is None else low, voxel_size)
     sorting = sort_by_voxel(points, voxel_size, origin)
     sides, flat = normal_sides(normals, sorting)
     keys, order = sorting.keys, sorting.order

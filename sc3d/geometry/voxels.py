@@ -334,6 +334,13 @@ def voxel_position(key):
     return x * BLOCK + place % BLOCK, y * BLOCK + place // BLOCK % BLOCK, z * BLOCK + place // (BLOCK * BLOCK)
 
 
+def voxel_positions(keys: np.ndarray) -> np.ndarray:
+    """(K, 3) int64, in voxels, of voxel keys (K,)."""
+    place = keys % VOXELS
+    inside = [place % BLOCK, place // BLOCK % BLOCK, place // (BLOCK * BLOCK)]
+    return unpack_blocks(keys // VOXELS).astype(np.int64) * BLOCK + np.stack(inside, axis=1)
+
+
 @numba.njit(parallel=True, cache=True)
 def _split_sides(normals, order, starts, sides, flat):
     """Arrays as in normal_sides."""

@@ -88,7 +88,9 @@ def _stated(path: Path, geometry: Geometry | None) -> int | None:
 def _write_in_parts(target: Path, path: Path, epsg: int | None, georeference: Georeference | None) -> None:
     cloud = CloudFile.open(path)
     if path.suffix.lower() in PARTS:
-        logger.info("%s does not fit into memory as a whole: its positions and colors are read", path)
+        logger.info(
+            "%s does not fit into memory as a whole: its positions, colors and classes are read", path
+        )
     fields = [(name, "f8" if name in ("x", "y", "z") else cloud.dtype[name].str[1:]) for name in cloud.names]
     dtype = np.dtype(fields)
 

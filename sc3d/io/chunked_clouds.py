@@ -20,6 +20,7 @@ from sc3d.io.splats import SPLATS, is_splat_ply
 RECORDS_AT_ONCE, BYTES_AT_ONCE = 1_000_000, 128 << 20  # rows held at a time
 LAS_FIELDS = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
 LAS_COLORS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+LAS_CLASSES = [("classification", "u1"), ("label", "u1")]  # ASPRS codes; class ids, where sc3d wrote the file
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,10 @@ class CloudFile:
             las = warn_of_spare(path)
             if not las.num_points:
                 raise InputError(f"{path} holds no points")
-            return cls(path, np.dtype(LAS_FIELDS + LAS_COLORS * las.has_colors), las.num_points)
+            with open_las(path) as file:
+                names = set(file.header.point_format.dimension_names)
+            classes = [field for field in LAS_CLASSES if field[0] in names]
+            return cls(path, np.dtype(LAS_FIELDS + LAS_COLORS * las.has_colors + classes), las.num_points)
         if kind != ".ply":
             raise InputError(
                 f"{path} does not fit into --max-memory, and can be read in parts as PLY, LAS or LAZ only: convert it, or allow more memory"

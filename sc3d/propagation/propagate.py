@@ -40,6 +40,9 @@ from sc3d.scene.scene import Scene
 from sc3d.scene.site_model import ModelPart, read_model
 from sc3d.settings.labels import Propagate
 
+FILLED = 0.5  # confidence of what the nearest label fills
+MAKE_CLOUD = "run `sc3d extract SCENE` first, or `sc3d import` a cloud"
+
 Learner = Callable[[Graph, LabelledPoints], tuple[LabelledPoints, LearnedAppearance | None]]
 
 
@@ -100,7 +103,7 @@ def fill_from_nearest(
     if label.all() or not label.any():
         return label, confidence
     filled, share = vote_nearest(points, label.astype(np.uint8), 1)
-    return np.where(label == 0, filled, label), np.where(label == 0, 0.5 * share, confidence)
+    return np.where(label == 0, filled, label), np.where(label == 0, FILLED * share, confidence)
 
 
 def with_states(
@@ -156,8 +159,8 @@ def propagate_scene(
     """Complete the labels of a scene's seeds (or of `settings.seeds`) and write the labelled cloud.
     read_objects: as `SceneObjects.tell_apart` takes it
     """
-    saved = _saved_appearance(scene, settings)
-    meters = _meters(scene) if settings.model or settings.save_model else None
+    saved = read_saved_appearance(scene, settings)
+    meters = meters_per_unit(scene) if settings.model or settings.save_model else None
     cloud, seeds, votes, path = _read_start(scene, settings)
     positions = cloud.point.positions.numpy().astype(np.float64)
     corrections = Corrections.of_scene(scene)
@@ -208,8 +211,8 @@ def _read_start(
     """Cloud, labels (ids) and votes to start from, and their file: what `sc3d label` wrote or, with a model, the
     cloud of the scene, of which nothing is known.
     """
-    path = settings.seeds or scene.seeds
-    if settings.model is None or settings.seeds is not None or path.exists():
+    path, bare = start_of(scene, settings)
+    if not bare:
         cloud, seeds = read_labelled(path, "label")
         votes = read_votes(cloud)
         if settings.method == "map" and votes is None:
@@ -217,22 +220,31 @@ def _read_start(
                 f"{path} has no votes, which --method map needs: run `sc3d label` again, or choose --method geometry"
             )
         return cloud, seeds, votes, path
-    scene.require(scene.cloud, hint="run `sc3d extract SCENE` first, or `sc3d import` a cloud")
-    cloud = read_cloud(scene.cloud)
+    scene.require(path, hint=MAKE_CLOUD)
+    cloud = read_cloud(path)
     points, normals = point_arrays(cloud, np.array([view.center for view in scene.model.views]))
     channels, empty = scene.class_table().channels, np.zeros(len(points), np.uint8)
     cloud.point.normals = o3d.core.Tensor(normals)
     seeds = Labels(empty, empty.astype(np.float32), empty + np.uint8(UNSEEN), empty.astype(np.int32))
-    return cloud, seeds, Votes(np.zeros((len(points), channels.count), np.float32), channels), scene.cloud
+    return cloud, seeds, Votes(np.zeros((len(points), channels.count), np.float32), channels), path
 
 
-def _saved_appearance(scene: Scene, settings: Propagate) -> SavedAppearance | None:
+def start_of(scene: Scene, settings: Propagate) -> tuple[Path, bool]:
+    """The cloud to start from, and whether nothing is known of its points: that of the scene, which a model
+    labels.
+    """
+    path = settings.seeds or scene.seeds
+    bare = settings.model is not None and settings.seeds is None and not path.exists()
+    return (scene.cloud if bare else path), bare
+
+
+def read_saved_appearance(scene: Scene, settings: Propagate) -> SavedAppearance | None:
     """What `--model` holds, checked against the scene before anything else."""
     if settings.model is None:
         return None
     part = read_model(settings.model, scene.class_table(), "appearance")
     saved = SavedAppearance.from_part(part, settings.model)
-    saved.require_unit(_meters(scene), settings.model)
+    saved.require_unit(meters_per_unit(scene), settings.model)
     return saved
 
 
@@ -241,7 +253,7 @@ def levels_of(scene: Scene, channels: Channels) -> np.ndarray | None:
     return scene.class_table().levels(channels) if scene.classes.exists() else None
 
 
-def _meters(scene: Scene) -> float | None:
+def meters_per_unit(scene: Scene) -> float | None:
     """Meters per unit of the world of a scene; None where nobody says."""
     found = read_georeference(scene)
     return None if found is None else found.meters

@@ -29,7 +29,8 @@ from sc3d.propagation.appearance import (
 )
 from sc3d.propagation.histogram import Histogram
 from sc3d.propagation.labelled_points import MIN_EXAMPLES, LabelledPoints
-from sc3d.propagation.terrain import NUM_FEATURES, Scale, relief_features, terrain_of
+from sc3d.propagation.quantile_sketch import QuantileSketch
+from sc3d.propagation.terrain import NUM_FEATURES, GroundModel, Scale, relief_features, terrain_of
 from sc3d.propagation.trust import Trust
 from sc3d.propagation.vote_evidence import count_disagreement
 from sc3d.scene.channels import Channels
@@ -108,20 +109,31 @@ class SavedAppearance:
         known, found: in the order of the cloud; found: channels; meters: per world unit, None = not known
         """
         known, found = known.ordered(graph.order), found[graph.order]
-        classes = len(channels.ids) - 1
-        examples = (found.label > 0) & (found.label <= classes) & (found.confidence >= SURE)
         terrain = terrain_of(graph, known.points, known.up)
-        scale = Scale(terrain.cell, terrain.spacing if meters is None else 1 / meters)
-        relief = relief_features(graph, known.points, known.up, scale)
+        relief = relief_features(graph, known.points, known.up, own_scale(terrain, meters))
         sketches = feature_counts(relief, known.colors)
         model = AppearanceModel.from_sketches(relief, known.colors, sketches)
-        statistics = model.statistics(found.label, examples, classes)
-        if (statistics[0].sum(axis=0) >= MIN_EXAMPLES).sum() < 2:
+        examples = sure_points(found.label, found.confidence, channels)
+        statistics = model.statistics(found.label, examples, len(channels.ids) - 1)
+        return cls.from_statistics(statistics, sketches, terrain, channels, meters)
+
+    @classmethod
+    def from_statistics(
+        cls,
+        statistics: AppearanceStatistics,
+        sketches: list[QuantileSketch],
+        terrain: GroundModel,
+        channels: Channels,
+        meters: float | None,
+    ) -> SavedAppearance | None:
+        """From what the sure points of a whole site teach; None if that is too little. sketches: as of
+        `feature_counts`, with heights in `own_scale`; terrain: of the site; meters: as in `learn`
+        """
+        if has_examples(statistics).sum() < 2:
             return None
-        colors = None if known.colors is None else np.stack(edges_of(sketches[NUM_FEATURES:], COLOR_BINS))
+        colors = np.stack(edges_of(sketches[NUM_FEATURES:], COLOR_BINS)) if len(statistics) > 1 else None
         relief_edges = np.stack(edges_of(sketches[:NUM_FEATURES], RELIEF_BINS))
-        unit = SPACINGS if meters is None else METERS
-        cell = terrain.cell / scale.unit
+        unit, cell = SPACINGS if meters is None else METERS, terrain.cell / own_scale(terrain, meters).unit
         return cls(channels.ids[1:], unit, cell, relief_edges, colors, statistics)
 
     def require_unit(self, meters: float | None, origin: Path) -> None:
@@ -151,21 +163,42 @@ class SavedAppearance:
 
         graph, known: in the order of the graph; meters: as in `require_unit`; origin: its file
         """
-        spacing = terrain_of(graph, known.points, known.up).spacing
-        unit = spacing if meters is None else 1 / meters
-        relief = relief_features(graph, known.points, known.up, Scale(self.cell * unit, unit))
-        colored = self.color_edges is not None and known.colors is not None
-        if colored != (self.color_edges is not None):
-            logger.warning("%s knows colors, but the cloud has none: relief alone is used", origin)
-        groups = [Histogram.from_features(relief, list(self.relief_edges), RELIEF_BLUR)]
-        if colored and self.color_edges is not None and known.colors is not None:
-            groups.insert(0, Histogram.from_features(known.colors, list(self.color_edges), COLOR_BLUR))
-        given = _in_channels(self.statistics[-len(groups) :], self.ids, channels)
-        own = AppearanceModel(tuple(groups)).statistics(known.seed_labels, known.agreed, known.num_classes)
-        model = SeededModel(tuple(groups), _no_heavier(given, own))
-        statistics = model.with_prior(own)
-        trust = Trust.unmeasured(statistics[0].sum(axis=0) >= MIN_EXAMPLES, count_disagreement(known))
+        scale = self.scale_on(terrain_of(graph, known.points, known.up).spacing, meters)
+        self.tell_of_colors(known.colors is not None, origin)
+        relief = relief_features(graph, known.points, known.up, scale)
+        groups = self.histograms(relief, known.colors)
+        own = AppearanceModel(groups).statistics(known.seed_labels, known.agreed, known.num_classes)
+        model = SeededModel(groups, self.prior_beside(own, channels))
+        statistics = add_prior(model.prior, own)
+        trust = Trust.unmeasured(has_examples(statistics), count_disagreement(known))
         return known, LearnedAppearance(model, statistics, trust)
+
+    def scale_on(self, spacing: float, meters: float | None) -> Scale:
+        """Of the relief of another scene, in its world units. spacing: of its points; meters: as in
+        `require_unit`
+        """
+        unit = spacing if meters is None else 1 / meters
+        return Scale(self.cell * unit, unit)
+
+    def tell_of_colors(self, colored: bool, origin: Path) -> None:
+        """A line if the model knows colors that a cloud has not. origin: its file"""
+        if self.color_edges is not None and not colored:
+            logger.warning("%s knows colors, but the cloud has none: relief alone is used", origin)
+
+    def histograms(self, relief: np.ndarray, colors: np.ndarray | None) -> tuple[Histogram, ...]:
+        """Cells of points with the borders of the model, colors first, where it and the points have any.
+        relief: (N, 4) in `scale_on`; colors: (N, 3) uint8 or None
+        """
+        groups = [Histogram.from_features(relief, list(self.relief_edges), RELIEF_BLUR)]
+        if self.color_edges is not None and colors is not None:
+            groups.insert(0, Histogram.from_features(colors, list(self.color_edges), COLOR_BLUR))
+        return tuple(groups)
+
+    def prior_beside(self, own: AppearanceStatistics, channels: Channels) -> AppearanceStatistics:
+        """What the model teaches a scene of these channels, whose own agreed points teach `own`, of as many
+        groups.
+        """
+        return _no_heavier(_in_channels(self.statistics[-len(own) :], self.ids, channels), own)
 
 
 @dataclass(frozen=True)
@@ -176,14 +209,35 @@ class SeededModel(AppearanceModel):
 
     def statistics(self, label: np.ndarray, examples: np.ndarray, num_classes: int) -> AppearanceStatistics:
         """Also what the other site's examples teach."""
-        return self.with_prior(super().statistics(label, examples, num_classes))
-
-    def with_prior(self, own: AppearanceStatistics) -> AppearanceStatistics:
-        return tuple(first + second for first, second in zip(self.prior, own, strict=True))
+        return add_prior(self.prior, super().statistics(label, examples, num_classes))
 
     def offers(self, num_classes: int) -> np.ndarray:
         """The classes of which the other site has enough examples."""
-        return self.prior[0].sum(axis=0) >= MIN_EXAMPLES
+        return has_examples(self.prior)
+
+
+def add_prior(prior: AppearanceStatistics, own: AppearanceStatistics) -> AppearanceStatistics:
+    """What another site's examples and a scene's own teach together."""
+    return tuple(first + second for first, second in zip(prior, own, strict=True))
+
+
+def has_examples(statistics: AppearanceStatistics) -> np.ndarray:
+    """(C,) bool classes of which there are enough."""
+    return statistics[0].sum(axis=0) >= MIN_EXAMPLES
+
+
+def own_scale(terrain: GroundModel, meters: float | None) -> Scale:
+    """With what the relief of a site is saved: heights in meters, or in point spacings where nobody knows how
+    long a meter is. meters: per world unit, None = not known
+    """
+    return Scale(terrain.cell, terrain.spacing if meters is None else 1 / meters)
+
+
+def sure_points(label: np.ndarray, confidence: np.ndarray, channels: Channels) -> np.ndarray:
+    """(N,) bool points of a finished site that are saved as examples; label: (N,) channels; confidence:
+    (N,)
+    """
+    return (label > 0) & (label < len(channels.ids)) & (confidence >= SURE)
 
 
 def _counts(part: ModelPart) -> list[np.ndarray]:

@@ -41,7 +41,9 @@ ReadMask = Callable[[View], Mask]
 class RefinementInputs:
     """A cloud with its surface, and the settings by which masks become labels.
 
-    colors: (N, 3) uint8 or None; up: (3,) of the cameras, None = not known; seen: the surface, whatever labels it has; num_channels: classes + 1, as labels and masks here are channels
+    colors: (N, 3) uint8 or None; up: (3,) of the cameras, None = not known; seen: the surface, whatever
+    labels it has;
+    num_channels: classes + 1, as labels and masks here are channels; levels: as of `LabelledPoints`
     """
 
     cloud: Cloud
@@ -51,15 +53,14 @@ class RefinementInputs:
     label: Label
     propagate: Propagate = Propagate()
     up: np.ndarray | None = None
+    levels: np.ndarray | None = None
 
     def labels(self, views: list[View], read: ReadMask) -> Labels:
         """Labels of all points from the masks of some views."""
         fusion = fuse(self.cloud, views, read, self.seen.surface, self.num_channels, self.label)
-        return propagate(
-            LabelledPoints(self.cloud.points, fusion.labels, fusion.votes, self.colors, self.up),
-            self.cloud.normals,
-            self.propagate,
-        )
+        points, levels = self.cloud.points, self.levels
+        known = LabelledPoints(points, fusion.labels, fusion.votes, self.colors, self.up, levels=levels)
+        return propagate(known, self.cloud.normals, self.propagate)
 
     def render(self, labels: Labels, view: View, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """(H, W) uint8 labels and (H, W) float32 confidences, 0 to 1, as a photo of (width, height) sees
@@ -90,6 +91,7 @@ def load_refinement_inputs(scene: Scene, masks: Masks) -> RefinementInputs:
         masks.channels.count,
         Label(voxel_size=default_voxel_size(points, masks)),
         up=scene_up(scene),
+        levels=masks.table.levels(masks.channels),
     )
 
 

@@ -122,8 +122,7 @@ class Label(Resources):
     """Only the first surface along each ray is labelled; --no-depth-filter lets labels penetrate."""
     surface: Literal["auto", "surfels", "voxels"] = "auto"
     """What hides the points behind it. auto: mesh.ply if there is one, else as voxels; voxels: a grid of the
-    cloud's own points, traversed coarse to fine; surfels: a square around every point (more memory), which
-    clouds in tiles have instead of voxels.
+    cloud's own points, traversed coarse to fine; surfels: a square around every point (more memory).
     """
     consensus: float = 0.66
     """Share of the votes that the winning class needs, else the voxel is locked (conflict-lock)."""

@@ -62,11 +62,5 @@ def run(scene: Scene, settings: Label) -> dict[str, object]:
 
 
 def _label(scene: Scene, settings: Label, prior: Path | None) -> dict[str, object]:
-    if label_fits(scene, settings):
-        return label_scene(scene, settings, prior).figures()
-    if prior is not None:
-        raise InputError(
-            "--prior needs the whole cloud in memory: leave --workers out and raise --max-memory, or label a"
-            " thinner cloud"
-        )
-    return label_scene_by_tiles(scene, settings).figures()
+    label = label_scene if label_fits(scene, settings) else label_scene_by_tiles
+    return label(scene, settings, prior).figures()

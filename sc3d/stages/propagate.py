@@ -8,7 +8,7 @@ from sc3d.errors import InputError
 from sc3d.georeferencing.georeference import georeference_path, read_georeference
 from sc3d.io.json_files import read_json
 from sc3d.io.provenance import Input, PhotoFrames
-from sc3d.propagation.propagate import propagate_scene
+from sc3d.propagation.propagate import propagate_scene, start_of
 from sc3d.runner import MAX_SIDECAR, sidecar
 from sc3d.scene.scene import Scene
 from sc3d.scene.site_model import ModelPart, read_model, require_model_or_nothing, write_model
@@ -32,8 +32,7 @@ def begin(scene: Scene, settings: Propagate) -> None:
 def inputs(scene: Scene, settings: Propagate) -> list[Input]:
     corrections = [scene.corrections] if scene.corrections.exists() else []
     photos = PhotoFrames(scene.images)  # which, with the cameras, tell up
-    seeds = settings.seeds or scene.seeds
-    start = scene.cloud if settings.model and not settings.seeds and not seeds.exists() else seeds
+    start, _ = start_of(scene, settings)
     model = [settings.model] if settings.model else []
     learned = _strokes_inputs(scene) if settings.save_model else []
     place = georeference_path(scene)  # which says how long a meter is
@@ -49,11 +48,6 @@ def outputs(scene: Scene, settings: Propagate) -> list[Path]:
 def run(scene: Scene, settings: Propagate) -> dict[str, object]:
     """Complete the labels, in memory or, where the cloud does not fit, by tiles."""
     fits = propagate_fits(scene, settings)
-    if not fits and (settings.model or settings.save_model):
-        raise InputError(
-            "--model and --save-model need the whole cloud in memory: leave --workers out and raise --max-memory,"
-            " or label a thinner cloud"
-        )
     strokes = _strokes_part(scene) if settings.save_model else None
     summary = (propagate_scene if fits else propagate_scene_by_tiles)(scene, settings, read_objects)
     if settings.save_model:

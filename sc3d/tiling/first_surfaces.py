@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
+from typing import Protocol
 
 import numba
 import numpy as np
@@ -19,11 +20,12 @@ from sc3d.errors import InputError
 from sc3d.geometry.cameras import View, camera_rays, may_see, undistorted
 from sc3d.geometry.raycast import Surface, surfels
 from sc3d.io.atomic import atomic_path
-from sc3d.io.chunked_clouds import RECORDS_AT_ONCE, CloudFile, columns, positions
+from sc3d.io.chunked_clouds import RECORDS_AT_ONCE, CloudFile, positions
 from sc3d.io.memory_limit import BASE
 from sc3d.io.ply import Property, check_ply, num_triangles
 from sc3d.scene.scene import Scene
 from sc3d.tiling.executor import Executor
+from sc3d.tiling.given_normals import NormalsOf
 from sc3d.tiling.memory import TRIANGLE
 from sc3d.tiling.store import CloudStatistics, TileGrid, TileStore
 
@@ -82,6 +84,18 @@ class MeshParts:
             ).scene,
             self.origin,
         )
+
+    def first_ranges(self, views: list[View]) -> dict[str, np.ndarray]:
+        """As of `SurfaceParts`; a part is loaded once for all of the views."""
+        ranges = {view.name: np.full(view.height * view.width, np.inf, np.float32) for view in views}
+        for part, (low, high) in self.boxes.items():
+            seeing = [view for view in views if may_see(view, low + self.origin, high + self.origin)]
+            if not seeing:
+                continue
+            surface = self.surface(part)
+            for view in seeing:
+                _cast(self, part, surface, view, camera_rays(view.camera), ranges[view.name])
+        return ranges
 
 
 def read_triangles(path: Path) -> Iterator[np.ndarray]:
@@ -191,21 +205,21 @@ class RangeMaps:
         return ranges, np.full_like(ranges, np.nan)
 
 
-def write_ranges(parts: MeshParts, views: list[View], maps: RangeMaps) -> None:
-    """Ranges of a group of views, sized as they shall be; a part of the mesh is loaded once for all of them.
-    Memory: one part and the maps of the group.
+class SurfaceParts(Protocol):
+    """A surface on disk."""
+
+    def first_ranges(self, views: list[View]) -> dict[str, np.ndarray]:
+        """(H * W,) float32 range of each pixel of a group of views, by name; inf = nothing hit."""
+
+
+def write_ranges(parts: SurfaceParts, views: list[View], maps: RangeMaps) -> None:
+    """Ranges of a group of views, sized as they shall be. Memory: the maps of the group, and what of the
+    surface is looked at once.
     """
     views = [view for view in views if not maps.path(view).exists()]
-    rays_of = {view.name: np.full(view.height * view.width, np.inf, np.float32) for view in views}
-    for part, (low, high) in parts.boxes.items():
-        seeing = [view for view in views if may_see(view, low + parts.origin, high + parts.origin)]
-        if not seeing:
-            continue
-        surface = parts.surface(part)
-        for view in seeing:
-            _cast(parts, part, surface, view, camera_rays(view.camera), rays_of[view.name])
+    ranges = parts.first_ranges(views) if views else {}
     for view in views:
-        maps.write(view, rays_of[view.name].reshape(view.height, view.width))
+        maps.write(view, ranges[view.name].reshape(view.height, view.width))
 
 
 GROUP = 16  # views whose ranges are held at once
@@ -219,7 +233,7 @@ class RangeJob:
     """
 
     scene: Path
-    parts: MeshParts
+    parts: SurfaceParts
     maps: RangeMaps
     sizes: dict[str, tuple[int, int]]
     pinhole: int = 0
@@ -276,16 +290,18 @@ def split_mesh(files: Sequence[Path], folder: Path, origin: np.ndarray, memory: 
     return MeshParts.split(chain.from_iterable(map(read_triangles, given)), grid, folder, origin)
 
 
-def split_surfels(store: TileStore, spacing: float, folder: Path, origin: np.ndarray) -> MeshParts:
-    """The surfels of a cloud without a mesh, tile by tile; the cloud must have normals."""
-    return MeshParts.split(_surfel_triangles(store, spacing, origin), store.grid, folder, origin)
+def split_surfels(
+    store: TileStore, normals: NormalsOf, spacing: float, folder: Path, origin: np.ndarray
+) -> MeshParts:
+    """The surfels of a cloud without a mesh, tile by tile."""
+    return MeshParts.split(_surfel_triangles(store, normals, spacing, origin), store.grid, folder, origin)
 
 
-def _surfel_triangles(store: TileStore, spacing: float, origin: np.ndarray) -> Iterator[np.ndarray]:
+def _surfel_triangles(
+    store: TileStore, normals: NormalsOf, spacing: float, origin: np.ndarray
+) -> Iterator[np.ndarray]:
     for tile in store.tiles:
         halo = store.with_halo(tile, SURFEL_MARGIN * spacing)
-        records = halo.gather(store.records)
-        vertices, triangles = surfels(
-            positions(records) - origin, columns(records, ("nx", "ny", "nz")), spacing, halo.core
-        )
+        points = positions(halo.gather(store.records))
+        vertices, triangles = surfels(points - origin, normals(halo), spacing, halo.core)
         yield vertices[triangles] + origin

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sc3d.errors import InputError
-from sc3d.geometry.cameras import local_origin
+from sc3d.geometry.cameras import View, local_origin
 from sc3d.geometry.neighbors import NeighborIndex, point_spacing
 from sc3d.geometry.voxels import BLOCK, VOXELS, file_header, sort_by_voxel, unpack_blocks, voxel_origin
-from sc3d.io.chunked_clouds import CloudFile, columns, positions, rows_at_once
+from sc3d.io.chunked_clouds import CloudFile, positions, rows_at_once
 from sc3d.io.ply import num_triangles, write_records
 from sc3d.io.provenance import Input, PhotoFrames
 from sc3d.labelling.cloud import Cloud, CloudExtent
@@ -30,30 +29,39 @@ from sc3d.labelling.inputs import (
 )
 from sc3d.labelling.label import LabelSummary, summarize
 from sc3d.labelling.normal_sides import Sides, judge_sides, sample_step, with_sides
+from sc3d.labelling.prior_cloud import PriorVotes
 from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import (
     INSTANCE,
     SPACING_NEIGHBORS,
     SPACING_SAMPLE,
     VOTES,
-    unit_normals,
-    usable_normals,
 )
 from sc3d.scene.labels import STATE_NAMES, Labels
 from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Label
 from sc3d.tiling.executor import Executor, open_executor
-from sc3d.tiling.first_surfaces import RangeJob, RangeMaps, compute_ranges, split_mesh, split_surfels
+from sc3d.tiling.first_surfaces import (
+    RangeJob,
+    RangeMaps,
+    SurfaceParts,
+    compute_ranges,
+    split_mesh,
+    split_surfels,
+)
+from sc3d.tiling.given_normals import NORMALS, TileNormals, has_usable_normals
 from sc3d.tiling.label_grid_file import write_field
 from sc3d.tiling.memory import TRIANGLE, fits, max_points, memory_of, num_points
+from sc3d.tiling.prior_votes import hear_prior
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
+from sc3d.tiling.voxel_parts import split_voxels
 from sc3d.tiling.work_folder import WorkFolder
 
 logger = logging.getLogger(__name__)
 
-NORMALS = ("nx", "ny", "nz")
 LEAST_BYTES = 420  # of a point while its tile votes
 BYTES, VOTE_BYTES = 180, 40  # the same without its votes, and of each channel of these
+PRIOR_BYTES = 150  # of a point of --prior, beside which the cloud is in memory
 VOXEL = 2.2  # of a label voxel, in point spacings, while neither is known exactly
 SAMPLE_MARGIN = 20.0  # around a tile whose spacing is measured, point spacings
 # margin of a tile: the rest of a block that its border cuts, and the block beyond, which verification looks
@@ -88,7 +96,8 @@ def label_fits(scene: Scene, settings: Label) -> bool:
     if count is None or not source.exists():
         return True  # cannot be read in parts
     needed = count * bytes_per_point(scene) + num_triangles(scene.surface) * TRIANGLE
-    return fits(needed, settings)
+    classified = num_points(settings.prior) if settings.prior is not None else None
+    return fits(needed + (classified or 0) * PRIOR_BYTES, settings)
 
 
 def bytes_per_point(scene: Scene) -> int:
@@ -98,16 +107,12 @@ def bytes_per_point(scene: Scene) -> int:
     return max(LEAST_BYTES, BYTES + VOTE_BYTES * scene.class_table().channels.count)
 
 
-def label_scene(scene: Scene, settings: Label) -> LabelSummary:
+def label_scene(scene: Scene, settings: Label, prior_name: Path | None = None) -> LabelSummary:
     """As `labelling.label.label_scene`, tile by tile, here or on the workers that the settings ask for."""
     settings = settings.resolved
-    if settings.surface == "voxels" and settings.depth_filter:
-        raise InputError(
-            "--surface voxels needs the whole cloud in memory: take surfels, or raise --max-memory"
-        )
     cloud = CloudFile.open(settings.cloud or scene.cloud)
     confidence = best_confidence(scene) if settings.use_confidence else None
-    masks, output = Masks.load(scene, confidence, settings.unlabelled), settings.output or scene.seeds
+    masks, output = _masks(scene, confidence, settings), settings.output or scene.seeds
     decisive: list[Input] = [
         scene.sparse,
         scene.classes,
@@ -116,6 +121,7 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
         *scene.surface,
         cloud.path,
         PhotoFrames(scene.images),
+        *([settings.prior] if settings.prior else []),
     ]
     folder = WorkFolder(output, "label", decisive, settings)
     statistics = CloudStatistics.from_cloud(cloud)
@@ -128,13 +134,16 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
     spacing, sample = sample_spacing(store, statistics)
     if not settings.voxel_size:
         settings = replace(settings, voxel_size=voxel_size_for(spacing, sample, masks))
-    sides = _judge_sides(cloud, masks)
+    sides = _judge_sides(cloud, masks.views or scene.model.views)
+    results = Results(folder.subfolder("results"), store)
+    job = LabelJob(scene.path, settings, statistics.extent, store, results, None, confidence, sides)
     with open_executor(settings) as executor:
-        maps = None
-        if settings.depth_filter:
-            maps = _ranges(scene, masks, store, spacing, settings, folder, executor)
-        results = Results(folder.subfolder("results"), store)
-        job = LabelJob(scene.path, settings, statistics.extent, store, results, maps, confidence, sides)
+        executor.run("normals", partial(normals_of_tile, job), store.tiles)
+        if settings.depth_filter and masks.views:
+            job = replace(job, maps=_ranges(scene, masks, job, spacing, folder, executor))
+        name = prior_name or settings.prior
+        if name is not None:
+            hear_prior(settings, name, box, results, folder.subfolder("prior"), executor, masks)
         executor.run("voting", partial(label_tile, job), store.tiles)
     header = file_header(settings.voxel_size, masks.channels.ids)
     write_field(job.results, store.tiles, header, scene.votes_of(settings.output))
@@ -145,50 +154,38 @@ def label_scene(scene: Scene, settings: Label) -> LabelSummary:
 
 
 def _ranges(
-    scene: Scene,
-    masks: Masks,
-    store: TileStore,
-    spacing: float,
-    settings: Label,
-    parts: WorkFolder,
-    executor: Executor,
+    scene: Scene, masks: Masks, job: LabelJob, spacing: float, parts: WorkFolder, executor: Executor
 ) -> RangeMaps:
-    origin = local_origin(masks.views)
-    if scene.mesh.exists() and settings.surface == "auto":
-        mesh = split_mesh(scene.surface, parts.subfolder("surface"), origin, memory_of(settings))
-    elif {"nx", "ny", "nz"} <= set(store.names):
-        mesh = split_surfels(store, spacing, parts.subfolder("surface"), origin)
+    origin, folder = local_origin(masks.views), parts.subfolder("surface")
+    normals = partial(job.results.around, name="normals")
+    surface: SurfaceParts
+    if scene.mesh.exists() and job.settings.surface == "auto":
+        surface = split_mesh(scene.surface, folder, origin, memory_of(job.settings))
+    elif job.settings.surface == "surfels":
+        surface = split_surfels(job.store, normals, spacing, folder, origin)
     else:
-        raise InputError(
-            "the cloud has neither normals nor a mesh beside it, and does not fit into --max-memory: allow more, or give it normals"
-        )
+        low = job.extent.low
+        surface = split_voxels(job.store, normals, low, spacing, folder, executor, job.settings)
     maps = RangeMaps(
         parts.subfolder("ranges"), {view.name: number for number, view in enumerate(masks.views)}
     )
     return compute_ranges(
-        RangeJob(scene.path, mesh, maps, {view.name: masks.size(view) for view in masks.views}),
+        RangeJob(scene.path, surface, maps, {view.name: masks.size(view) for view in masks.views}),
         executor,
     )
 
 
-def _judge_sides(cloud: CloudFile, masks: Masks) -> Sides:
+def _masks(scene: Scene, confidence: Path | None, settings: Label) -> Masks:
+    return Masks.load(scene, confidence, settings.unlabelled, needed=settings.prior is None)
+
+
+def _judge_sides(cloud: CloudFile, views: list[View]) -> Sides:
     """What to do with the cloud's own normals, by the points that `labelling.label` looks at."""
-    if not set(NORMALS) <= set(cloud.names):
+    if not has_usable_normals(cloud):
         return Sides.ESTIMATE
-    step, found, unusable = sample_step(cloud.num_points), [], 0
-    for start, records in cloud.chunks():
-        unusable += int((~usable_normals(_normals(records))).sum())
-        found.append(records[-start % step :: step])
-    if unusable:
-        logger.warning(
-            "%s: %d of %d normals have no length or are not finite: all are estimated",
-            cloud.path,
-            unusable,
-            cloud.num_points,
-        )
-        return Sides.ESTIMATE
-    sample = np.concatenate(found)
-    return judge_sides(positions(sample), _normals(sample), masks.views, cloud.path)
+    step = sample_step(cloud.num_points)
+    sample = np.concatenate([records[-start % step :: step] for start, records in cloud.chunks()])
+    return judge_sides(positions(sample), _normals(sample), views, cloud.path)
 
 
 def _normals(records: np.ndarray) -> np.ndarray:
@@ -220,6 +217,21 @@ def sample_spacing(store: TileStore, statistics: CloudStatistics) -> tuple[float
     return point_spacing(ordered[0]) or 1.0, ordered[1]
 
 
+def normals_of_tile(job: LabelJob, tile: int) -> None:
+    """Leaves the normals of a tile, turned to the right side, and how many were turned."""
+    if job.results.has(tile, "turned"):
+        return
+    scene, halo = Scene(job.scene), job.store.with_halo(tile, job.margin)
+    views = _masks(scene, job.confidence, job.settings).views or scene.model.views
+    centers = np.array([view.center for view in views])
+    given = TileNormals(job.store, centers, job.extent.low, job.sides is not Sides.ESTIMATE)(halo)
+    points = positions(halo.gather(job.store.records))
+    normals = with_sides(points, given, views, job.sides)[halo.core]
+    turned = (normals != given[halo.core]).any(axis=1).sum()
+    job.results.write(tile, normals=normals)
+    job.results.write(tile, turned=np.array([turned]))
+
+
 def label_tile(job: LabelJob, tile: int) -> None:
     """Fuse the masks on one tile and write its labels, votes and part of the voxel field; a finished tile is
     left alone.
@@ -228,21 +240,15 @@ def label_tile(job: LabelJob, tile: int) -> None:
         return
     scene, store = Scene(job.scene), job.store
     halo = store.with_halo(tile, job.margin)
-    records = halo.gather(store.records)
-    points, masks = positions(records), Masks.load(scene, job.confidence, job.settings.unlabelled)
-    normals = unit_normals(
-        None if job.sides is Sides.ESTIMATE else columns(records, NORMALS),
-        points,
-        np.array([view.center for view in masks.views]),
-        job.extent.low,
-    )
-    turned = with_sides(points, normals, masks.views, job.sides)
-    num_turned = (turned != normals)[halo.core].any(axis=1).sum()
-    normals = turned
+    points, masks = positions(halo.gather(store.records)), _masks(scene, job.confidence, job.settings)
+    normals = job.results.around(halo, "normals")
     origin = voxel_origin(job.extent.low, job.settings.voxel_size)
     density = None
     if job.settings.mechanisms.density:
         density = point_density(scene, points, job.settings.voxel_size, origin)
+    prior = None
+    if job.settings.prior is not None:
+        prior = PriorVotes(job.results.around(halo, "prior"), job.settings.prior_weight)
     fusion = fuse(
         Cloud(points, normals, density, job.extent),
         masks.views,
@@ -251,6 +257,7 @@ def label_tile(job: LabelJob, tile: int) -> None:
         masks.channels.count,
         job.settings,
         masks.channels.none,
+        prior,
     )
     core = halo.core
     labels = fusion.labels
@@ -261,10 +268,9 @@ def label_tile(job: LabelJob, tile: int) -> None:
         state=labels.state[core],
         num_views=labels.num_views[core].astype(np.int32),
         votes=fusion.votes[core],
-        normals=normals[core],
     )
     keys, votes = _blocks(fusion, points, core)
-    job.results.write(tile, turned=np.array([num_turned]), keys=keys, field=votes)
+    job.results.write(tile, keys=keys, field=votes)
 
 
 def _blocks(fusion: Fusion, points: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -26,14 +26,16 @@ from sc3d.tiling.executor import Executor, SerialExecutor
 from sc3d.tiling.first_surfaces import (
     RangeJob,
     RangeMaps,
+    SurfaceParts,
     compute_ranges,
     sized_view,
     split_mesh,
-    split_surfels,
 )
+from sc3d.tiling.given_normals import TileNormals, has_usable_normals
 from sc3d.tiling.label import sample_spacing
 from sc3d.tiling.memory import fits, max_points, memory_of, num_points, surface_bytes
 from sc3d.tiling.store import CloudStatistics, Results, TileStore
+from sc3d.tiling.voxel_parts import split_voxels
 from sc3d.tiling.work_folder import WorkFolder
 
 BYTES = 260  # of a point while pixels look for the nearest one
@@ -173,12 +175,15 @@ def find_points(
     store = TileStore.build(cloud, grid, folder.subfolder("tiles"))
     spacing, _ = sample_spacing(store, statistics)
     parts, origin = folder.subfolder("surface"), local_origin(scene.model.views)
+    surface: SurfaceParts
     if scene.mesh.exists():
-        mesh = split_mesh(scene.surface, parts, origin, memory_of(settings))
+        surface = split_mesh(scene.surface, parts, origin, memory_of(settings))
     else:
-        mesh = split_surfels(store, spacing, parts, origin)
+        low, centers = statistics.extent.low, np.array([view.center for view in scene.model.views])
+        normals = TileNormals(store, centers, low, has_usable_normals(cloud))
+        surface = split_voxels(store, normals, low, spacing, parts, executor, settings)
     maps = RangeMaps(folder.subfolder("ranges"), {name: number for number, name in enumerate(sizes)})
-    compute_ranges(RangeJob(scene.path, mesh, maps, dict(sizes), pinhole), executor)
+    compute_ranges(RangeJob(scene.path, surface, maps, dict(sizes), pinhole), executor)
     job = SeenJob(
         scene.path,
         dict(sizes),

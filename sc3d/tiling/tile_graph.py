@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sc3d.geometry.graph import Graph, build_graph
-from sc3d.io.chunked_clouds import columns, positions
+from sc3d.io.chunked_clouds import CloudFile, columns, positions
 from sc3d.labelling.cloud import CloudExtent
 from sc3d.propagation.appearance import (
     COLOR_BINS,
@@ -27,9 +27,11 @@ from sc3d.propagation.propagate import seeds_in_channels
 from sc3d.propagation.terrain import NUM_FEATURES
 from sc3d.scene.channels import Channels
 from sc3d.scene.corrections import Corrections
-from sc3d.scene.labelled_cloud import VOTES
-from sc3d.scene.labels import Labels
+from sc3d.scene.labelled_cloud import VOTES, unit_normals
+from sc3d.scene.labels import UNSEEN, Labels
+from sc3d.scene.scene import Scene
 from sc3d.settings.labels import Propagate
+from sc3d.tiling.given_normals import NORMALS, has_usable_normals
 from sc3d.tiling.store import Results, TileStore, TileWithHalo
 
 GRAPH = tuple(field.name for field in fields(Graph))
@@ -38,10 +40,37 @@ KNOWN = ("points", "votes", *(field.name for field in fields(Labels)), "colors")
 
 
 @dataclass(frozen=True)
+class BareStart:
+    """A cloud without labels and votes, which a model labels. centers: (M, 3) of the cameras; estimated:
+    whether its normals are
+    """
+
+    centers: np.ndarray
+    estimated: bool
+
+    @classmethod
+    def of_cloud(cls, cloud: CloudFile, scene: Scene) -> BareStart:
+        return cls(np.array([view.center for view in scene.model.views]), not has_usable_normals(cloud))
+
+    def know(
+        self, records: np.ndarray, origin: np.ndarray, channels: Channels
+    ) -> tuple[Labels, np.ndarray, np.ndarray]:
+        """Labels and votes (N, channels) float32, which are empty, and normals (N, 3) float32 of records;
+        origin: (3,) as in `NeighborIndex`.
+        """
+        empty, count = np.zeros(len(records), np.uint8), (len(records), channels.count)
+        labels = Labels(empty, empty.astype(np.float32), empty + np.uint8(UNSEEN), empty.astype(np.int32))
+        given = None if self.estimated else columns(records, NORMALS)
+        normals = unit_normals(given, positions(records), self.centers, origin)
+        return labels, np.zeros(count, np.float32), normals
+
+
+@dataclass(frozen=True)
 class PropagateJob:
     """What the task of a tile needs to know. margin: world units; channels: of the votes; shared: folder
     for what all tiles read; up: (3,) of the cameras, None = not known; rates: of votes for none, once
-    counted; levels: as of `LabelledPoints`; misplaced: votes that count less, once measured
+    counted; levels: as of `LabelledPoints`; misplaced: votes that count less, once measured; start: where
+    nothing is known of the points
     """
 
     settings: Propagate
@@ -56,6 +85,7 @@ class PropagateJob:
     rates: NoneRates | None = None
     levels: np.ndarray | None = None
     misplaced: Misplaced | None = None
+    start: BareStart | None = None
 
     @property
     def colored(self) -> bool:
@@ -147,6 +177,8 @@ def _build(job: PropagateJob, tile: int, halo: TileWithHalo) -> None:
         known.colors if job.colored else np.empty(0),
     )
     job.results.write(tile, touched=touched)
+    if job.start is not None and normals is not None:
+        job.results.write(tile, normals=normals[halo.core])
     for names, arrays in ((GRAPH, [getattr(graph, name) for name in GRAPH]), (KNOWN, values)):
         job.results.write(tile, **{f"part_{name}": array for name, array in zip(names, arrays, strict=True)})
 
@@ -158,20 +190,16 @@ def _mapped(job: PropagateJob, tile: int, names: tuple[str, ...]) -> list[np.nda
 def _evidence(job: PropagateJob, halo: TileWithHalo) -> tuple[LabelledPoints, np.ndarray | None, np.ndarray]:
     """What is known of the window's points, by row, their normals, and how many lie in each correction."""
     records = halo.gather(job.store.records)
-    points = positions(records)
-    labels = Labels(
-        *(
-            records[name].astype(kind)
-            for name, kind in (
-                ("label", np.uint8),
-                ("confidence", np.float32),
-                ("state", np.uint8),
-                ("num_views", np.int32),
-            )
-        )
-    )
+    points, colors = positions(records), columns(records, ("red", "green", "blue"))
+    votes: np.ndarray | None
+    normals: np.ndarray | None
+    if job.start is not None:
+        labels, votes, normals = job.start.know(records, job.extent.low, job.channels)
+    else:
+        names = {"label": np.uint8, "confidence": np.float32, "state": np.uint8, "num_views": np.int32}
+        labels = Labels(*(records[name].astype(kind) for name, kind in names.items()))
+        votes = columns(records, [f"{VOTES}{name}" for name in job.channels.names])
+        normals = columns(records, NORMALS)
     labels, touched = job.corrections.apply(labels, points)
     labels = seeds_in_channels(labels, job.channels, "the cloud")
-    votes = columns(records, [f"{VOTES}{name}" for name in job.channels.names])
-    known = LabelledPoints(points, labels, votes, columns(records, ("red", "green", "blue")))
-    return known, columns(records, ("nx", "ny", "nz")), touched
+    return LabelledPoints(points, labels, votes, colors), normals, touched

@@ -13,7 +13,7 @@ from sc3d.geometry.cameras import rays
 from sc3d.io.clouds import read_cloud
 from sc3d.runner import sidecar
 from sc3d.segmentation import mask_refinement as refinement
-from tests.builders import ORIGIN, ground, truth_mask, views, write_bare_scene
+from tests.builders import CLASSES, ORIGIN, ground, truth_mask, views, write_bare_scene
 
 
 def run(*arguments) -> None:
@@ -144,6 +144,19 @@ def test_agreement_is_measured_on_photos_left_out(scene):
     assert 0.9 < result.before <= 1 and 0.9 < result.after <= 1
     first_fusion = asked[: asked.index("photo_2.jpg")]
     assert set(first_fusion) == {"photo_0.jpg", "photo_1.jpg", "photo_3.jpg", "photo_4.jpg"}
+
+
+def test_refinement_knows_which_classes_stand(scene, monkeypatch):
+    from sc3d.labelling.inputs import Masks
+    from sc3d.scene.class_table import ON_GROUND, STANDING
+    from sc3d.scene.scene import Scene
+
+    codes = [entry | {"asprs": code} for entry, code in zip(CLASSES, (11, 5), strict=True)]
+    (scene / "classes.json").write_text(json.dumps(codes))
+    masks, known = Masks.load(Scene(scene), None), []
+    monkeypatch.setattr(refinement, "propagate", lambda points, *_: known.append(points) or points.seeds)
+    refinement.load_refinement_inputs(Scene(scene), masks).labels(masks.views, masks.read)
+    assert [points.levels.tolist() for points in known] == [[ON_GROUND, STANDING]]
 
 
 def test_refine_wants_masks_in_the_scene(scene, capsys):

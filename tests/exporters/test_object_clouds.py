@@ -11,7 +11,7 @@ import pytest
 import shapely
 
 from sc3d.errors import InputError
-from sc3d.exporters import laz, object_clouds, objects
+from sc3d.exporters import laz, object_clouds, objects, projected_cloud
 from sc3d.exporters.best_photo import best_photos
 from sc3d.exporters.projected_cloud import MapProjection
 from sc3d.geometry.cameras import look_at, pinhole_view
@@ -72,6 +72,23 @@ def test_objects_in_laz_and_in_files_of_their_own(scene):
     for number in NUMBERS:
         part = read_cloud(folder / f"{number}_building.ply").point.positions.numpy()
         np.testing.assert_array_equal(part, cloud.point.positions.numpy()[instance == number])
+
+
+def test_objects_of_a_cloud_that_does_not_fit_are_written_part_by_part(scene, monkeypatch):
+    """The same points and attributes, and the same files whatever the parts."""
+    folder, found = object_clouds.outputs(scene, Export())[0], []
+    monkeypatch.setattr(projected_cloud, "fits", lambda _, resources: not resources.max_memory)
+    for memory, rows in (("", 10**6), ("2G", 7000), ("2G", 999)):
+        monkeypatch.setattr("sc3d.io.chunked_clouds.RECORDS_AT_ONCE", rows)
+        figures = object_clouds.write(scene, Export(max_memory=memory, classes=("building",)))
+        files = sorted(folder.iterdir())
+        found.append((figures, {file.name: (file.read_bytes(), read_cloud(file).point) for file in files}))
+    whole, parts, smaller = (files for _, files in found)
+    assert found[0][0] == found[1][0] == found[2][0] and whole.keys() == parts.keys() and len(whole) == 2
+    for name, (content, points) in parts.items():
+        assert content == smaller[name][0] and set(points) == set(whole[name][1])
+        for attribute, values in whole[name][1].items():
+            np.testing.assert_array_equal(points[attribute].numpy(), values.numpy(), err_msg=attribute)
 
 
 def test_a_cloud_without_objects_says_what_to_do(scene):

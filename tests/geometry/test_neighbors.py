@@ -38,6 +38,17 @@ def test_search_at_utm_size_and_with_fewer_points_than_asked():
         neighbors.NeighborIndex(np.empty((0, 3)))
 
 
+def test_of_equally_near_points_the_first_is_found():
+    """Among the corners of cells, and of points at one place."""
+    lattice = np.stack(np.meshgrid(*[np.arange(9.0)] * 3), axis=-1).reshape(-1, 3)
+    points = np.concatenate([lattice, lattice[::3]])[np.random.default_rng(0).permutation(729 + 243)]
+    for queries in (lattice, lattice[lattice.max(axis=1) < 8] + [0.5, 0.5, 0]):
+        apart = np.linalg.norm(queries[:, None] - points, axis=2)
+        found, distances = neighbors.NeighborIndex(points, np.zeros(3)).nearest_first(queries)
+        np.testing.assert_array_equal(found, apart.argmin(axis=1))
+        np.testing.assert_array_equal(distances, apart.min(axis=1).astype(np.float32))
+
+
 def test_normals_of_noisy_plane_and_sphere_within_two_degrees():
     rng = np.random.default_rng(0)
     plane = np.concatenate([rng.uniform(-5, 5, (20000, 2)), rng.normal(0, 0.002, (20000, 1))], axis=1)

@@ -106,13 +106,6 @@ def test_what_says_nothing_is_refused(scene, tmp_path, shift, code, table, messa
     assert not scene.seeds.exists()
 
 
-def test_a_cloud_in_tiles_is_refused(scene, tmp_path, monkeypatch):
-    prior = laz(tmp_path / "other.laz", ground(0.5), np.full(256, 11))
-    monkeypatch.setattr(stage, "label_fits", lambda *_: False)
-    with pytest.raises(InputError, match="--prior needs the whole cloud in memory"):
-        stage.run(scene, Label(prior=prior))
-
-
 def test_the_labels_of_before_are_no_prior(scene):
     with pytest.raises(InputError, match="is what label writes"):
         stage.run(scene, Label(prior=scene.seeds))

@@ -212,12 +212,11 @@ def test_by_tiles_it_is_the_same(tmp_path, monkeypatch):
     for module in (tiled_label, tiled_propagate):
         monkeypatch.setattr(module, "max_points", lambda *_: 4000)
     label_by_tiles(scene, Label(cloud=tmp_path / "whole.ply", output=tmp_path / "tiled.ply"))
-    label_scene(scene, Label(cloud=tmp_path / "whole.ply", output=tmp_path / "again.ply", surface="surfels"))
+    label_scene(scene, Label(cloud=tmp_path / "whole.ply", output=tmp_path / "again.ply"))
     first, second = (read_cloud(tmp_path / name).point for name in ("again.ply", "tiled.ply"))
     assert set(first) == set(second) and "votes_none" in first
-    for name in first:  # surfels by tile may differ in the last digit of a range, and so of a vote
-        allowed = 1e-3 if name.startswith("votes") or name == "confidence" else 0
-        np.testing.assert_allclose(first[name].numpy(), second[name].numpy(), atol=allowed, err_msg=name)
+    for name in first:
+        np.testing.assert_array_equal(first[name].numpy(), second[name].numpy(), err_msg=name)
     results = []
     for run, name in ((propagate_scene, "a.ply"), (propagate_by_tiles, "b.ply")):
         settings = Propagate(seeds=tmp_path / "tiled.ply", output=tmp_path / name)

@@ -158,14 +158,10 @@ def test_scale_must_be_known_on_both_sites_or_on_none(model, tmp_path, caplog):
     assert (labels_of(other)[0] == truth).mean() > 0.97
 
 
-def test_what_does_not_fit_together_is_refused_at_once(model, tmp_path, monkeypatch):
+def test_what_does_not_fit_together_is_refused_at_once(model):
     for wrong in (Propagate, replace):
         with pytest.raises(InputError, match="need --method map"):
             wrong(*([] if wrong is Propagate else [Propagate(model=model)]), method="knn", save_model=model)
-    scene, _ = site(tmp_path, 1, votes=False)
-    with pytest.raises(InputError, match="need the whole cloud in memory"):
-        monkeypatch.setattr(stage, "propagate_fits", lambda *_: False)
-        stage.run(scene, Propagate(model=model))
 
 
 def test_damaged_models_are_refused(model, tmp_path):

@@ -20,12 +20,14 @@ import pytest
 from sc3d.errors import InputError
 from sc3d.exporters import orthophoto, projected_cloud
 from sc3d.geometry.cameras import undistorted
+from sc3d.geometry.voxel_patches import surface_patches
 from sc3d.io.chunked_clouds import CloudFile
 from sc3d.io.clouds import read_cloud, read_mesh, write_geometry
 from sc3d.io.images import read_image
 from sc3d.io.ply import write_records
 from sc3d.report.tally import tally, tally_by_parts
 from sc3d.scene.cloud_parts import read_thinned
+from sc3d.scene.labelled_cloud import spacing_of, unit_normals
 from sc3d.scene.scene import Scene
 from sc3d.settings.common import Memory
 from sc3d.settings.labels import Evaluate, Label, PaperMechanisms, Propagate
@@ -36,10 +38,13 @@ from sc3d.synthetic.generate import synthesize
 from sc3d.tiling import label as tiled_label
 from sc3d.tiling import memory as plan
 from sc3d.tiling import propagate as tiled_propagate
-from sc3d.tiling import seen_points
+from sc3d.tiling import seen_points, voxel_parts
+from sc3d.tiling.executor import SerialExecutor
 from sc3d.tiling.first_surfaces import MeshParts, RangeMaps, read_triangles, write_ranges
+from sc3d.tiling.given_normals import TileNormals
 from sc3d.tiling.memory import memory_of
 from sc3d.tiling.store import CloudStatistics, TileStore
+from sc3d.tiling.voxel_parts import split_voxels
 from sc3d.tiling.work_folder import WorkFolder
 
 POINTS = 60_000
@@ -123,12 +128,53 @@ def test_there_are_several_tiles_of_the_size_asked_for(site):
     assert (np.bincount(grid.tile_of(points), minlength=len(held)) <= held).all()
 
 
-def test_without_a_mesh_the_surfels_by_tile_are_those_of_the_whole(site, small_tiles, tmp_path):
+@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize("surface", ["auto", "voxels", "surfels"])
+def test_without_a_mesh_the_points_hide_by_tile_what_they_hide_as_a_whole(
+    site, small_tiles, tmp_path, surface, given
+):
+    """Voxels, and surfels but for the last digit of a range, and so of a vote; with the cloud's own normals and with
+    estimated ones.
+    """
     shutil.copytree(site, tmp_path / "bare", ignore=shutil.ignore_patterns("*mesh.ply", ".*"))
-    whole = run_label(tmp_path / "bare", "whole", surface="surfels")
-    assert_same(whole, run_label(tmp_path / "bare", "tiled", surface="surfels", max_memory="2G"))
-    with pytest.raises(InputError, match="surface"):
-        run_label(tmp_path / "bare", "tiled", surface="voxels", max_memory="2G")
+    if not given:
+        cloud = read_cloud(tmp_path / "bare" / "cloud.ply")
+        del cloud.point["normals"]
+        write_geometry(tmp_path / "bare" / "cloud.ply", cloud)
+    whole = run_label(tmp_path / "bare", "whole", surface=surface)
+    tiled = run_label(tmp_path / "bare", "tiled", surface=surface, max_memory="2G")
+    weighed = [name for name in whole if name.startswith("votes") or name == "confidence"]
+    assert_same(whole, tiled, but=tuple(weighed) if surface == "surfels" else ())
+    for name in weighed:
+        assert (whole[name] != tiled[name]).mean() <= 1e-3, name
+        np.testing.assert_allclose(whole[name], tiled[name], atol=1e-3, err_msg=name)
+    assert (whole["num_views"] != run_label(tmp_path / "bare", "open", depth_filter=False)["num_views"]).any()
+
+
+def test_patches_of_the_tiles_are_those_of_the_whole(site, tmp_path, monkeypatch):
+    """Of all voxels, also of gaps that lie in tiles without points."""
+    cloud = CloudFile.open(site / "cloud.ply")
+    read, statistics = read_cloud(site / "cloud.ply").point, CloudStatistics.from_cloud(cloud)
+    points, low = read.positions.numpy(), statistics.extent.low
+    normals = unit_normals(read.normals.numpy(), points, np.zeros((1, 3)), low)
+    size = 2.5 * spacing_of(points)
+    whole, tables = surface_patches(points, normals, size), []
+    for room in (TILES, 4_000):
+        folder = tmp_path / str(room)
+        store = TileStore.build(cloud, statistics.grid(room), folder / "tiles")
+        assert len(store.tiles) >= 4
+        (folder / "patches").mkdir()
+        own = TileNormals(store, np.zeros((1, 3)), low, True)
+        arguments = (low, spacing_of(points), folder / "patches", SerialExecutor())
+        parts = split_voxels(store, own, *arguments, Memory())
+        np.testing.assert_array_equal(parts.origin, whole.grid.origin)
+        tables.append([np.load(parts.folder / name) for name in ("keys.npy", "shapes.npy")])
+    for keys, shapes in tables:
+        np.testing.assert_array_equal(keys, whole.keys)
+        np.testing.assert_array_equal(shapes, whole.shapes)
+    monkeypatch.setattr(voxel_parts, "PATCH", 10**5)
+    with pytest.raises(InputError, match="million voxels needs about .*, or choose --surface surfels"):
+        split_voxels(store, own, *arguments, Memory("1500M"))
 
 
 def test_what_no_second_photo_confirms_hides_as_the_mesh_does_by_tile_and_as_a_whole(
@@ -489,8 +535,13 @@ def labelled_site(site: Path) -> Scene:
     return Scene(site)
 
 
-def test_masks_by_tile_are_those_of_the_whole(site, small_tiles):
+@pytest.mark.parametrize("has_mesh", [True, False])
+def test_masks_by_tile_are_those_of_the_whole(site, small_tiles, tmp_path, has_mesh):
+    """Without a mesh, the points themselves hide what is behind them."""
     scene, found = labelled_site(site), []
+    if not has_mesh:
+        ignored = shutil.ignore_patterns("*mesh.ply", ".*", "export")
+        scene = Scene(shutil.copytree(site, tmp_path / "bare", ignore=ignored))
     for memory in ("", "2G"):
         export.run(scene, Export(format=("masks",), max_size=120, max_memory=memory))
         found.append([read_image(file) for file in sorted((scene.export / "masks").glob("*.png"))])

@@ -49,7 +49,7 @@ FUSE, MAP, RAYS, Z_BUFFER, NEIGHBORS, SKLEARN = (
 @dataclass(frozen=True)
 class FusionWorkload:
     """A cloud and the views that label it; masks are those of the scene. read: mask by view, kept in memory
-    so that no file is timed.
+    so that no file is timed; levels: as of `LabelledPoints`
     """
 
     cloud: Cloud
@@ -58,6 +58,7 @@ class FusionWorkload:
     masks: dict[str, Mask]
     surface: Surface
     num_channels: int
+    levels: np.ndarray | None = None
 
     def read(self, view: View) -> Mask:
         return self.masks[view.name.split("#")[0]]
@@ -120,6 +121,7 @@ def _workload(scene: Scene, masks: Masks, num_points: int) -> FusionWorkload:
         pictures,
         surface,
         scene.class_table().channels.count,
+        masks.table.levels(masks.channels),
     )
 
 
@@ -147,7 +149,9 @@ def _label(workload: FusionWorkload) -> Fusion:
 
 
 def _propagate(workload: FusionWorkload, fusion: Fusion) -> Labels:
-    evidence = LabelledPoints(workload.cloud.points, fusion.labels, fusion.votes, workload.colors)
+    evidence = LabelledPoints(
+        workload.cloud.points, fusion.labels, fusion.votes, workload.colors, levels=workload.levels
+    )
     return propagate(evidence, workload.cloud.normals, Propagate(method="map"))
 
 
