@@ -27,6 +27,7 @@ from typing import Any
 
 from sc3d.errors import InputError, Sc3dError
 from sc3d.io.atomic import (
+    file_state,
     full_folder,
     remove_leftovers,
     require_inside,
@@ -132,7 +133,7 @@ def _replacing(outputs: list[Path]) -> Iterator[None]:
     """Hide the sidecars: an output that is being replaced must not pass for finished. They come back if the
     block fails and no output has changed.
     """
-    before = [_identity(output) for output in outputs]
+    before = [file_state(output) for output in outputs]
     hidden = {
         path: path.with_name(f"{temporary_name(path.name)}.before")
         for path in map(sidecar, outputs)
@@ -143,21 +144,13 @@ def _replacing(outputs: list[Path]) -> Iterator[None]:
     try:
         yield
     except BaseException:  # Ctrl-C too
-        if [_identity(output) for output in outputs] == before:
+        if [file_state(output) for output in outputs] == before:
             for path, aside in hidden.items():
                 aside.rename(path)
         raise
     finally:
         for aside in hidden.values():
             aside.unlink(missing_ok=True)
-
-
-def _identity(path: Path) -> tuple[int, ...] | None:
-    """Changes whenever a file is replaced, or anything in a folder."""
-    with suppress(OSError):
-        found = path.lstat()
-        return found.st_ino, found.st_mtime_ns, found.st_size
-    return None
 
 
 @contextmanager

@@ -69,6 +69,14 @@ def temporary_name(name: str) -> str:
     return f".{name}.{HOST}-{os.getpid()}.tmp"
 
 
+def file_state(path: Path) -> tuple[int, ...] | None:
+    """Changes whenever a file is replaced or written, or the entries of a folder; None while there is none."""
+    with suppress(OSError):
+        found = path.lstat()
+        return found.st_ino, found.st_mtime_ns, found.st_size
+    return None
+
+
 def remove(path: Path) -> None:
     """Remove a file, link or folder, if it is there; of a link, not what it leads to."""
     if path.is_dir() and not path.is_symlink():
