@@ -203,9 +203,9 @@ def _class_id(name: str | None, table: ClassTable | None, origin: Path) -> int:
     return found
 
 
-def add_correction(scene: Scene, name: str | None, shape: Balls | Prism) -> None:
+def add_correction(scene: Scene, name: str | None, shape: Balls | Prism) -> str:
     """Write down that the points in a shape are of a class (None: of none), at once and after whatever
-    others wrote.
+    others wrote. Returns the key of the correction.
 
     Raises InputError for a class that no point can be of, a shape that is none, or a broken file.
     """
@@ -214,12 +214,16 @@ def add_correction(scene: Scene, name: str | None, shape: Balls | Prism) -> None
     entry = {"class": name} | shape.as_json()
     if scene.sparse.is_dir():
         entry["cameras"] = {name: pose.tolist() for name, pose in reference_of(scene.model.views).items()}
-    _append(scene.corrections, lambda _: entry)
+    return _append(scene.corrections, lambda _: entry)
 
 
-def undo(scene: Scene) -> Correction | None:
-    """Take the last correction that stands back, and return it; None if there is none."""
-    return _revoke(scene, "undo", lambda log: next(reversed(standing(log)), None))
+def undo(scene: Scene, key: str | None = None) -> Correction | None:
+    """Take the last correction that stands back, or the one of that key, and return it; None if there is none."""
+    return _revoke(
+        scene,
+        "undo",
+        lambda log: next((one for one in reversed(standing(log)) if key in (None, one.key)), None),
+    )
 
 
 def redo(scene: Scene) -> Correction | None:
@@ -266,16 +270,21 @@ def _is_made(entry: dict) -> bool:
     return "balls" in entry or "polygon" in entry
 
 
-def _append(path: Path, make: Callable[[list[dict]], dict[str, object] | None]) -> None:
-    """Add the entry that `make` gives for the present log, if it gives one; nobody else writes meanwhile."""
+def _append(path: Path, make: Callable[[list[dict]], dict[str, object] | None]) -> str:
+    """Add the entry that `make` gives for the present log, if it gives one; nobody else writes meanwhile.
+    Returns its key, "" without one.
+    """
     with locked(path):
         log = read_log(path) if path.exists() else []
         entry = make(log)
         if entry is None:
-            return
+            return ""
         now = datetime.now(timezone.utc).isoformat(timespec="seconds").replace("+00:00", "Z")
-        entry |= {"id": uuid.uuid4().hex, "time": now}
-        write_json(path, {"version": VERSION, "log": _checked([*log, entry], path)})
+        key = uuid.uuid4().hex
+        write_json(
+            path, {"version": VERSION, "log": _checked([*log, entry | {"id": key, "time": now}], path)}
+        )
+        return key
 
 
 def read_log(path: Path) -> list[dict]:

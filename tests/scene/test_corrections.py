@@ -118,6 +118,14 @@ def test_the_log_gives_back_what_was_added_undone_and_redone(scene):
     assert Corrections.of_scene(scene).ids == (3, 1)
 
 
+def test_one_of_several_is_taken_back_by_its_key(scene):
+    first, second = add_correction(scene, "grass", HERE), add_correction(scene, "road", EAST)
+    assert undo(scene, "other") is None
+    assert undo(scene, first).key == first and undo(scene, first) is None
+    assert [one.key for one in Corrections.of_scene(scene).corrections] == [second]
+    assert redo(scene).key == first and Corrections.of_scene(scene).ids == (3, 1)
+
+
 def test_writers_at_the_same_time_lose_nothing(scene):
     code = (
         "import sys, numpy as np; from pathlib import Path; from sc3d.scene.scene import Scene;"
