@@ -13,6 +13,10 @@ import pycolmap
 from PIL import Image
 
 from sc3d.geometry.cameras import View, look_at, rays
+from sc3d.io.clouds import write_geometry
+from sc3d.scene.channels import Channels
+from sc3d.scene.labelled_cloud import Votes, with_labels
+from sc3d.scene.labels import PROPAGATED, Labels
 from sc3d.scene.scene import Scene
 from sc3d.segmentation.instances import Instance
 from sc3d.segmentation.rle import find_runs
@@ -151,6 +155,34 @@ def labelled_scene(path: Path) -> Scene:
             path / "images" / view.name
         )
     return Scene(path)
+
+
+LARGE, SMALL = np.array([2.0, 2.0]), np.array([-2.0, -1.5])  # middles of two doubtful places, m
+LARGE_SIZE, SMALL_SIZE = 0.8, 0.5  # their radii
+
+
+def doubtful_scene(path: Path) -> Scene:
+    """Road and grass with labels that are sure but for a large place in the grass and a small one on the road, of
+    which some views say the other class; seeds.ply has the votes.
+    """
+    scene = labelled_scene(path)
+    points = ground()
+    local, label = points[:, :2] - ORIGIN[:2], np.where(points[:, 0] < ORIGIN[0], 1, 3).astype(np.uint8)
+    large, small = (
+        np.linalg.norm(local - middle, axis=1) < size
+        for middle, size in ((LARGE, LARGE_SIZE), (SMALL, SMALL_SIZE))
+    )
+    confidence = np.where(large, 0.5, np.where(small, 0.4, 0.99)).astype(np.float32)
+    state = np.full(len(points), PROPAGATED, np.uint8)
+    labels = Labels(label, confidence, state, np.ones(len(points), np.int32))
+    votes = np.where(large | small, [[0], [1.5], [2]], [[0], [0], [2]]).T.astype(np.float32)
+    votes[label == 1] = votes[label == 1][:, [0, 2, 1]]
+    bare = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
+    normals = np.tile(np.float32([0, 0, 1]), (len(points), 1))
+    write_geometry(scene.labelled, with_labels(bare, normals, labels))
+    seeds = with_labels(bare, normals, labels, Votes(votes, Channels.of_classes([1, 3])))
+    write_geometry(scene.seeds, seeds)
+    return Scene(scene.path)
 
 
 def inspector_of(scene: Scene) -> Inspector:

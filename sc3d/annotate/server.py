@@ -19,8 +19,9 @@ from socketserver import TCPServer
 from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 
+from sc3d.annotate.asking import StaleError
 from sc3d.annotate.session import BusyError, Session
-from sc3d.annotate.suggestions import StaleError, Suggestions
+from sc3d.annotate.suggestions import Suggestions
 from sc3d.errors import InputError
 from sc3d.io.local_page import LocalPage
 

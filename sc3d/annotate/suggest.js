@@ -11,20 +11,24 @@ async function go(path, content) {
   if (busy) return;
   busy = true;
   document.body.dataset.busy = "yes";
-  try {
-    now = await ask(path, content);
-    if (now.place !== null && now.stem !== stem) {
-      image = await ask(`/photo/${encodeURIComponent(now.stem)}`);
-      stem = now.stem;
-    }
-    wide = false;
-    show();
-  } catch (error) {
+  await take(path, content).catch(async error => {
+    if (error.status === 409) await take("/question").catch(() => {}); // what is asked now
     $("status").textContent = error.message;
     $("status").className = "bad";
-  }
+  });
   busy = false;
   document.body.dataset.busy = "no";
+}
+
+async function take(path, content) {
+  const before = now?.place;
+  now = await ask(path, content);
+  if (now.place !== null && now.stem !== stem) {
+    image = await ask(`/photo/${encodeURIComponent(now.stem)}`);
+    stem = now.stem;
+  }
+  wide = wide && now.place === before;
+  show();
 }
 
 const answer = name => { if (now?.place != null) go("/answer", { place: now.place, class: name }); };
@@ -38,7 +42,7 @@ function show() {
   $("question").textContent = done
     ? "Nothing is left to ask. Run sc3d propagate to use the answers."
     : `${now.points} points are labelled ${now.label}${now.rival ? `, some views say ${now.rival}` : ""} · ${now.name}`;
-  $("undo").disabled = !now.answered;
+  $("undo").disabled = !now.own;
   $("skip").disabled = $("wide").disabled = done;
   $("wide").setAttribute("aria-pressed", wide);
   const list = $("classes");
@@ -113,6 +117,7 @@ document.addEventListener("keydown", event => {
 $("undo").addEventListener("click", undo);
 $("skip").addEventListener("click", skip);
 $("wide").addEventListener("click", toggle);
+document.addEventListener("visibilitychange", () => { if (!document.hidden && now) go("/question"); }); // others may have answered
 new ResizeObserver(draw).observe(canvas);
 
 ask("/scene").then(scene => { $("scene").textContent = document.title = scene.scene; return go("/question"); })

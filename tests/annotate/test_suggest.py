@@ -9,29 +9,25 @@ import threading
 from dataclasses import replace
 
 import numpy as np
-import open3d as o3d
 import pytest
 from PIL import Image
 
+from sc3d.annotate.asking import StaleError
 from sc3d.annotate.questions import Evidence, doubt_of, rank_places, rivals_of
 from sc3d.annotate.server import AnnotationServer, SuggestHandler
-from sc3d.annotate.suggestions import StaleError, Suggestions
+from sc3d.annotate.suggestions import Suggestions
 from sc3d.cli import main
 from sc3d.errors import InputError
 from sc3d.geometry.cameras import project
 from sc3d.io.clouds import read_cloud, write_geometry
-from sc3d.scene.channels import Channels
-from sc3d.scene.corrections import Corrections
-from sc3d.scene.labelled_cloud import Votes, with_labels
-from sc3d.scene.labels import CORRECTED, LOCKED, PROPAGATED, SEED, Labels
+from sc3d.scene.corrections import Balls, Corrections, add_correction, undo
+from sc3d.scene.labels import CORRECTED, LOCKED, SEED
 from sc3d.scene.scene import Scene
 from tests.annotate.test_annotate import ask, browser  # noqa: F401
-from tests.builders import ORIGIN, labelled_scene
+from tests.builders import LARGE, ORIGIN, doubtful_scene
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 ROAD, GRASS = 1, 3
-LARGE, SMALL = np.array([2.0, 2.0]), np.array([-2.0, -1.5])  # middles of two doubtful places, m
-SIZES = {0: 0.8, 1: 0.5}
 
 
 def known(points: np.ndarray | None = None) -> Evidence:
@@ -118,26 +114,7 @@ def test_colors_divide_places():
 
 @pytest.fixture
 def scene(tmp_path):
-    scene = labelled_scene(tmp_path / "scene")
-    cloud = read_cloud(scene.labelled)
-    points = cloud.point.positions.numpy()
-    local = points[:, :2] - ORIGIN[:2]
-    near = [
-        np.linalg.norm(local - middle, axis=1) < size
-        for middle, size in zip((LARGE, SMALL), (0.8, 0.5), strict=True)
-    ]
-    label = np.where(local[:, 0] < 0, ROAD, GRASS).astype(np.uint8)
-    confidence = np.where(near[0], 0.5, np.where(near[1], 0.4, 0.99)).astype(np.float32)
-    state = np.full(len(points), PROPAGATED, np.uint8)
-    labels = Labels(label, confidence, state, np.ones(len(points), np.int32))
-    votes = np.where(near[0] | near[1], [[0], [1.5], [2]], [[0], [0], [2]]).T.astype(np.float32)
-    votes[label == ROAD] = votes[label == ROAD][:, [0, 2, 1]]
-    bare = o3d.t.geometry.PointCloud(cloud.point.positions)
-    normals = np.tile(np.float32([0, 0, 1]), (len(points), 1))
-    write_geometry(scene.labelled, with_labels(bare, normals, labels))
-    seeds = with_labels(bare, normals, labels, Votes(votes, Channels.of_classes([ROAD, GRASS])))
-    write_geometry(scene.seeds, seeds)
-    return Scene(scene.path)
+    return doubtful_scene(tmp_path / "scene")
 
 
 @pytest.fixture
@@ -183,8 +160,10 @@ def test_answers_are_corrections_and_undo_takes_them_back(scene):
         page.answer(first["place"], "road")
     last = page.skip(second["place"])
     assert last["place"] is None and last["skipped"] == 1
+    assert last["own"] == 1
     again = page.undo()
-    assert again["place"] == first["place"] and again["answered"] == 0 and not corrected(scene)
+    assert again["place"] == first["place"] and again["answered"] == again["own"] == 0
+    assert not corrected(scene)
     page.answer(again["place"], None)
     assert corrected(scene)[0][0] is None
     assert Suggestions(scene).question()["points"] < first["points"]  # what is answered is not asked again
@@ -296,7 +275,27 @@ def test_two_windows_do_not_answer_one_place_twice(page, browser, server, scene)
     load(other, server)
     page.keyboard.press("1")
     page.wait_for_selector("#status:has-text('1 answered')")
+    asked = other.inner_text("#question")
     other.keyboard.press("2")
-    other.wait_for_selector("#status.bad:has-text('reload the page')")
+    other.wait_for_selector("#status.bad:has-text('nothing is written')")
     assert [name for name, _ in corrected(scene)] == ["road"]
+    assert other.inner_text("#question") == page.inner_text("#question") != asked  # what is asked now
+    other.keyboard.press("2")
+    other.wait_for_selector("#status:not(.bad):has-text('2 answered')")
     other.close()
+
+
+def test_what_is_answered_elsewhere_is_seen_on_return(page, scene):
+    """In the viewer, say; and an answer of this page that was taken back there is not taken back twice."""
+    asked = page.inner_text("#question")
+    page.keyboard.press("1")
+    page.wait_for_selector("#status:has-text('1 answered')")
+    undo(scene)
+    page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    page.wait_for_selector("#status:has-text('0 answered')")
+    assert page.inner_text("#question") == asked
+    add_correction(scene, "grass", Balls(((ORIGIN[None], 20.0),)))
+    page.keyboard.press("Control+z")
+    page.wait_for_selector("#status.bad:has-text('taken back elsewhere')")
+    assert page.inner_text("#question").startswith("Nothing is left") and page.is_disabled("#undo")
+    assert [name for name, _ in corrected(scene)] == ["grass"]
