@@ -5,6 +5,7 @@ photographed from above; clouds with labels.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from sc3d.geometry.cameras import View, look_at, rays
 from sc3d.io.clouds import write_geometry
 from sc3d.scene.channels import Channels
 from sc3d.scene.labelled_cloud import Votes, with_labels
-from sc3d.scene.labels import PROPAGATED, Labels
+from sc3d.scene.labels import PROPAGATED, SEED, Labels
 from sc3d.scene.scene import Scene
 from sc3d.segmentation.instances import Instance
 from sc3d.segmentation.rle import find_runs
@@ -173,15 +174,16 @@ def doubtful_scene(path: Path) -> Scene:
         for middle, size in ((LARGE, LARGE_SIZE), (SMALL, SMALL_SIZE))
     )
     confidence = np.where(large, 0.5, np.where(small, 0.4, 0.99)).astype(np.float32)
-    state = np.full(len(points), PROPAGATED, np.uint8)
-    labels = Labels(label, confidence, state, np.ones(len(points), np.int32))
+    count = len(points)
+    labels = Labels(label, confidence, np.full(count, PROPAGATED, np.uint8), np.full(count, 3, np.int32))
     votes = np.where(large | small, [[0], [1.5], [2]], [[0], [0], [2]]).T.astype(np.float32)
     votes[label == 1] = votes[label == 1][:, [0, 2, 1]]
     bare = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
     normals = np.tile(np.float32([0, 0, 1]), (len(points), 1))
     write_geometry(scene.labelled, with_labels(bare, normals, labels))
-    seeds = with_labels(bare, normals, labels, Votes(votes, Channels.of_classes([1, 3])))
-    write_geometry(scene.seeds, seeds)
+    seeds = replace(labels, state=np.full(count, SEED, np.uint8))
+    cast = Votes(votes, Channels.of_classes([1, 3]))
+    write_geometry(scene.seeds, with_labels(bare, normals, seeds, cast))
     return Scene(scene.path)
 
 

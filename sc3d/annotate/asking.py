@@ -60,6 +60,8 @@ class Asking:
         self._scene, self._views, self._make_surface = scene, views, surface
         self._lock = threading.RLock()
         self._own, self._first, self._places = list[str](), 0, list[Place]()
+        self._asked: Asked | None = None
+        self._num_open = np.zeros(0, np.int64)  # points of each place that are not corrected
         self._load()
 
     @property
@@ -174,7 +176,7 @@ class Asking:
         unsure = np.where(known.label == 0, 1, 1 - known.confidence.astype(np.float64))
         self._unsure = np.where(known.state == CORRECTED, 0, unsure)
         self._skipped, self._unseen = set[int](), set[int]()
-        self._asked: Asked | None = None
+        self._asked = None
         self._photos = BestPhoto(known, self._views, lambda: self._make_surface(known.points))
         self._inside = dict[str, np.ndarray]()  # rows of the cloud, by the key of a correction
         self._settle()

@@ -44,7 +44,8 @@ class BestPhoto:
     """Finds the photo of places of one cloud; the surface that hides them is made when it is first needed."""
 
     def __init__(self, known: Evidence, views: Sequence[View], surface: Callable[[], RayTarget]) -> None:
-        self._known, self._views, self._make, self._made = known, views, surface, None
+        self._known, self._views, self._make = known, views, surface
+        self._made: RayTarget | None = None
 
     def find(self, rows: np.ndarray) -> Shown | None:
         """Where most of a place is seen, large; None if no photo sees enough of it. rows: (R,) of its points"""

@@ -146,7 +146,7 @@ class Inspector:
             else f"state {value['state']}"
         )
         photos = (
-            photos_that_see(self._points[row], self._normal(row), self.views, self._surface, self._voxel_size)
+            photos_that_see(self._points[row], self._normal(row), self.views, self.surface, self._voxel_size)
             if self.views and self._surface_fits
             else []
         )
@@ -194,20 +194,25 @@ class Inspector:
 
     @cached_property
     def _surface_fits(self) -> bool:
-        held = len(self._points) * SHOWN_BYTES
-        surface = surface_bytes(self._files) or 2 * TRIANGLE * len(
-            self._points
-        )  # two triangles of each surfel
-        found = fits(held + surface, self._memory)
+        found = self.has_room(0)
         if not found:
             logger.warning(
                 "which photos see a point is not told: the surface, %.1f GiB, does not fit into memory beside the cloud",
-                surface / (1 << 30),
+                self._surface_bytes / (1 << 30),
             )
         return found
 
+    @property
+    def _surface_bytes(self) -> int:
+        return surface_bytes(self._files) or 2 * TRIANGLE * len(self._points)  # two triangles of each surfel
+
+    def has_room(self, num_bytes: int) -> bool:
+        """Whether so much fits into memory beside the cloud and the surface."""
+        return fits(len(self._points) * SHOWN_BYTES + self._surface_bytes + num_bytes, self._memory)
+
     @cached_property
-    def _surface(self) -> RayTarget:
+    def surface(self) -> RayTarget:
+        """What hides points from photos."""
         logger.info("preparing the surface, to find out which photos see a point ...")
         normals = self.cloud.point.normals.cpu().numpy() if "normals" in self.cloud.point else None
         return read_surface(self._files, self._points, normals, local_origin(self.views))

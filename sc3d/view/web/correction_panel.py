@@ -7,12 +7,12 @@ import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import fields
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sc3d.errors import InputError, Sc3dError
+from sc3d.io.atomic import file_state
 from sc3d.io.json_files import read_json
 from sc3d.io.python_process import run_python
 from sc3d.runner import sidecar
@@ -22,7 +22,8 @@ from sc3d.scene.scene import Scene
 from sc3d.scene.selection import balls_around, region_around, seen_in_lasso
 from sc3d.settings.labels import Propagate
 from sc3d.view.picking import point_on_ray
-from sc3d.view.web.panel import Page, ShowPanel
+from sc3d.view.web.layers import MarkLayer
+from sc3d.view.web.panel import Page, ShowPanel, note_html
 
 if TYPE_CHECKING:
     import viser
@@ -37,7 +38,8 @@ HINTS = {
     BRUSH: "Shift + click: a ball around the point",
     LASSO: "Shift + click: a corner; Close lasso: what is seen in it",
 }
-_COVER, _LASSO_COLOR, _LASSO_WIDTH = 1.6, (255, 0, 200), 3.0  # of a marked point, in sizes of a shown one; px
+COVER = 1.6  # of a marked point, in spacings of the shown ones
+_LASSO_COLOR, _LASSO_WIDTH = (255, 0, 200), 3.0  # px
 _DAY = 24 * 3600.0
 
 
@@ -48,9 +50,11 @@ class CorrectionPanel:
         self._page, self._show, self._busy = page, show, threading.RLock()
         self._eye, self._corners = np.zeros(3), list[np.ndarray]()
         self._lasso: viser.SceneNodeHandle | None = None
-        self._marked: viser.SceneNodeHandle | None = None
+        self._marked = MarkLayer(page.server, "corrected", COVER)
         self._applying = threading.Lock()
         self._on_start: list[Callable[[], None]] = []
+        self._on_done: list[Callable[[], None]] = []
+        self._read: tuple[int, ...] | None = None  # state of corrections.json when it was shown
         self._inside = dict[str, np.ndarray]()  # rows of the display, by correction
         self._world = page.inspector.cloud.point.positions.cpu().numpy().astype(np.float64)[page.display.rows]
         table, gui, spacing = page.display.class_table, page.server.gui, page.display.spacing
@@ -75,6 +79,15 @@ class CorrectionPanel:
         """Call an action when a tool is chosen: other tools answer the same clicks."""
         self._on_start.append(action)
 
+    def on_done(self, action: Callable[[], None]) -> None:
+        """Call an action after whatever was done here: corrections or labels may have changed."""
+        self._on_done.append(action)
+
+    def follow(self) -> None:
+        """Show corrections that were made or taken back elsewhere."""
+        if file_state(self._page.scene.corrections) != self._read:
+            self._try(self._mark)
+
     def stop(self) -> None:
         """Put the tool away."""
         if self._tool.value != OFF:
@@ -88,9 +101,11 @@ class CorrectionPanel:
             except (Sc3dError, OSError) as error:
                 logger.warning("%s", error)
                 self._say(str(error))
+        for follow in self._on_done:  # without the lock: they may wait for what waits for it
+            follow()
 
     def _say(self, text: str) -> None:
-        self._text.content = f"<small style='padding:0 .75em'>{escape(text)}</small>"
+        self._text.content = note_html(text)
 
     def _choose(self) -> None:
         self._close.visible, self._radius.visible = self._tool.value == LASSO, self._tool.value == BRUSH
@@ -147,7 +162,8 @@ class CorrectionPanel:
         """Show the corners of the lasso so far, at the distance of the middle of the scene."""
         self._corners, scene = corners, self._page.server.scene
         if not corners:
-            _remove(self._lasso)
+            if self._lasso is not None:
+                self._lasso.remove()
             self._lasso = None
             return
         far = float(np.linalg.norm(self._page.display.middle - self._eye)) / 2
@@ -171,25 +187,18 @@ class CorrectionPanel:
 
     def _mark(self, done: str = "") -> None:
         """Show what is corrected and not yet in the labels."""
+        self._read = file_state(self._page.scene.corrections)
         found, display = Corrections.of_scene(self._page.scene), self._page.display
         label = display.label.astype(np.int16)
         for row, given in enumerate(found.ids):
             label[self._rows_in(found, row)] = given
         rows = np.flatnonzero(label != display.label)
-        if len(rows) and display.class_table is not None:
-            size = _COVER * display.spacing_at(self._page.cloud.count)
-            colors = display.class_table.palette[label[rows]]
-            self._marked = self._page.server.scene.add_point_cloud(
-                "/corrected",
-                display.points[rows],
-                colors,
-                point_size=size,
-                precision="float32",
-                point_shading="flat",
+        if display.class_table is not None:
+            colors, spacing = (
+                display.class_table.palette[label[rows]],
+                display.spacing_at(self._page.cloud.count),
             )
-        else:
-            _remove(self._marked)
-            self._marked = None
+            self._marked.show(display.points[rows], colors, spacing)
         count = f"corrections: {len(found.ids)}; points that wait for Apply: {len(rows)}"
         self._say(f"{done}: {count}" if done else count if found.ids else HINTS[self._tool.value])
 
@@ -207,11 +216,6 @@ class CorrectionPanel:
             self._page.display.relabel(labelled)
             self._show.relabel()
             self._mark("applied")
-
-
-def _remove(node: viser.SceneNodeHandle | None) -> None:
-    if node is not None:
-        node.remove()
 
 
 def propagate_again(scene: Scene) -> None:

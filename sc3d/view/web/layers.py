@@ -138,6 +138,30 @@ class CloudLayer:
         return handles
 
 
+class MarkLayer:
+    """Points that are drawn once more, larger and in colors of their own; none at the start."""
+
+    def __init__(self, server: viser.ViserServer, name: str, cover: float) -> None:
+        """name: of its node in the scene tree; cover: side of a point, in point spacings"""
+        self._scene, self._name, self._cover = server.scene, f"/{name}", cover
+        self._handle: viser.PointCloudHandle | None = None
+
+    def show(self, points: np.ndarray, colors: np.ndarray, spacing: float) -> None:
+        """Mark these points and no others. points: (K, 3) float32; colors: (K, 3) uint8; spacing: of those shown"""
+        if self._handle is not None:
+            self._handle.remove()
+        self._handle = None
+        if len(points):
+            self._handle = self._scene.add_point_cloud(
+                self._name,
+                points,
+                colors,
+                point_size=self._cover * spacing,
+                precision="float32",
+                point_shading="flat",
+            )
+
+
 class SplatLayer:
     """The Gaussians, a node per class, or one node if they have no labels; loaded when they are first shown."""
 

@@ -33,6 +33,7 @@ from sc3d.view.web.layers import CameraLayer, CloudLayer, SplatLayer
 from sc3d.view.web.measure_panel import MeasurePanel
 from sc3d.view.web.orbit_camera import OrbitCamera
 from sc3d.view.web.panel import Page, PhotoPanel, PointPanel, ShowPanel, legend_html
+from sc3d.view.web.question_panel import QuestionPanel
 
 if TYPE_CHECKING:
     import viser
@@ -88,7 +89,7 @@ def serving(view: WebView, host: str = LOCAL, port: int = 0) -> Iterator[str]:
     Raises MissingPackageError without viser.
     """
     display = _display_cloud(view)
-    with _server(host, port) as server:
+    with _server(host, port) as server, contextlib.ExitStack() as ending:
         hidden = _hidden(view, display)
         cloud = CloudLayer(server, display, "cloud", view.by, hidden)
         cloud.show_points(view.num_points or PAGE_POINTS)
@@ -108,6 +109,8 @@ def serving(view: WebView, host: str = LOCAL, port: int = 0) -> Iterator[str]:
             correct = CorrectionPanel(page, show)
             measure.on_start(correct.stop)
             correct.on_start(measure.stop)
+            if view.scene.labelled.exists() and view.inspector.views:
+                ending.callback(_ask(page, correct).close)
         if views:
             photos = PhotoPanel(page, home)
             if view.photo is not None:
@@ -206,6 +209,14 @@ def _display_cloud(view: WebView) -> DisplayCloud:
 
 def _hidden(view: WebView, display: DisplayCloud) -> set[int]:
     return set() if view.classes is None else ({0} | set(display.class_counts)) - view.classes
+
+
+def _ask(page: Page, correct: CorrectionPanel) -> QuestionPanel:
+    """Questions whose answers are corrections: what one panel does, the other shows."""
+    questions = QuestionPanel(page)
+    questions.on_done(correct.follow)
+    correct.on_done(questions.follow)
+    return questions
 
 
 def _start(server: viser.ViserServer, view: WebView, display: DisplayCloud, views: list[View]) -> OrbitCamera:

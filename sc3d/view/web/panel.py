@@ -18,7 +18,7 @@ from sc3d.scene.scene import Scene
 from sc3d.view.colors import Coloring, color_scale, legend_entries
 from sc3d.view.display_cloud import DisplayCloud
 from sc3d.view.picking import Inspector, PickedPoint, point_on_ray
-from sc3d.view.web.layers import CameraLayer, CloudLayer, SplatLayer
+from sc3d.view.web.layers import CameraLayer, CloudLayer, MarkLayer, SplatLayer
 from sc3d.view.web.orbit_camera import OrbitCamera
 from sc3d.view.web.photos import PhotoPictures, photo_pictures, thumbnail
 
@@ -155,7 +155,7 @@ class PhotoPanel:
         self._page, self._home, self._views = page, home, {view.name: view for view in page.views}
         gui = page.server.gui
         with gui.add_folder("Photo"):
-            gui.add_html(_note("click a camera, or choose by name"))
+            gui.add_html(note_html("click a camera, or choose by name"))
             self._names = gui.add_dropdown("Photo", (_NO_PHOTO, *self._views), initial_value=_NO_PHOTO)
             self._names.on_update(lambda _: self._show(self._names.value))
             buttons = gui.add_button_group("View", ("Through it", "Overview"))
@@ -199,9 +199,9 @@ class PointPanel:
 
     def __init__(self, page: Page, panel: ShowPanel) -> None:
         self._page, self._panel, self._busy = page, panel, threading.Lock()
-        self._marked: viser.PointCloudHandle | None = None
+        self._marked = MarkLayer(page.server, "object", _OBJECT_COVER)
         with page.server.gui.add_folder("Point"):
-            self._text = page.server.gui.add_html(_note(_PICK_HINT))
+            self._text = page.server.gui.add_html(note_html(_PICK_HINT))
         page.server.scene.on_click(modifier="cmd/ctrl")(
             lambda event: self._pick(np.array(event.ray_origin), np.array(event.ray_direction))
         )
@@ -234,18 +234,8 @@ class PointPanel:
         display = self._page.display
         rows = display.rows_of_object(number) if number else np.zeros(0, np.int64)
         rows = rows[rows < self._page.cloud.count]
-        if self._marked is not None:
-            self._marked.remove()
-        self._marked = None
-        if len(rows):
-            self._marked = self._page.server.scene.add_point_cloud(
-                "/object",
-                display.points[rows],
-                np.tile(np.array(_OBJECT_COLOR, np.uint8), (len(rows), 1)),
-                point_size=_OBJECT_COVER * display.spacing_at(self._page.cloud.count),
-                precision="float32",
-                point_shading="flat",
-            )
+        colors = np.tile(np.array(_OBJECT_COLOR, np.uint8), (len(rows), 1))
+        self._marked.show(display.points[rows], colors, display.spacing_at(self._page.cloud.count))
 
 
 def legend_html(by: Coloring, display: DisplayCloud) -> str:
@@ -274,11 +264,11 @@ def pictures_html(found: PhotoPictures) -> str:
     withdraws while they load.
     """
     pictures = [
-        f"{_note(label)}<img alt='{label}' style='display:block;width:100%' src='{data_uri(picture)}'>"
+        f"{note_html(label)}<img alt='{label}' style='display:block;width:100%' src='{data_uri(picture)}'>"
         for label, picture in (("photo", found.photo), ("mask", found.mask))
         if picture is not None
     ]
-    return f"<div style='padding:.25em .75em'>{''.join(pictures)}</div>{_note(found.note)}"
+    return f"<div style='padding:.25em .75em'>{''.join(pictures)}</div>{note_html(found.note)}"
 
 
 def point_html(picked: PickedPoint) -> str:
@@ -291,7 +281,8 @@ def point_html(picked: PickedPoint) -> str:
     return f"<div style='padding:0 .75em;font-size:.8em;line-height:1.4'><table>{rows}</table></div>"
 
 
-def _note(text: str) -> str:
+def note_html(text: str) -> str:
+    """A line of small text, as HTML; nothing for no text."""
     return f"<small style='padding:0 .75em'>{escape(text)}</small>" if text else ""
 
 
