@@ -275,10 +275,10 @@ class CameraLayer:
             if name in images or handle.image is not None:
                 handle.image = images.get(name)
 
-    def hide(self, hidden: str | None) -> None:
-        """Hide this camera, which would stand before the eyes of who looks through it, and show all others."""
+    def hide(self, hidden: Collection[str]) -> None:
+        """Hide these cameras, which would stand before the eyes, and show all others."""
         for name, handle in self._handles.items():
-            handle.visible = name != hidden
+            handle.visible = name not in hidden
 
     def mark(self, names: Sequence[str]) -> None:
         """Another color for these cameras, and for no others."""

@@ -168,7 +168,7 @@ class PhotoPanel:
         self._names.value = name  # type: ignore[misc]  # calls `_show`; viser types it as read-only
 
     def _show(self, name: str) -> None:
-        self._page.cameras.hide(None)
+        self._page.cameras.hide(())
         found = None
         if name != _NO_PHOTO:
             found = photo_pictures(
@@ -185,10 +185,10 @@ class PhotoPanel:
     def _look(self, client: viser.ClientHandle | None, where: str) -> None:
         name = self._names.value
         if client is not None and where == "Overview":
-            self._page.cameras.hide(None)
+            self._page.cameras.hide(())
             self._home.move(client)
         elif client is not None and name != _NO_PHOTO:
-            self._page.cameras.hide(name)
+            self._page.cameras.hide((name,))
             OrbitCamera.from_view(self._views[name], self._page.display.middle, upright=False).move(client)
 
 
@@ -283,7 +283,7 @@ def point_html(picked: PickedPoint) -> str:
 
 def note_html(text: str) -> str:
     """A line of small text, as HTML; nothing for no text."""
-    return f"<small style='padding:0 .75em'>{escape(text)}</small>" if text else ""
+    return f"<small style='display:block;padding:0 .75em'>{escape(text)}</small>" if text else ""
 
 
 def _css(color: tuple[int, int, int] | np.ndarray) -> str:

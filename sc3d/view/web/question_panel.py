@@ -100,8 +100,10 @@ class QuestionPanel:
                 self._try(self._next)
 
     def close(self) -> None:
-        """End all that runs beside the page."""
+        """End all that runs beside the page, which ends."""
         self._ended.set()
+        with self._busy:
+            self._asking = None
 
     def _press(self, action: Callable[[], None], event: viser.GuiEvent | viser.CommandEvent) -> None:
         """Do what a button or key of a browser means, if nothing else is being done."""
@@ -160,7 +162,7 @@ class QuestionPanel:
         self._ended.set()
         self._asking = self._asked = None
         self._draw()
-        self._page.cameras.hide(None)
+        self._page.cameras.hide(())
         for command in self._commands:
             command.remove()
         self._commands.clear()
@@ -226,8 +228,9 @@ class QuestionPanel:
 
     def _fly(self) -> None:
         """Take the browsers that take part to the place that is asked about."""
-        asked, cameras, display = self._asked, self._page.cameras, self._page.display
-        cameras.hide(None if asked is None else asked.shown.view.name)  # which would stand before the eye
+        asked, display = self._asked, self._page.display
+        # the eye is on the way to a camera, and others stand around it
+        self._page.cameras.hide(() if asked is None else [view.name for view in self._page.views])
         if asked is None:
             return
         points, line = asked.known.points[asked.place.rows] - display.origin, asked.shown.line
