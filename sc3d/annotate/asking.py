@@ -1,4 +1,5 @@
-"""Asking about the doubtful places of a scene, one after the other, whatever page shows them: which is asked about,
+"""Asking about the doubtful places of a scene, one after the other, whatever page shows them: which is
+asked about,
 what an answer writes, and what was answered or taken back elsewhere.
 
 What counts as answered is what `corrections.json` says, so that pages, tabs and programs follow one another.
@@ -26,14 +27,16 @@ from sc3d.scene.selection import balls_within
 
 
 class StaleError(InputError):
-    """What was meant has changed elsewhere: the answer is to a place that is not asked about any more, or the answer
+    """What was meant has changed elsewhere: the answer is to a place that is not asked about any more, or
+    the answer
     that should be taken back does not stand.
     """
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked about. number: which is never given again, also after new labels; place: its points that are
+    """What is asked about. number: which is never given again, also after new labels; place: its points
+    that are
     not corrected; shown: the photo that sees it best; known: of the points
     """
 
@@ -44,7 +47,8 @@ class Asked:
 
 
 class Asking:
-    """The questions of a scene. Those first where an answer changes most, but for the places that are answered,
+    """The questions of a scene. Those first where an answer changes most, but for the places that are
+    answered,
     skipped, or in no photo. All methods look first at what changed in the scene's files, and may be called by
     several threads.
     """
@@ -197,7 +201,9 @@ class Asking:
 
 
 def evidence_of_scene(scene: Scene) -> Evidence:
-    """The labels of a scene and the votes that they are from, without the corrections that they do not have yet."""
+    """The labels of a scene and the votes that they are from, without the corrections that they do not
+    have yet.
+    """
     cloud, labels = read_labelled(scene.labelled, "propagate")
     points = cloud.point.positions.numpy().astype(np.float64)
     votes = _votes(scene, len(points))

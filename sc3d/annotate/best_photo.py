@@ -33,7 +33,9 @@ class Line:
 
 @dataclass(frozen=True)
 class Shown:
-    """Where a place is seen: the view, the rows of its points that are, and a line from about their middle."""
+    """Where a place is seen: the view, the rows of its points that are, and a line from about their
+    middle.
+    """
 
     view: View
     rows: np.ndarray
@@ -48,7 +50,9 @@ class BestPhoto:
         self._made: RayTarget | None = None
 
     def find(self, rows: np.ndarray) -> Shown | None:
-        """Where most of a place is seen, large; None if no photo sees enough of it. rows: (R,) of its points"""
+        """Where most of a place is seen, large; None if no photo sees enough of it. rows: (R,) of its
+        points
+        """
         points = self._known.points[rows[:: max(1, len(rows) // PROBES)]]
         sizes = []
         for view in self._views:

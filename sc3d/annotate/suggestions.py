@@ -1,4 +1,5 @@
-"""What the page of `sc3d annotate --suggest` can do: show the place that is asked about in the photo that sees it
+"""What the page of `sc3d annotate --suggest` can do: show the place that is asked about in the photo that
+sees it
 best, and take the answer. Knows nothing of HTTP.
 """
 
@@ -79,7 +80,8 @@ class Suggestions(Session):
         return self.question()
 
     def undo(self) -> dict[str, object]:
-        """Take the last answer of this page back, so that it is asked again; without one, the question as it is.
+        """Take the last answer of this page back, so that it is asked again; without one, the question as
+        it is.
 
         Raises StaleError if it does not stand any more.
         """

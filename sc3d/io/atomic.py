@@ -70,7 +70,9 @@ def temporary_name(name: str) -> str:
 
 
 def file_state(path: Path) -> tuple[int, ...] | None:
-    """Changes whenever a file is replaced or written, or the entries of a folder; None while there is none."""
+    """Changes whenever a file is replaced or written, or the entries of a folder; None while there is
+    none.
+    """
     with suppress(OSError):
         found = path.lstat()
         return found.st_ino, found.st_mtime_ns, found.st_size

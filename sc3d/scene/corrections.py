@@ -218,7 +218,9 @@ def add_correction(scene: Scene, name: str | None, shape: Balls | Prism) -> str:
 
 
 def undo(scene: Scene, key: str | None = None) -> Correction | None:
-    """Take the last correction that stands back, or the one of that key, and return it; None if there is none."""
+    """Take the last correction that stands back, or the one of that key, and return it; None if there is
+    none.
+    """
     return _revoke(
         scene,
         "undo",

@@ -147,7 +147,9 @@ class MarkLayer:
         self._handle: viser.PointCloudHandle | None = None
 
     def show(self, points: np.ndarray, colors: np.ndarray, spacing: float) -> None:
-        """Mark these points and no others. points: (K, 3) float32; colors: (K, 3) uint8; spacing: of those shown"""
+        """Mark these points and no others. points: (K, 3) float32; colors: (K, 3) uint8; spacing: of those
+        shown
+        """
         if self._handle is not None:
             self._handle.remove()
         self._handle = None

@@ -1,4 +1,6 @@
-"""The part of the panel that asks about doubtful places: flies to one, marks it, and writes the answer down."""
+"""The part of the panel that asks about doubtful places: flies to one, marks it, and writes the answer
+down.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,8 @@ _PAUSE = 1.0  # s between looks at whether others answered
 class QuestionPanel:
     """One question at a time, the same in all tabs. Nothing is read or computed before Start.
 
-    While something is done, and in the flight to the next place, what is pressed says nothing: nobody answers what
+    While something is done, and in the flight to the next place, what is pressed says nothing: nobody
+    answers what
     they have not seen.
     """
 
@@ -138,7 +141,7 @@ class QuestionPanel:
             count = num_points(page.scene.labelled)
             if count is not None and not page.inspector.has_room(count * _ASKED_BYTES):
                 raise InputError(
-                    "questions need more memory than there is beside the page: sc3d annotate --suggest asks too"
+                    "questions need more memory than the page leaves: sc3d annotate --suggest asks too"
                 )
             self._asking = Asking(page.scene, page.inspector.views, lambda _: page.inspector.surface)
         finally:
@@ -205,7 +208,9 @@ class QuestionPanel:
             )
             text = f"{len(place.rows)} points {label}{rival}"
             seen = f"What is marked? It is seen best in {escape(asked.shown.view.name)}"
-            self._text.content = f"<div style='padding:0 .75em;font-size:.9em'>{text}. {seen}<br><small>{_KEYS_HINT}</small></div>"
+            style = "padding:0 .75em;font-size:.9em"
+            keys = f"<br><small>{_KEYS_HINT}</small>"
+            self._text.content = f"<div style='{style}'>{text}. {seen}{keys}</div>"
         self._draw()
         if asked is None or before is None or asked.number != before.number:
             self._fly()
@@ -215,7 +220,9 @@ class QuestionPanel:
             self._draw()
 
     def _draw(self) -> None:
-        """Mark the place that is asked about; or show it in the colors of the photos, as far as the cloud has them."""
+        """Mark the place that is asked about; or show it in the colors of the photos, as far as the cloud
+        has them.
+        """
         asked, display, marked = self._asked, self._page.display, self._mark.value
         if asked is None or not (marked or asked.known.colors is not None):
             self._marked.show(np.zeros((0, 3)), np.zeros((0, 3)), 1.0)
