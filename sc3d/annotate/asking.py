@@ -140,8 +140,9 @@ class Asking:
             wrong, total = float(self._unsure[rest].sum()), int(np.count_nonzero(rest))
         unseen = f", {counts['unseen']} in no photo" if counts["unseen"] else ""
         return (
-            f"{counts['answered']} answered, {counts['skipped']} skipped{unseen}, {counts['left']} places left;"
-            f" about {wrong:.0f} of {total} points may be wrong: the rest is {1 - wrong / max(total, 1):.1%} sure"
+            f"{counts['answered']} answered, {counts['skipped']} skipped{unseen},"
+            f" {counts['left']} places left; about {wrong:.0f} of {total} points may be wrong:"
+            f" the rest is {1 - wrong / max(total, 1):.1%} sure"
         )
 
     def _require(self, number: int) -> Asked:
