@@ -41,7 +41,7 @@ function show() {
   const done = now.place === null;
   $("question").textContent = done
     ? "Nothing is left to ask. Run sc3d propagate to use the answers."
-    : `${now.points} points are labelled ${now.label}${now.rival ? `, some views say ${now.rival}` : ""} · ${now.name}`;
+    : `${now.points} points, most labelled ${now.label}${now.rival ? `, some views say ${now.rival}` : ""} · ${now.name}`;
   $("undo").disabled = !now.own;
   $("skip").disabled = $("wide").disabled = done;
   $("wide").setAttribute("aria-pressed", wide);

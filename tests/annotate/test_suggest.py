@@ -245,7 +245,7 @@ def load(page, server) -> None:
 
 
 def test_one_key_answers(page, server, scene):
-    assert page.inner_text("#question").startswith("197 points are labelled grass, some views say road")
+    assert page.inner_text("#question").startswith("197 points, most labelled grass, some views say road")
     picture = np.array(Image.open(io.BytesIO(page.locator("#canvas").screenshot())).convert("RGB")).astype(
         int
     )

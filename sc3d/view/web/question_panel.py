@@ -204,9 +204,9 @@ class QuestionPanel:
             place = asked.place
             rival = f", some views say <b>{escape(table.name(place.rival))}</b>" if place.rival else ""
             label = (
-                f"are labelled <b>{escape(table.name(place.label))}</b>" if place.label else "have no label"
+                f"most labelled <b>{escape(table.name(place.label))}</b>" if place.label else "most without label"
             )
-            text = f"{len(place.rows)} points {label}{rival}"
+            text = f"{len(place.rows)} points, {label}{rival}"
             seen = f"What is marked? It is seen best in {escape(asked.shown.view.name)}"
             style = "padding:0 .75em;font-size:.9em"
             keys = f"<br><small>{_KEYS_HINT}</small>"
