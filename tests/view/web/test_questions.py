@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 MARK = [255, 0, 200]
 GRASS = CLASSES[1]["color"]
 FIRST, SECOND = (
-    "points are labelled grass, some views say road",
-    "points are labelled road, some views say grass",
+    "points, most labelled grass, some views say road",
+    "points, most labelled road, some views say grass",
 )
 DONE = "Nothing is left to ask"
 NOBODY = SimpleNamespace(client=None)  # an event of no browser
@@ -203,7 +203,7 @@ def test_apply_asks_about_the_new_labels(scene, opened):
     assert (state[inside] == CORRECTED).all() and (label[inside] == 1).all()
     places = rank_places(evidence_of_scene(scene))
     assert places and not np.isin(places[0].rows, np.flatnonzero(inside)).any()
-    see(opened, f"{len(places[0].rows)} points are labelled")
+    see(opened, f"{len(places[0].rows)} points, most labelled")
     assert text(opened, f"0 answered, 0 skipped, {len(places)} places left")
     assert np.allclose((points[places[0].rows] - ORIGIN)[:, :2].mean(axis=0), SMALL, atol=0.3)
 
@@ -217,12 +217,12 @@ def test_clouds_without_votes_and_with_colors_are_asked_about(scene, browser):  
     with served(scene) as address, visit(browser, address, (900, 1100)) as found:
         ready(found)
         press(found, "Start")
-        see(found, "points are labelled grass. What is marked?")
+        see(found, "points, most labelled grass. What is marked?")
         assert not text(found, "some views say") and found.share(tinted) > 0.01
         found.page.get_by_role("checkbox", name="mark the place").click()
         found.wait_for(lambda: found.share([100, 100, 100]) > 0.01, "the colors of the photos")
         press(found, "1 road")
-        see(found, "points are labelled road. What is marked?")
+        see(found, "points, most labelled road. What is marked?")
         ((name, middle),) = answers(scene)
         assert name == "road" and np.allclose(middle, LARGE, atol=0.1)
 
