@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +13,7 @@ import open3d as o3d
 from sc3d.errors import Sc3dError
 from sc3d.extraction.crop import cropped
 from sc3d.extraction.evidence import DepthViews, EvidenceStore
+from sc3d.extraction.first_hits import FirstHits, surface_of
 from sc3d.extraction.free_space import MARGIN, count_opposed, farthest_free
 from sc3d.extraction.photo_support import find_supported
 from sc3d.geometry.cameras import View
@@ -78,20 +79,24 @@ def fuse_views(
     part, confirmed = _fused(data, store, voxel_size)
     sure, unsure = [part], list[Part]()
     _see(data, store, part)
+    hits = FirstHits(data, store)
     shares = {"continued": 0.0, "occluders": 0.0}
     steps = {"continued": _continued, "occluders": _occluding}
     for name in list(steps)[: FILLS.index(fill)]:
         with Progress(len(data.views), name, "view") as bar:
             for turn in range(min(ROUNDS, len(data.views))):
-                surface = _surface([*sure, *unsure])
+                before = len(sure), len(unsure)
                 for row in range(turn, len(data.views), ROUNDS):
-                    view_sure, view_unsure, share = _added(data, store, surface, row, steps[name], voxel_size)
-                    sure.append(view_sure)
-                    unsure.append(view_unsure)
-                    shares[name] += share / len(data.views)
+                    added = _added(data, store, hits.depth(row), row, steps[name], voxel_size)
+                    sure.append(added[0])
+                    unsure.append(added[1])
+                    shares[name] += added[2] / len(data.views)
                     bar.update()
-                del surface  # two at once would need twice the memory
+                hits.add([*sure[before[0] :], *unsure[before[1] :]])
     shares["sky"] = float(np.mean([store.read(row, "sky").mean() for row in range(len(data.views))]))
+    shares["covered"] = float(
+        np.mean([np.isfinite(hits.depth(row)).mean() for row in range(len(data.views))])
+    )
     return _surfaces(
         data, store, (_joined(sure), _joined(unsure)), voxel_size, crop, {"confirmed": confirmed} | shares
     )
@@ -109,11 +114,12 @@ def _surfaces(
     left_out = 0.0
     parts = _split(*parts, find_supported(parts[0], data, store, voxel_size))
     if crop:
-        parts, left_out = cropped(parts, _surface(list(parts)), data, store, voxel_size, crop)
+        parts, left_out = cropped(parts, surface_of(parts), data, store, voxel_size, crop)
+        shares["covered"] = _coverage(surface_of(parts), data.views)
     (mesh, cloud), (other, other_cloud) = parts
     for points, flag in ((cloud, 0), (other_cloud, 1)):
         points.point.unconfirmed = o3d.core.Tensor(np.full((len(points.point.positions), 1), flag, np.uint8))
-    coverage, covered = (_coverage(_surface(meshes), data.views) for meshes in (parts[:1], parts))
+    coverage = _coverage(surface_of(parts[:1]), data.views)
     return Surfaces(
         mesh,
         other,
@@ -121,7 +127,6 @@ def _surfaces(
         voxel_size,
         **shares,
         coverage=coverage,
-        covered=covered,
         cropped=left_out,
     )
 
@@ -189,23 +194,24 @@ def _part(fusion: DepthFusion) -> Part:
 
 
 def _see(data: DepthViews, store: EvidenceStore, part: Part) -> None:
-    """Keep what every view knows behind a point: the mesh, or sky (inf), 0 = nothing; and the mesh's colors."""
-    surface, mesh = _surface([part]), part[0]
+    """Keep how far every view sees, inf = no surface; what it knows behind a point: the mesh, or sky (inf),
+    0 = nothing; and the mesh's colors.
+    """
+    surface = surface_of([part])
     for row, view in enumerate(progress(data.views, "looking", "view")):
-        first = first_surface(surface, view)
-        hit = np.isfinite(first.range)
-        known = np.where(hit, first.range * first.ray_z, np.where(store.read(row, "sky"), np.inf, 0))
+        triangles, uv, hit = surface.triangles(view)
+        known = np.where(np.isfinite(hit) | store.read(row, "sky"), hit, 0)
+        store.save(row, "hit", hit)
         store.save(row, "known", known.astype(np.float32))
-        store.save(row, "colors", _shown_colors(surface, mesh, view))
+        store.save(row, "colors", _shown_colors(part[0], triangles, uv))
 
 
-def _shown_colors(surface: Surface, mesh: o3d.t.geometry.TriangleMesh, view: View) -> np.ndarray:
-    """(H, W, 3) uint8 colors of the mesh in a view, 0 where nothing is hit."""
-    rows, uv = surface.triangles(view)
-    corners = mesh.triangle.indices.numpy()[rows]
+def _shown_colors(mesh: o3d.t.geometry.TriangleMesh, triangles: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 colors of the mesh at (H, W) triangles and their barycentric (H, W, 2); 0 at -1."""
+    corners = mesh.triangle.indices.numpy()[triangles]
     weights = np.concatenate([1 - uv.sum(axis=2, keepdims=True), uv], axis=2)[..., None]
     colors = (mesh.vertex.colors.numpy()[corners] * weights).sum(axis=2)
-    return np.where(rows[..., None] >= 0, np.clip(colors * 255, 0, 255), 0).astype(np.uint8)
+    return np.where(triangles[..., None] >= 0, np.clip(colors * 255, 0, 255), 0).astype(np.uint8)
 
 
 def _others(data: DepthViews, store: EvidenceStore, row: int) -> tuple[list[np.ndarray], list[View]]:
@@ -214,16 +220,14 @@ def _others(data: DepthViews, store: EvidenceStore, row: int) -> tuple[list[np.n
 
 
 def _added(
-    data: DepthViews, store: EvidenceStore, surface: Surface, row: int, step: Step, voxel_size: float
+    data: DepthViews, store: EvidenceStore, hit: np.ndarray, row: int, step: Step, voxel_size: float
 ) -> tuple[Part, Part, float]:
-    """Squares where a view has a depth by `step` and sees nothing of the surface there: of confirmed depth,
-    and of other; their share of its pixels.
+    """Squares where a view has a depth by `step` and sees nothing of the surface, `hit` (H, W), there: of
+    confirmed depth, and of other; their share of its pixels.
 
     Each view's own: where views disagree, as in tree crowns, their average would be no surface at all.
     """
     view = data.views[row]
-    first = first_surface(surface, view)
-    hit = np.where(np.isfinite(first.range), first.range * first.ray_z, np.inf).astype(np.float32)
     depth, normals = step(data, store, row, hit)
     wanted = (depth > 0) & (depth < (1 - MARGIN) * hit) & ~store.read(row, "sky")
     confirmed = depth == store.read(row, "confirmed")
@@ -338,11 +342,6 @@ def _joined_clouds(clouds: list[o3d.t.geometry.PointCloud]) -> o3d.t.geometry.Po
 def _coverage(surface: Surface, views: list[View]) -> float:
     """Share of the views' pixels whose ray hits a surface."""
     return float(np.mean([np.isfinite(first_surface(surface, view).range).mean() for view in views]))
-
-
-def _surface(parts: Sequence[Part]) -> Surface:
-    meshes = [(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy()) for mesh, _ in parts]
-    return Surface.from_meshes([mesh for mesh in meshes if len(mesh[1])], np.zeros(3))
 
 
 def default_voxel_size(points: np.ndarray, footprint: float) -> float:

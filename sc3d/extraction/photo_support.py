@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from sc3d.extraction.evidence import DepthViews, EvidenceStore
-from sc3d.geometry.raycast import Surface, first_surface
+from sc3d.geometry.raycast import Surface
 from sc3d.geometry.tsdf import Part
 from sc3d.geometry.voxels import voxel_keys, voxel_origin
 from sc3d.io.progress import progress
@@ -48,9 +48,9 @@ def _count(
     """(T,) pixels of all views that see each triangle first, and those of them whose supported depth it is."""
     seen, supported = np.zeros(num_triangles), np.zeros(num_triangles)
     for row, view in enumerate(progress(data.views, "comparing with the photos", "view")):
-        first, triangles = first_surface(surface, view), surface.triangles(view)[0]
+        triangles, _, first = surface.triangles(view)
         hit = triangles >= 0
-        depth, known = (first.range * first.ray_z)[hit], store.read(row, "supported")[hit]
+        depth, known = first[hit], store.read(row, "supported")[hit]
         near = np.abs(known - depth) < NEAR * depth
         seen += np.bincount(triangles[hit], minlength=num_triangles)
         supported += np.bincount(triangles[hit][near], minlength=num_triangles)

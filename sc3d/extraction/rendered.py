@@ -68,8 +68,8 @@ def _evidence(data: DepthViews, store: EvidenceStore, row: int, min_views: int) 
     rendered, normals = store.read(row, "rendered"), store.read(row, "rendered-normals")
     neighbors = data.neighbors[row][:NUM_NEIGHBORS]
     others = [(store.read(other, "rendered"), data.views[other]) for other in neighbors]
-    enough = consistent(rendered, data.views[row], others, 1.0) >= min(min_views, len(neighbors))
-    loosely = consistent(rendered, data.views[row], others, LOOSE) >= 1
+    strictly, loosely = consistent(rendered, data.views[row], others, 1.0, LOOSE)
+    enough, loosely = strictly >= min(min_views, len(neighbors)), loosely >= 1
     confirmed = np.where(enough, rendered, 0).astype(np.float32)
     sky, continued, towards = np.zeros(rendered.shape, bool), np.zeros_like(rendered), normals
     if store.has(row, "sky"):

@@ -70,9 +70,9 @@ class Surface:
         vertices, triangles = surfels(points - origin, normals)
         return cls(cls.from_mesh(vertices, triangles, np.zeros(3)).scene, np.asarray(origin, np.float64))
 
-    def triangles(self, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W) int64 triangle that each pixel hits first, -1 = none, and (H, W, 2) float32
-        barycentric u, v.
+    def triangles(self, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(H, W) int64 triangle that each pixel hits first, -1 = none, (H, W, 2) float32 barycentric u, v,
+        and (H, W) float32 depth z, world units, inf = nothing hit.
         """
         directions = camera_rays(view.camera)
         bundle = np.empty((len(directions), 6), np.float32)
@@ -80,8 +80,9 @@ class Surface:
         hit = self.scene.cast_rays(o3d.core.Tensor.from_numpy(bundle))
         numbers = hit["primitive_ids"].numpy()
         rows = np.where(numbers == self.scene.INVALID_ID, -1, numbers.astype(np.int64))
-        shape = view.height, view.width
-        return rows.reshape(shape), hit["primitive_uvs"].numpy().reshape(*shape, 2)
+        shape, ranges = (view.height, view.width), hit["t_hit"].numpy()
+        depth = np.where(np.isfinite(ranges), ranges * directions[:, 2], np.float32(np.inf))
+        return rows.reshape(shape), hit["primitive_uvs"].numpy().reshape(*shape, 2), depth.reshape(shape)
 
     def cast(self, view: View, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `RayTarget.cast`."""
@@ -116,6 +117,11 @@ class FirstSurface:
     range: np.ndarray
     incidence: np.ndarray
     ray_z: np.ndarray
+
+    @property
+    def depth(self) -> np.ndarray:
+        """(H, W) float32 z, world units; inf = nothing hit."""
+        return np.where(np.isfinite(self.range), self.range * self.ray_z, np.float32(np.inf))
 
 
 def first_surface(surface: RayTarget, view: View) -> FirstSurface:

@@ -4,6 +4,7 @@ and cloud.
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import open3d as o3d
 from scipy.sparse import coo_array
@@ -188,12 +189,40 @@ def drop_small_parts(mesh: o3d.t.geometry.TriangleMesh, min_triangles: int) -> o
 
 
 def near_mesh(points: np.ndarray, mesh: o3d.t.geometry.TriangleMesh, distance: float) -> np.ndarray:
-    """(N,) bool: which of the (N, 3) points lie within `distance` of the mesh, in the mesh's own frame."""
+    """(N,) bool: which of the (N, 3) points lie within `distance` of the mesh, in the mesh's own frame. Its
+    own vertices do, and are known at once where both are in the order of `cloud_in_order`, as most points
+    of a field are.
+    """
+    points = np.ascontiguousarray(points, np.float32)
+    near = _found_in(points, np.ascontiguousarray(used_vertices(mesh), np.float32))
+    others = np.flatnonzero(~near)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(mesh)
-    near = np.empty(len(points), bool)
-    for start in range(0, len(points), QUERIES_AT_ONCE):
-        part = slice(start, start + QUERIES_AT_ONCE)
-        queries = o3d.core.Tensor(np.ascontiguousarray(points[part], np.float32))
-        near[part] = scene.compute_distance(queries).numpy() <= distance
+    for start in range(0, len(others), QUERIES_AT_ONCE):
+        rows = others[start : start + QUERIES_AT_ONCE]
+        near[rows] = scene.compute_distance(o3d.core.Tensor(points[rows])).numpy() <= distance
     return near
+
+
+def used_vertices(mesh: o3d.t.geometry.TriangleMesh) -> np.ndarray:
+    """(V, 3) positions of the corners of triangles, in the order of the mesh."""
+    used = np.zeros(len(mesh.vertex.positions), bool)
+    used[mesh.triangle.indices.numpy().ravel()] = True
+    return mesh.vertex.positions.numpy()[used]
+
+
+@numba.njit(cache=True)
+def _found_in(points, others):
+    """(N,) bool: which points (N, 3) are one of the others (M, 3), found in one pass if both are ordered by
+    z, y, x; of points in another order, some are not found.
+    """
+    found, at = np.zeros(len(points), np.bool_), 0
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        while at < len(others) and (
+            others[at, 2] < z
+            or (others[at, 2] == z and (others[at, 1] < y or (others[at, 1] == y and others[at, 0] < x)))
+        ):
+            at += 1
+        found[k] = at < len(others) and others[at, 0] == x and others[at, 1] == y and others[at, 2] == z
+    return found

@@ -85,16 +85,17 @@ def reprojection_error(
     return (gap.square().sum(1) + 1e-12).sqrt(), valid
 
 
-def consistent(depth: np.ndarray, view: View, others: OtherDepths, tolerance: float = 1.0) -> np.ndarray:
-    """(H, W) uint8: in how many other views a pixel's depth is confirmed, phi < `tolerance` px.
-
-    depth: (H, W) float32, 0 = none
+def consistent(depth: np.ndarray, view: View, others: OtherDepths, *limits: float) -> list[np.ndarray]:
+    """(H, W) uint8 for each limit: in how many other views a pixel's depth (H, W), 0 = none, has phi below
+    it, px.
     """
-    count, points_cam = np.zeros(depth.shape, np.uint8), _surface_points(depth, view)
+    counts = [np.zeros(depth.shape, np.uint8) for _ in limits]
+    points_cam = _surface_points(depth, view)
     for other_depth, other in others:
         error, valid = reprojection_error(points_cam, view, torch.from_numpy(other_depth), other)
-        count[depth > 0] += (valid & (error < tolerance)).numpy()
-    return count
+        for count, limit in zip(counts, limits, strict=True):
+            count[depth > 0] += (valid & (error < limit)).numpy()
+    return counts
 
 
 def _surface_points(depth: np.ndarray, view: View) -> Tensor:

@@ -192,8 +192,9 @@ def test_photos_with_little_confirmed_depth_are_named_and_without_any_nothing_is
 
 def test_triangles_are_those_that_are_hit_and_where():
     view = views()[0]
-    rows, uv = quad(3.0).triangles(view)
+    rows, uv, hit = quad(3.0).triangles(view)
     first = first_surface(quad(3.0), view)
+    np.testing.assert_array_equal(hit, first.depth)
     np.testing.assert_array_equal(rows >= 0, np.isfinite(first.range))
     assert set(np.unique(rows)) == {-1, 0, 1}
     corners = 3.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)

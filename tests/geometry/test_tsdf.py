@@ -56,6 +56,20 @@ def test_sphere_within_half_a_voxel_and_closed(sphere):
     assert near_mesh(onto, mesh, VOXEL).mean() > 0.999
 
 
+def test_near_a_part_of_a_mesh_is_what_distances_say(sphere):
+    """Of the whole sphere's cloud, in its order, near one half of the mesh."""
+    mesh, points = sphere.mesh(), sphere.cloud().point.positions.numpy()
+    corners = mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy()]
+    half = mesh.select_faces_by_mask(o3d.core.Tensor(corners[..., 0].max(axis=1) < 0.3))
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(half)
+    expected = scene.compute_distance(o3d.core.Tensor(points)).numpy() <= 0.5 * VOXEL
+    assert 0.3 < expected.mean() < 0.8
+    assert np.array_equal(near_mesh(points, half, 0.5 * VOXEL), expected)
+    backwards = near_mesh(points[::-1], half, 0.5 * VOXEL)  # another order costs time, no more
+    assert np.array_equal(backwards[::-1], expected)
+
+
 def test_cloud_has_colors_and_outward_normals(sphere):
     cloud = sphere.cloud()
     points, normals = cloud.point.positions.numpy(), cloud.point.normals.numpy()

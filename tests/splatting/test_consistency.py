@@ -58,6 +58,9 @@ def test_consistency_counts_views():
     depth[30:40] *= 1.08
     maps = [(plane_depth(other), other) for other in others]
     maps[2] = (maps[2][0] * 0.9, others[2])
-    count = consistent(depth.numpy(), view, [(other.numpy(), pose) for other, pose in maps])
+    others = [(other.numpy(), pose) for other, pose in maps]
+    count, loose = consistent(depth.numpy(), view, others, 1.0, 1e3)
+    assert np.array_equal(loose, consistent(depth.numpy(), view, others, 1e3)[0]) and (loose >= count).all()
+    assert loose.max() == 3
     assert (count[:5] == 0).all() and (count[30:40] == 0).all()
     assert (count[15:25, 30:60] == 2).all() and count.max() == 2
