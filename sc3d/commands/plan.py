@@ -34,9 +34,7 @@ FASTER = {  # what makes stages faster, and coarser
 # 1600x900 and 24 of 640x427, and at most 1.5 times off either; compared with these alone. Too little where time
 # grows faster than the number of photos.
 EXPECTED: dict[str, Callable[[Any, Sizes], float | None]] = {
-    "map_photos": lambda settings, sizes: (
-        1.7 * megapixels(sizes, settings.max_size) + 0.05 * num_pairs(len(sizes), settings.matching)
-    ),
+    "map_photos": lambda settings, sizes: _mapping(settings, sizes),
     "reconstruct": lambda settings, sizes: 0.03 * len(sizes),
     "depth": lambda settings, sizes: 1.5 * settings.num_sources * megapixels(sizes, settings.max_size),
     "train": lambda settings, sizes: _training(settings.training, sizes),
@@ -53,6 +51,13 @@ def megapixels(sizes: Sizes, longest: int | None = None) -> float:
     """Of all photos, or of what is left of them where their longest side is no more than `longest` px."""
     scales = [1.0 if longest is None else min(1.0, longest / max(size)) for size in sizes]
     return sum(width * height * scale**2 for (width, height), scale in zip(sizes, scales, strict=True)) / 1e6
+
+
+def _mapping(settings: Any, sizes: Sizes) -> float:
+    """Features by pixels, matches by pairs (of smaller photos, which have fewer features, less each), cameras."""
+    pixels, count = megapixels(sizes, settings.max_size), len(sizes)
+    detail = min(1.0, pixels / count / 1.44)
+    return 1.35 * pixels + 0.14 * detail * num_pairs(count, settings.matching) + 0.5 * count
 
 
 def _training(settings: Any, sizes: Sizes) -> float | None:
