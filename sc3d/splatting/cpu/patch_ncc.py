@@ -2,10 +2,11 @@
 slow twin.
 
 A patch pixel with ray r (z = 1) lands at q = d R r - t (n . r), projected. With gray values a_p of the photo
-and b_p sampled at q_p, and g_p = db_p / d(n, d), all sums that NCC and its gradient need are gathered in one
-pass:
+and b_p sampled at q_p, and g_p = db_p / d(n, d):
     d NCC = sum_p [(a_p - mean a) / (P s) - NCC (b_p - mean b) / (P (var b + e))] g_p,   s = sqrt((var a +
     e)(var b + e)).
+A row of a patch is seven of eight lanes; three passes over the rows find where the pixels land, what the
+images show there, and the gradient. Each writes what the next one reads.
 """
 
 from __future__ import annotations
@@ -15,9 +16,32 @@ import numpy as np
 import torch
 from torch import Tensor
 
-PATCH_RADIUS = 3  # the kernel's 3, 7 and 49
+from sc3d.splatting.cpu.simd import (
+    LANES,
+    bits_at_least,
+    fma,
+    load,
+    minimum,
+    ramp,
+    splat,
+    store,
+    total,
+    truncate,
+    where_at_least,
+)
+
+PATCH_RADIUS = 3
 NOISE = 1 / 255**2
 """variance of gray values that counts as noise"""
+_SIDE = 2 * PATCH_RADIUS + 1
+_USED = (1 << _SIDE) - 1  # lanes
+_CHUNK = 64  # patches per parallel work item
+# planes of a row: where in the other image (column, row; its fraction; p0, p1 and 1 / depth), gray values a
+# and the four around b; b takes the place of the first of these
+_COLUMN, _ROW, _ACROSS, _DOWN, _P0, _P1, _INVERSE, _A, _B = (plane * LANES for plane in range(9))
+_PLANES = 12
+_ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
+_SHARE = np.float32(1 / _SIDE**2)
 
 
 def patch_dissimilarity(
@@ -61,78 +85,139 @@ class _Patches(torch.autograd.Function):
         return slopes[:, :3], slopes[:, 3], None, None, None
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
+@numba.njit(parallel=True, cache=True, error_model="numpy")
 def _compare(planes, pixels, gray, other, camera, values, inside, slopes):
     """Fill values, inside and slopes (d value / d (n, d)) patch by patch; a patch that leaves an image has
     value 1 and slope 0.
     """
-    for patch in numba.prange(len(planes)):
-        column, row = pixels[patch, 0], pixels[patch, 1]
-        values[patch] = 1
-        slopes[patch] = 0
-        within = 3 <= column < gray.shape[1] - 3 and 3 <= row < gray.shape[0] - 3
-        inside[patch] = within and _compare_one(
-            planes[patch], column, row, gray, other, camera, values[patch:], slopes[patch]
-        )
+    count, radius = len(planes), PATCH_RADIUS
+    for item in numba.prange((count + _CHUNK - 1) // _CHUNK):
+        work = np.zeros(_SIDE * _PLANES * LANES, np.float32)
+        for patch in range(item * _CHUNK, min(count, (item + 1) * _CHUNK)):
+            column, row = pixels[patch, 0], pixels[patch, 1]
+            values[patch], slopes[patch] = _ONE, _ZERO
+            within = radius <= column < gray.shape[1] - radius and radius <= row < gray.shape[0] - radius
+            inside[patch] = within and _land(planes[patch], column, row, other, camera, work)
+            if inside[patch]:
+                _fetch(column, row, gray, other, work)
+                values[patch] = _correlate(column, row, camera, work, slopes[patch])
 
 
-@numba.njit(cache=True, fastmath=True, inline="always")
-def _compare_one(plane, column, row, gray, other, camera, value, slope):
-    n0, n1, n2, distance = plane[0], plane[1], plane[2], plane[3]
-    t0, t1, t2 = camera[17], camera[18], camera[19]
-    one, half = np.float32(1), np.float32(0.5)
-    right, bottom = np.float32(other.shape[1]) - half, np.float32(other.shape[0]) - half
-    sum_a = sum_b = sum_aa = sum_bb = sum_ab = np.float32(0)
-    g0 = g1 = g2 = g3 = ag0 = ag1 = ag2 = ag3 = bg0 = bg1 = bg2 = bg3 = np.float32(0)
-    for step in range(49):
-        i, j = row + step // 7 - 3, column + step % 7 - 3
-        x = (np.float32(j) + half - camera[2]) / camera[0]
-        y = (np.float32(i) + half - camera[3]) / camera[1]
-        r0 = camera[8] * x + camera[9] * y + camera[10]
-        r1 = camera[11] * x + camera[12] * y + camera[13]
-        r2 = camera[14] * x + camera[15] * y + camera[16]
-        along = n0 * x + n1 * y + n2
-        q2 = r2 * distance - t2 * along
-        if q2 <= np.float32(1e-9):
-            return False
-        p0, p1 = (r0 * distance - t0 * along) / q2, (r1 * distance - t1 * along) / q2
-        u, v = p0 * camera[4] + camera[6], p1 * camera[5] + camera[7]
-        if not (half <= u <= right and half <= v <= bottom):
-            return False
-        left, top = min(int(u - half), other.shape[1] - 2), min(int(v - half), other.shape[0] - 2)
-        fu, fv = u - half - np.float32(left), v - half - np.float32(top)
-        b00, b01, b10, b11 = (
-            other[top, left],
-            other[top, left + 1],
-            other[top + 1, left],
-            other[top + 1, left + 1],
+@numba.njit(cache=True, error_model="numpy")
+def _rays(column, row, step, camera):
+    """x of the rays of the eight pixels of a patch row, and their common y."""
+    first = np.float32(column - PATCH_RADIUS) + _HALF - camera[2]
+    y = (np.float32(row + step - PATCH_RADIUS) + _HALF - camera[3]) / camera[1]
+    return (ramp() + splat(first)) * splat(_ONE / camera[0]), y
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _land(plane, column, row, other, camera, work):
+    """Where the pixels of a patch land; False if one does not land in the other image."""
+    limit = splat(np.float32(1e-9))
+    low, distance, one, last = splat(_HALF), splat(plane[3]), splat(_ONE), splat(np.float32(_SIDE - 1))
+    right, bottom = np.float32(other.shape[1]) - _HALF, np.float32(other.shape[0]) - _HALF
+    for step in range(_SIDE):
+        place = step * _PLANES * LANES
+        x, y = _rays(column, row, step, camera)
+        along = fma(splat(plane[0]), x, splat(plane[1] * y + plane[2]))
+        q0 = (
+            fma(splat(camera[8]), x, splat(camera[9] * y + camera[10])) * distance - splat(camera[17]) * along
         )
-        a, b = gray[i, j], (one - fv) * (b00 + fu * (b01 - b00)) + fv * (b10 + fu * (b11 - b10))
-        c0 = ((one - fv) * (b01 - b00) + fv * (b11 - b10)) * camera[4] / q2
-        c1 = ((one - fu) * (b10 - b00) + fu * (b11 - b01)) * camera[5] / q2
-        c2 = -(c0 * p0 + c1 * p1)
-        by_along = -(c0 * t0 + c1 * t1 + c2 * t2)
-        d0, d1, d2, d3 = by_along * x, by_along * y, by_along, c0 * r0 + c1 * r1 + c2 * r2
-        sum_a, sum_b, sum_aa, sum_bb, sum_ab = (
-            sum_a + a,
-            sum_b + b,
-            sum_aa + a * a,
-            sum_bb + b * b,
-            sum_ab + a * b,
+        q1 = (
+            fma(splat(camera[11]), x, splat(camera[12] * y + camera[13])) * distance
+            - splat(camera[18]) * along
         )
-        g0, g1, g2, g3 = g0 + d0, g1 + d1, g2 + d2, g3 + d3
-        ag0, ag1, ag2, ag3 = ag0 + a * d0, ag1 + a * d1, ag2 + a * d2, ag3 + a * d3
-        bg0, bg1, bg2, bg3 = bg0 + b * d0, bg1 + b * d1, bg2 + b * d2, bg3 + b * d3
-    share = one / np.float32(49)
-    mean_a, mean_b = sum_a * share, sum_b * share
-    var_a = max(sum_aa * share - mean_a * mean_a, np.float32(0)) + np.float32(NOISE)
-    var_b = max(sum_bb * share - mean_b * mean_b, np.float32(0)) + np.float32(NOISE)
-    scale = one / np.sqrt(var_a * var_b)
-    ncc = (sum_ab * share - mean_a * mean_b) * scale
-    value[0] = one - ncc
-    by_a, by_b = share * scale, share * ncc / var_b
-    slope[0] = (bg0 - mean_b * g0) * by_b - (ag0 - mean_a * g0) * by_a
-    slope[1] = (bg1 - mean_b * g1) * by_b - (ag1 - mean_a * g1) * by_a
-    slope[2] = (bg2 - mean_b * g2) * by_b - (ag2 - mean_a * g2) * by_a
-    slope[3] = (bg3 - mean_b * g3) * by_b - (ag3 - mean_a * g3) * by_a
+        q2 = (
+            fma(splat(camera[14]), x, splat(camera[15] * y + camera[16])) * distance
+            - splat(camera[19]) * along
+        )
+        inverse = one / q2
+        p0, p1 = q0 * inverse, q1 * inverse
+        u, v = fma(p0, splat(camera[4]), splat(camera[6])), fma(p1, splat(camera[5]), splat(camera[7]))
+        met = bits_at_least(q2, limit) & bits_at_least(u, low) & bits_at_least(v, low)
+        met &= bits_at_least(splat(right), u) & bits_at_least(splat(bottom), v)
+        if met & _USED != _USED:
+            return False
+        u, v = u - low, v - low
+        left = truncate(minimum(u, splat(right - _HALF - _ONE)))
+        top = truncate(minimum(v, splat(bottom - _HALF - _ONE)))
+        store(work, place + _COLUMN, left)
+        store(work, place + _ROW, top)
+        store(work, place + _ACROSS, u - left)
+        store(work, place + _DOWN, v - top)
+        # the eighth lane is none of the patch's, and may be anything
+        store(work, place + _P0, where_at_least(last, ramp(), p0))
+        store(work, place + _P1, where_at_least(last, ramp(), p1))
+        store(work, place + _INVERSE, where_at_least(last, ramp(), inverse))
     return True
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fetch(column, row, gray, other, work):
+    """The gray values of a patch and the four around each pixel that it landed on."""
+    for step in range(_SIDE):
+        for lane in range(_SIDE):
+            place = step * _PLANES * LANES + lane
+            left, top = np.int64(work[place + _COLUMN]), np.int64(work[place + _ROW])
+            work[place + _A] = gray[row + step - PATCH_RADIUS, column + lane - PATCH_RADIUS]
+            work[place + _B] = other[top, left]
+            work[place + _B + LANES] = other[top, left + 1]
+            work[place + _B + 2 * LANES] = other[top + 1, left]
+            work[place + _B + 3 * LANES] = other[top + 1, left + 1]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _correlate(column, row, camera, work, slope):
+    """1 - NCC of a patch whose values are there; fills slope (4,)."""
+    sum_a = sum_b = sum_aa = sum_bb = sum_ab = zero = splat(_ZERO)
+    for step in range(_SIDE):
+        place = step * _PLANES * LANES
+        across, b00, b10 = (
+            load(work, place + _ACROSS),
+            load(work, place + _B),
+            load(work, place + _B + 2 * LANES),
+        )
+        upper, lower = load(work, place + _B + LANES) - b00, load(work, place + _B + 3 * LANES) - b10
+        above, below, down = fma(across, upper, b00), fma(across, lower, b10), load(work, place + _DOWN)
+        a, b = (
+            load(work, place + _A),
+            where_at_least(splat(np.float32(_SIDE - 1)), ramp(), fma(down, below - above, above)),
+        )
+        store(work, place + _B, b)
+        store(
+            work,
+            place + _B + LANES,
+            where_at_least(splat(np.float32(_SIDE - 1)), ramp(), fma(down, lower - upper, upper)),
+        )
+        store(
+            work, place + _B + 2 * LANES, where_at_least(splat(np.float32(_SIDE - 1)), ramp(), below - above)
+        )
+        sum_a, sum_b, sum_aa = sum_a + a, sum_b + b, fma(a, a, sum_aa)
+        sum_bb, sum_ab = fma(b, b, sum_bb), fma(a, b, sum_ab)
+    mean_a, mean_b = total(sum_a) * _SHARE, total(sum_b) * _SHARE
+    var_a = max(total(sum_aa) * _SHARE - mean_a * mean_a, _ZERO) + np.float32(NOISE)
+    var_b = max(total(sum_bb) * _SHARE - mean_b * mean_b, _ZERO) + np.float32(NOISE)
+    scale = _ONE / np.sqrt(var_a * var_b)
+    ncc = (total(sum_ab) * _SHARE - mean_a * mean_b) * scale
+    by_a, by_b = splat(_SHARE * scale), splat(_SHARE * ncc / var_b)
+    g0 = g1 = g2 = g3 = zero
+    t0, t1, t2 = splat(camera[17]), splat(camera[18]), splat(camera[19])
+    for step in range(_SIDE):
+        place = step * _PLANES * LANES
+        x, y = _rays(column, row, step, camera)
+        gain = (load(work, place + _B) - splat(mean_b)) * by_b - (
+            load(work, place + _A) - splat(mean_a)
+        ) * by_a
+        gain = gain * load(work, place + _INVERSE)
+        c0 = load(work, place + _B + LANES) * splat(camera[4]) * gain
+        c1 = load(work, place + _B + 2 * LANES) * splat(camera[5]) * gain
+        c2 = zero - fma(c0, load(work, place + _P0), c1 * load(work, place + _P1))
+        by_along = zero - fma(c0, t0, fma(c1, t1, c2 * t2))
+        r0 = fma(splat(camera[8]), x, splat(camera[9] * y + camera[10]))
+        r1 = fma(splat(camera[11]), x, splat(camera[12] * y + camera[13]))
+        r2 = fma(splat(camera[14]), x, splat(camera[15] * y + camera[16]))
+        g0, g1, g2 = fma(by_along, x, g0), fma(by_along, splat(y), g1), g2 + by_along
+        g3 = fma(c0, r0, fma(c1, r1, fma(c2, r2, g3)))
+    slope[0], slope[1], slope[2], slope[3] = total(g0), total(g1), total(g2), total(g3)
+    return _ONE - ncc

@@ -153,6 +153,16 @@ def maximum(typingctx, a, b):
 
 
 @intrinsic
+def truncate(typingctx, a):
+    """Lane-wise whole number towards zero, for |a| < 2^31."""
+
+    def codegen(context, builder, sig, args):
+        return builder.sitofp(builder.fptosi(args[0], _INTS), _FLOATS)
+
+    return lanes(a), codegen
+
+
+@intrinsic
 def absolute(typingctx, a):
     """Lane-wise |a|."""
 
@@ -182,6 +192,17 @@ def any_at_least(typingctx, a, b):
         return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
 
     return types.boolean(a, b), codegen
+
+
+@intrinsic
+def bits_at_least(typingctx, a, b):
+    """int64 whose lowest bits tell in which lanes a >= b; lane 0 is the lowest."""
+
+    def codegen(context, builder, sig, args):
+        bits = builder.bitcast(builder.fcmp_ordered(">=", args[0], args[1]), ir.IntType(LANES))
+        return builder.zext(bits, ir.IntType(64))
+
+    return types.int64(a, b), codegen
 
 
 # 2^f on [-0.5, 0.5], highest power first: Chebyshev interpolation, relative error 1e-7.
