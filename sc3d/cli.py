@@ -254,9 +254,11 @@ class Terminated(KeyboardInterrupt):
 @contextmanager
 def ending_when_told() -> Iterator[None]:
     """SIGTERM ends the block like Ctrl-C, once the call into a library that is under way comes back. Without this
-    it is for the handler that pycolmap brings when it is imported (so this comes after), which prints a stack
-    trace and may wait for ever for a lock that the interrupted thread holds.
+    it is for the handler that pycolmap brings when it is imported (so that is done here, before), which prints a
+    stack trace and may wait for ever for a lock that the interrupted thread holds.
     """
+    with suppress(ImportError):  # `sc3d doctor` tells what is missing
+        import pycolmap  # noqa: F401
 
     def end(*_: object) -> None:
         raise Terminated

@@ -374,3 +374,13 @@ def test_a_log_gets_the_messages_and_the_error(scene, tmp_path, capsys):
 def test_settings_that_do_not_go_together_are_one_line(scene, capsys, options):
     name, *rest = options
     fails(capsys, name, scene, *rest)
+
+
+def test_sigterm_stays_ours_where_pycolmap_comes_later():
+    """Its import brings a handler that prints a stack trace."""
+    code = (
+        "import os, signal, sys\nfrom sc3d.cli import Terminated, ending_when_told\n"
+        "try:\n with ending_when_told():\n  import pycolmap\n  os.kill(os.getpid(), signal.SIGTERM)\n"
+        "except Terminated:\n sys.exit(7)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 7
