@@ -204,7 +204,9 @@ class QuestionPanel:
             place = asked.place
             rival = f", some views say <b>{escape(table.name(place.rival))}</b>" if place.rival else ""
             label = (
-                f"most labelled <b>{escape(table.name(place.label))}</b>" if place.label else "most without label"
+                f"most labelled <b>{escape(table.name(place.label))}</b>"
+                if place.label
+                else "most without label"
             )
             text = f"{len(place.rows)} points, {label}{rival}"
             seen = f"What is marked? It is seen best in {escape(asked.shown.view.name)}"
