@@ -98,12 +98,13 @@ def _finished(scene: Scene, settings: Reconstruct) -> Reconstruct | None:
     with suppress(InputError):
         record: Any = read_json(sidecar(scene.mapped), MAX_SIDECAR)
         made = record.get("settings") if isinstance(record, dict) else None
-        asked = settings
-        for name, known in (("matching", get_args(Matching)), ("mapper", get_args(Mapper))):
-            # records from before there was a choice say nothing
-            used = made.get(name, getattr(Mapping, name)) if isinstance(made, dict) else None
-            if getattr(settings, name) == "auto" and used in known:
-                asked = replace(asked, **{name: used})
+        made = made if isinstance(made, dict) else {}
+        # records from before there was a choice say nothing of the mapper
+        matching: Any = made.get("matching") if settings.matching == "auto" else settings.matching
+        mapper: Any = made.get("mapper", Mapping.mapper) if settings.mapper == "auto" else settings.mapper
+        if matching not in get_args(Matching) or mapper not in get_args(Mapper):
+            return None
+        asked = replace(settings, matching=matching, mapper=mapper)
         if asked != settings and up_to_date("map_photos", scene, steps(asked)[0][1]):
             return asked
     return None
