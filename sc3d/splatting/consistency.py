@@ -86,9 +86,7 @@ def reprojection_error(
 
 
 def consistent(depth: np.ndarray, view: View, others: OtherDepths, *limits: float) -> list[np.ndarray]:
-    """(H, W) uint8 for each limit: in how many other views a pixel's depth (H, W), 0 = none, has phi below
-    it, px.
-    """
+    """(H, W) uint8 per limit, px: in how many views a pixel's depth (H, W), 0 = none, has phi below it."""
     counts = [np.zeros(depth.shape, np.uint8) for _ in limits]
     points_cam = _surface_points(depth, view)
     for other_depth, other in others:
