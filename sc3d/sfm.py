@@ -301,43 +301,36 @@ def _map(
     step: Callable[[], object],
 ) -> list[list[str]]:
     if settings.mapper == "global":
-        models = _map_at_once(database, images, work, settings, num_photos)
+        models = pycolmap.global_mapping(database, images, work, _options_at_once(settings, num_photos))
     else:
-        models = _map_in_turn(database, images, work, settings, num_photos, has_gps, step)
+        options = _options_in_turn(settings, num_photos, has_gps)
+        models = pycolmap.incremental_mapping(database, images, work, options, next_image_callback=step)
     ordered = sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     for number, model in enumerate(ordered, start=1):
         write_model(work / MODEL / (str(number) if number > 1 else ""), model)
     return [[image.name for image in registered_images(model)] for model in ordered]
 
 
-def _map_at_once(
-    database: Path, images: Path, work: Path, settings: Mapping, num_photos: int
-) -> dict[int, pycolmap.Reconstruction]:
+def _options_at_once(settings: Mapping, num_photos: int) -> pycolmap.GlobalPipelineOptions:
     """Rotations of all photos, then all positions, then all together (GLOMAP: Pan et al., ECCV 2024)."""
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = settings.seed
     options.min_model_size = min(MIN_MODEL, num_photos)
     options.mapper.global_positioning.use_gpu = options.mapper.bundle_adjustment.ceres.use_gpu = False
-    return pycolmap.global_mapping(database, images, work, options)
+    return options
 
 
-def _map_in_turn(
-    database: Path,
-    images: Path,
-    work: Path,
-    settings: Mapping,
-    num_photos: int,
-    has_gps: bool,
-    step: Callable[[], object],
-) -> dict[int, pycolmap.Reconstruction]:
-    """Photo after photo, near their GPS; step: called after each."""
+def _options_in_turn(
+    settings: Mapping, num_photos: int, has_gps: bool
+) -> pycolmap.IncrementalPipelineOptions:
+    """Photo after photo, near their GPS."""
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = settings.seed
     options.num_threads = 1  # with more, sums of larger scenes are rounded otherwise in each run
     options.use_prior_position = has_gps
     options.use_robust_loss_on_prior_position = has_gps
     options.min_model_size = min(MIN_MODEL, num_photos)
-    return pycolmap.incremental_mapping(database, images, work, options, next_image_callback=step)
+    return options
 
 
 def _reasons(database: Path, names: list[str], parts: list[list[str]]) -> dict[str, str]:

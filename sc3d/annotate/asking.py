@@ -1,6 +1,5 @@
 """Asking about the doubtful places of a scene, one after the other, whatever page shows them: which is
-asked about,
-what an answer writes, and what was answered or taken back elsewhere.
+asked about, what an answer writes, and what was answered or taken back elsewhere.
 
 What counts as answered is what `corrections.json` says, so that pages, tabs and programs follow one another.
 """
@@ -28,16 +27,14 @@ from sc3d.scene.selection import balls_within
 
 class StaleError(InputError):
     """What was meant has changed elsewhere: the answer is to a place that is not asked about any more, or
-    the answer
-    that should be taken back does not stand.
+    the answer that should be taken back does not stand.
     """
 
 
 @dataclass(frozen=True)
 class Asked:
     """What is asked about. number: which is never given again, also after new labels; place: its points
-    that are
-    not corrected; shown: the photo that sees it best; known: of the points
+    that are not corrected; shown: the photo that sees it best; known: of the points
     """
 
     number: int
@@ -48,8 +45,7 @@ class Asked:
 
 class Asking:
     """The questions of a scene. Those first where an answer changes most, but for the places that are
-    answered,
-    skipped, or in no photo. All methods look first at what changed in the scene's files, and may be called by
+    answered, skipped, or in no photo. All methods look first at what changed in the scene's files, and may be called by
     several threads.
     """
 

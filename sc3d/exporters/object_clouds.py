@@ -93,8 +93,7 @@ def _sort(
     scene: Scene, settings: Export, file: BinaryIO, numbers: np.ndarray, places: np.ndarray
 ) -> np.dtype:
     """Write the records of objects `numbers` (K,), rising, one object after the other, each in the order of
-    the cloud;
-    places: (K,) its first record.
+    the cloud; places: (K,) its first record.
     """
     classes, places, dtype = sorted(chosen_classes(scene, settings)), places.copy(), np.dtype([])
     for projected in projected_chunks(scene, settings):

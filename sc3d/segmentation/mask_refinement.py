@@ -42,8 +42,7 @@ class RefinementInputs:
     """A cloud with its surface, and the settings by which masks become labels.
 
     colors: (N, 3) uint8 or None; up: (3,) of the cameras, None = not known; seen: the surface, whatever
-    labels it has;
-    num_channels: classes + 1, as labels and masks here are channels; levels: as of `LabelledPoints`
+    labels it has; num_channels: classes + 1, as labels and masks here are channels; levels: as of `LabelledPoints`
     """
 
     cloud: Cloud

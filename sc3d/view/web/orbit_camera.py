@@ -59,8 +59,7 @@ class OrbitCamera:
         """All of a place in the window, with what is around it if there is room to step back.
 
         points: (K, 3) of the place; target: (3,) one that is looked at; towards: (3,) unit, from it to the
-        eye;
-            reach: how far away on that line the eye may be; least: height that is shown of a smaller place;
+        eye; reach: how far away on that line the eye may be; least: height that is shown of a smaller place;
             aspect: width over height of the window; ahead: (3,) level, top of the window in a look
             straight down
         """
