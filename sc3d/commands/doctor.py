@@ -19,6 +19,7 @@ from sc3d.io.requirements import ALWAYS, INSTALL, LIBRARIES, outdated
 from sc3d.segmentation.models import find_weights
 from sc3d.settings.labels import Segment
 from sc3d.settings.outputs import Doctor
+from sc3d.view.renderers import VULKAN_PROBE
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +28,7 @@ PROBES = {  # each in a process of its own: a missing library may abort it
     "pycolmap": "import pycolmap; print('works, CUDA' if pycolmap.has_cuda else 'works, CPU')",
     "torch": "import torch; print(f'works, CUDA {torch.version.cuda}' if torch.cuda.is_available() else 'works, CPU')",
     "transformers": "import transformers; print('works')",
-    "vulkan pictures": "import open3d as o; o.visualization.rendering.OffscreenRenderer(8, 8); print('work')",
+    "vulkan pictures": VULKAN_PROBE,
     "OpenGL pictures": "import open3d as o; v = o.visualization.Visualizer(); print('work' if v.create_window(visible=False) else 'do not work')",
 }
 

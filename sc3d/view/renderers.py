@@ -4,6 +4,8 @@ Neither needs a display.
 Known failures, and what is done about them (Open3D 0.20):
 - no Vulkan driver: the process aborts instead of raising, and after a failed start the OpenGL visualizer
     fails too: so another process tries first;
+- with Mesa 25 (Debian 13), Vulkan draws all points and triangles in the color of the first one: so that
+    process looks at the colors;
 - two living OffscreenRenderers abort: each dies in the function that made it;
 - the OpenGL visualizer ignores the principal point and fx != fy: it draws a larger centered picture, from
     which the view is cut.
@@ -18,7 +20,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -36,7 +38,11 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _NO_RENDERER = "cannot render pictures here: `apt install libvulkan1 mesa-vulkan-drivers` (or libegl1 libgl1-mesa-dri) provides a software renderer"
-_PROBE = "import open3d as o3d; o3d.visualization.rendering.OffscreenRenderer(16, 16).render_to_image()"
+VULKAN_PROBE = (
+    "from sc3d.view.renderers import probe_vulkan; probe_vulkan()"  # says `work`, or ends with an error
+)
+
+_WRONG_COLORS = 3  # status of the process that tries Vulkan
 
 
 @dataclass(frozen=True)
@@ -73,16 +79,44 @@ def render(
 
 @functools.cache
 def vulkan_works() -> bool:
-    """Whether OffscreenRenderer works here, tried in another process because it may abort."""
+    """Whether OffscreenRenderer works here and draws the right colors, tried in another process because it may
+    abort.
+    """
     try:
-        probe = run_python(_PROBE, timeout=120)
+        probe = run_python(VULKAN_PROBE, timeout=120)
     except (OSError, subprocess.TimeoutExpired):
         return False
-    if probe.returncode:
+    if probe.returncode == _WRONG_COLORS:
+        logger.info("Open3D's Vulkan renderer draws wrong colors here, OpenGL is used")
+    elif probe.returncode:
         logger.info(
             "Open3D's Vulkan renderer does not work here (`apt install libvulkan1 mesa-vulkan-drivers`), OpenGL is used"
         )
     return probe.returncode == 0
+
+
+def probe_vulkan() -> None:
+    """Say `work`, or end with a status other than 0 if Vulkan draws other colors than asked for."""
+    if draws_colors(_render_vulkan):
+        sys.stdout.write("work\n")
+    else:
+        sys.stderr.write("wrong colors, so OpenGL draws\n")
+        sys.exit(_WRONG_COLORS)
+
+
+def draws_colors(draw: Callable[[Renderable, View, tuple[int, int, int]], np.ndarray]) -> bool:
+    """Whether a renderer shows red at the left and blue at the right, as points and as triangles."""
+    corners = np.array([[x, y, 2.0] for x in (-1, -0.1, 0.1, 1) for y in (-1, 1)], np.float32)
+    triangles = np.array([[0, 1, 2], [1, 3, 2], [4, 5, 6], [5, 7, 6]])
+    colors = np.repeat(np.uint8([[200, 30, 40], [20, 60, 220]]), 4, axis=0)
+    middles = np.array([[x, 0, 2.0] for x in (-0.5, 0.5)], np.float32)
+    cloud = Renderable(middles, colors[::4], point_size=8.0)
+    view = pinhole_view("probe", (32, 32), (32, 32, 16, 16), np.eye(4))
+    for renderable in (cloud, Renderable(corners, colors, triangles=triangles)):
+        image = draw(renderable, view, (255, 255, 255))
+        if not all((image[16, column] == colors[row]).all() for column, row in ((8, 0), (24, -1))):
+            return False
+    return True
 
 
 def _render_vulkan(renderable: Renderable, view: View, background: tuple[int, int, int]) -> np.ndarray:

@@ -4,6 +4,7 @@ renderer.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -29,7 +30,7 @@ from sc3d.view.colors import (
     shaded,
 )
 from sc3d.view.picking import Inspector
-from sc3d.view.renderers import vulkan_works
+from sc3d.view.renderers import draws_colors, render, vulkan_works
 from sc3d.view.screenshot import Style, draw_points, screenshot
 from sc3d.view.viewpoints import frusta, overview
 from sc3d.view.window import show
@@ -110,6 +111,17 @@ def test_points_appear_where_project_says(renderer):
     if "cannot render pictures here" in done.stderr:
         pytest.skip(f"no {renderer} here")
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_a_renderer_that_draws_all_in_the_first_color_is_found_out():
+    """As Vulkan does with Mesa 25."""
+
+    def first_color(renderable, view, background):
+        colors = np.repeat(renderable.colors[:1], len(renderable.colors), axis=0)
+        return render(dataclasses.replace(renderable, colors=colors), view, background)
+
+    assert draws_colors(render)
+    assert not draws_colors(first_color)
 
 
 def test_undistorted_photo_view_is_drawn():
