@@ -1,4 +1,4 @@
-"""By hand: `python tests/robustness/kill_run.py FOLDER --kills 50` kills `sc3d run` on a tiny synthetic site at random
+"""By hand: `python tests/robustness/kill_run.py FOLDER --kills 50` kills `sc3d run` on a small synthetic site at random
 moments and runs it again.
 
 Each time the second run must complete, leave no hidden files, and write the bytes of an uninterrupted run. A
@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 COMMAND = [sys.executable, "-c", "import sys; from sc3d.cli import main; main(sys.argv[1:])"]
-SITE = ["--views", "6", "--width", "240", "--extent", "50", "--altitude", "35", "--num-points", "20000"]
+SITE = ["--width", "240", "--extent", "50", "--altitude", "35", "--num-points", "20000"]
 OPTIONS = [
     "--train.iterations",
     "30",
@@ -44,13 +44,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--photos", type=int, default=6, help="of the site, when it is made")
     parser.add_argument("--signal", choices=("KILL", "INT"), default="KILL")
     parser.add_argument("--minutes", type=float, default=9, help="start no further kill after this long")
     arguments = parser.parse_args()
     started, folder = time.time(), arguments.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "site" / "truth.ply.json").exists():
-        subprocess.run([*COMMAND, "synthesize", str(folder / "site"), *SITE], check=True)
+        views = ["--views", str(arguments.photos)]
+        subprocess.run([*COMMAND, "synthesize", str(folder / "site"), *SITE, *views], check=True)
     reference = reference_run(folder)
     results = folder / "kills.jsonl"
     done = (
