@@ -42,6 +42,7 @@ VULKAN_PROBE = (
     "from sc3d.view.renderers import probe_vulkan; probe_vulkan()"  # says `work`, or ends with an error
 )
 
+_LINE_WIDTH = 3.0  # px
 _WRONG_COLORS = 3  # status of the process that tries Vulkan
 
 
@@ -136,7 +137,7 @@ def _render_vulkan(renderable: Renderable, view: View, background: tuple[int, in
         material = rendering.MaterialRecord()
         material.shader = "unlitLine" if name == "lines" else "defaultUnlit"
         material.point_size = renderable.point_size
-        material.line_width = 3.0
+        material.line_width = _LINE_WIDTH
         scene.add_geometry(name, geometry, material)
     renderer.setup_camera(view.matrix, view.cam_from_world, view.width, view.height)
     return np.array(renderer.render_to_image())
@@ -188,6 +189,7 @@ def _render_egl(renderable: Renderable, view: View, background: tuple[int, int, 
     try:
         options = visualizer.get_render_option()
         options.point_size = renderable.point_size
+        options.line_width = _LINE_WIDTH
         options.background_color = np.array(background) / 255.0
         options.light_on = False
         options.mesh_show_back_face = True
