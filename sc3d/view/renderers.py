@@ -4,7 +4,7 @@ Neither needs a display.
 Known failures, and what is done about them (Open3D 0.20):
 - no Vulkan driver: the process aborts instead of raising, and after a failed start the OpenGL visualizer
     fails too: so another process tries first;
-- with Mesa 25 (Debian 13), Vulkan draws all points and triangles in the color of the first one: so that
+- with Mesa 25.0 (Debian 13), Vulkan draws all points and triangles in the color of the first one: so that
     process looks at the colors;
 - two living OffscreenRenderers abort: each dies in the function that made it;
 - the OpenGL visualizer ignores the principal point and fx != fy: it draws a larger centered picture, from

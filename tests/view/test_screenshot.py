@@ -114,7 +114,7 @@ def test_points_appear_where_project_says(renderer):
 
 
 def test_a_renderer_that_draws_all_in_the_first_color_is_found_out():
-    """As Vulkan does with Mesa 25."""
+    """As Vulkan does with Mesa 25.0."""
 
     def first_color(renderable, view, background):
         colors = np.repeat(renderable.colors[:1], len(renderable.colors), axis=0)
