@@ -90,8 +90,8 @@ class Trainer:
 
     def __init__(self, data: TrainingData, settings: TrainSettings) -> None:
         self.data, self.train_views = data, data.held_out(settings).trained
-        settings = settings.for_photos(len(self.train_views))
-        self.settings, self.device = settings, pick_device(settings.device)
+        self.device = pick_device(settings.device)
+        self.settings = settings = settings.resolved(self.device.type, len(self.train_views))
         self.generator = torch.Generator().manual_seed(settings.seed)
         used = data.subset(self.train_views, settings.seen_by)
         points, centers = np.asarray(used.points, np.float64), np.stack([view.center for view in used.views])

@@ -26,9 +26,8 @@ def write_training_sheet(
     path: Path, result: TrainResult, data: TrainingData, settings: TrainSettings
 ) -> None:
     """Write the contact sheet of a training, a picture of 1600 px width; its title says how long and how
-    well.
+    well. settings: `resolved`
     """
-    settings = settings.for_photos(len(data.held_out(settings).trained))
     title = f"{settings.iterations:,} iterations, {len(result.gaussians):,} Gaussians"
     if result.log:
         title += f", PSNR {result.log[-1]['psnr']:.2f} dB over the last steps"
