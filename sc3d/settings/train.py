@@ -9,6 +9,8 @@ from typing import Literal, NamedTuple
 from sc3d.errors import InputError
 from sc3d.settings.common import DepthMode, Memory, Workers
 
+Exposure = Literal["none", "gain", "affine"]
+
 
 class Amounts(NamedTuple):
     """What 0 stands for in the settings of the same names, and the training steps for each photo, in all at least
@@ -55,8 +57,10 @@ class TrainSettings:
     """the same seed gives the same result"""
     plain: bool = False
     """no normal and multi-view terms: faster, rougher surface"""
-    exposure: bool = True
-    """fit a brightness gain and offset per photo"""
+    exposure: Exposure = "gain"
+    """fit to each photo a gain and offset of its brightness, or an affine transform of its colors (3x3 and an
+    offset) for photos whose white balance changes, or nothing
+    """
     test_every: int = 0
     """hold out every Nth photo and report PSNR, SSIM and depth agreement on them; 0 = none. Tells how views
     between others look
@@ -168,6 +172,12 @@ class TrainSettings:
         """
         boost = min(max((30_000 / self.iterations) ** 0.5, 1.0), 4.0)
         return self.means_rate * boost * extent * 0.01 ** (iteration / self.iterations)
+
+    def exposure_rate(self, iteration: int) -> float:
+        """Learning rate of what is fitted to each photo; colors have farther to go than brightness, which
+        cameras mostly settle, so theirs begins higher and falls to a tenth.
+        """
+        return 0.02 * 0.1 ** (iteration / self.iterations) if self.exposure == "affine" else 1e-3
 
     def densify_interval(self, num_views: int) -> int:
         """Iterations between densifications: a 300th of the run, but long enough for statistics of every view

@@ -68,6 +68,20 @@ def test_too_many_blocks_are_refused_before_work(site, tmp_path, capsys):
         Train(blocks=-1)
 
 
+def test_affine_colors_of_blocks_are_means(site, tmp_path, monkeypatch):
+    found = []
+    monkeypatch.setattr(
+        train_stage, "write_training_sheet", lambda path, result, data, settings: found.append(result)
+    )
+    few = ["--iterations", "24", "--plain", "--no-fill", "--exposure", "affine"]
+    folder = trained(site, tmp_path / "scene", *few, "--blocks", "2", "--checkpoint-every", "0")
+    monkeypatch.undo()
+    exposures = found[0].exposures
+    assert exposures.shape == (8, 12) and not exposures[3::4].any() and np.isfinite(exposures).all()
+    assert (np.abs(exposures).max(axis=1) > 0).sum() == 6 and np.abs(exposures).max() < 1
+    assert read_json(sidecar(folder / "gaussians.ply"))["settings"]["exposure"] == "affine"
+
+
 class Reached(Exception):
     """Training would begin."""
 
