@@ -281,6 +281,7 @@ def test_interrupted_output_leaves_the_old_file(tmp_path):
         (["--from=centres"], ["--from=centers"]),
         (["--num_neighbours", "4"], ["--num-neighbors", "4"]),
         (["--train.num-neighbours=4"], ["--train.num-neighbors=4"]),
+        (["--train.no-exposure", "--no_exposure"], ["--train.exposure=none", "--exposure=none"]),
         (
             ["--label.no-range", "--label.incidence"],
             ["--label.mechanisms.no-range", "--label.mechanisms.incidence"],
@@ -298,6 +299,7 @@ def test_options_as_they_were_spelled_before_are_taken_with_a_warning(before, no
 def test_old_spellings_reach_the_records(tmp_path):
     assert parse("extract", current([str(tmp_path), "--from", "centres"]))[0].settings.method == "centers"
     assert parse("train", current([str(tmp_path), "--num-neighbours", "5"]))[0].settings.num_neighbors == 5
+    assert parse("train", current([str(tmp_path), "--no-exposure"]))[0].settings.exposure == "none"
     assert parse("run", current(["a", "b", "--label.incidence"]))[0].label.mechanisms.incidence
 
 

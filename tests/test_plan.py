@@ -1,10 +1,12 @@
 """What `sc3d run` tells before it starts and at its end."""
 
+import importlib.util
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
 import pytest
+import torch
 
 from sc3d.commands import plan as plans
 from sc3d.commands.plan import EXPECTED, megapixels, pending, plan, results, warn_of_slow
@@ -80,13 +82,20 @@ def test_pairs_are_counted_and_pixels_as_the_stages_make_them_smaller():
     assert megapixels([(4000, 3000), (600, 800)], 800) == pytest.approx((800 * 600 + 600 * 800) / 1e6)
 
 
-def test_training_takes_as_long_as_its_steps_and_is_not_known_on_a_gpu():
+def test_training_takes_as_long_as_its_steps_and_is_not_known_on_a_gpu(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     sizes = [(1600, 900)] * 18
     one, two = (EXPECTED["train"](Train(iterations=count), sizes) for count in (1000, 2000))
     assert one is not None and two == pytest.approx(2 * one)
     assert one == pytest.approx(0.49 * 1000 * 0.36)
     assert EXPECTED["train"](Train(device="cuda"), sizes) is None
-    halved = EXPECTED["train"](Train(iterations=1000, downscale=4.0), sizes)
+    for pretended in (False, True):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=pretended: there)
+        auto = EXPECTED["train"](Train(), sizes)
+        assert auto is None if pretended else auto == pytest.approx(one)
+        assert EXPECTED["train"](Train(device="cpu"), sizes) == pytest.approx(one)
+    halved = EXPECTED["train"](Train(iterations=1000, downscale=4.0, device="cpu"), sizes)
     assert halved == pytest.approx(one / 4)
 
 

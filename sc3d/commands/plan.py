@@ -62,14 +62,18 @@ def _mapping(settings: Any, sizes: Sizes) -> float:
 
 def _training(settings: Any, sizes: Sizes) -> float | None:
     """None: on a GPU nothing was measured."""
-    if settings.device == "cuda":
+    from sc3d.splatting.device import device_type
+
+    device = device_type(settings.device)
+    if device == "cuda":
         return None
+    settings = settings.resolved(device, len(sizes))
     longest = [max(size) for size in sizes]
     pixels = [
         width * height * (settings.size(side) / side) ** 2 / 1e6
         for (width, height), side in zip(sizes, longest, strict=True)
     ]
-    return 0.49 * settings.for_photos(len(sizes)).iterations * sum(pixels) / len(pixels)
+    return 0.49 * settings.iterations * sum(pixels) / len(pixels)
 
 
 def _segmenting(settings: Any, sizes: Sizes) -> float | None:

@@ -18,6 +18,8 @@ MECHANISMS = [field.name.replace("_", "-") for field in fields(PaperMechanisms)]
 OPTIONS = {
     "--num-neighbours": "--num-neighbors",
     "--train.num-neighbours": "--train.num-neighbors",
+    "--no-exposure": "--exposure=none",
+    "--train.no-exposure": "--train.exposure=none",
     **{f"--label.{name}": f"--label.mechanisms.{name}" for name in MECHANISMS},
     **{f"--label.no-{name}": f"--label.mechanisms.no-{name}" for name in MECHANISMS},
 }

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sc3d.geometry.cameras import View
+from sc3d.geometry.cameras import View, in_image, project
 
 NUM_DEPTHS = 64
 MIN_SPARSE = 8
@@ -29,6 +29,27 @@ class SweptView:
     pixels: np.ndarray
     depths: np.ndarray
     grid: np.ndarray
+
+    @classmethod
+    def between(
+        cls, view: View, points: np.ndarray, mask: np.ndarray | None, step: float
+    ) -> SweptView | None:
+        """A grid of pixels `step` apart, no nearer to those of the sparse points than that; None where too few
+        points are seen, or nothing is empty.
+
+        points: (N, 3) world, that the view sees, as far as it is known; mask: (H, W) bool, False = no grid
+        """
+        pixels, depths = project(view, points)
+        usable = in_image(view, pixels) & (depths > 0)
+        if usable.sum() < MIN_SPARSE:
+            return None
+        columns, rows = (np.arange(step / 2, side, step) for side in (view.width, view.height))
+        grid = np.stack(np.meshgrid(columns, rows), 2).reshape(-1, 2)
+        if mask is not None:
+            grid = grid[mask[grid[:, 1].astype(int), grid[:, 0].astype(int)]]
+        if len(grid):
+            grid = grid[cKDTree(pixels[usable]).query(grid)[0] > step]
+        return cls(view, pixels[usable], depths[usable], grid) if len(grid) else None
 
     @property
     def rays(self) -> np.ndarray:

@@ -2,11 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from sc3d.errors import InputError
 from sc3d.settings.common import DepthMode, Memory, Workers
+
+Exposure = Literal["none", "gain", "affine"]
+
+
+class Amounts(NamedTuple):
+    """What 0 stands for in the settings of the same names, and the training steps for each photo, in all at least
+    and at most so many.
+    """
+
+    max_gaussians: int
+    max_size: int
+    steps_per_photo: int
+    fewest_steps: int
+    most_steps: float = math.inf
+
+
+ON_CPU = Amounts(200_000, 800, 40, 1000)
+ON_GPU = Amounts(1_000_000, 1600, 300, 7000, 30_000)
+"""By the common practice of 3D Gaussian splatting; never run here, for want of a GPU."""
 
 
 @dataclass(frozen=True)
@@ -16,11 +36,15 @@ class TrainSettings:
     """
 
     iterations: int = 0
-    """training steps, one photo each; 0 = 40 for each photo, at least 1000; 30 000 is the paper's"""
-    max_gaussians: int = 200_000
-    """never more Gaussians than this: bounds memory and time"""
-    max_size: int = 800
-    """longest side of the training images, px"""
+    """training steps, one photo each; 0 = on the CPU 40 for each photo, at least 1000; on a GPU 300, at least 7000,
+    at most 30 000, which is the paper's number
+    """
+    max_gaussians: int = 0
+    """never more Gaussians than this: bounds memory and time; 0 = 200 000 on the CPU, 1 000 000 on a GPU (no
+    default for a GPU was ever run: they follow common practice)
+    """
+    max_size: int = 0
+    """longest side of the training images, px; 0 = 800 on the CPU, 1600 on a GPU"""
     downscale: float = 0.0
     """divide the photos' size by this instead of fitting max_size; 0 = fit max_size"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -33,8 +57,10 @@ class TrainSettings:
     """the same seed gives the same result"""
     plain: bool = False
     """no normal and multi-view terms: faster, rougher surface"""
-    exposure: bool = True
-    """fit a brightness gain and offset per photo"""
+    exposure: Exposure = "gain"
+    """fit to each photo a gain and offset of its brightness, or an affine transform of its colors (3x3 and an
+    offset) for photos whose white balance changes, or nothing
+    """
     test_every: int = 0
     """hold out every Nth photo and report PSNR, SSIM and depth agreement on them; 0 = none. Tells how views
     between others look
@@ -95,26 +121,38 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         if (
-            self.iterations < 0
-            or self.max_gaussians < 1
-            or self.max_size < 16
+            min(self.iterations, self.max_gaussians) < 0
+            or 0 != self.max_size < 16
             or not 0 <= self.sh_degree <= 3
             or self.downscale < 0
         ):
             raise InputError(
-                "max_gaussians must be at least 1, max_size at least 16, sh_degree 0 to 3, iterations and downscale not negative"
+                "max_size must be 0 or at least 16, sh_degree 0 to 3, iterations, max_gaussians and downscale not negative"
             )
         if self.test_every < 0 or not 0 <= self.test_sector < 1:
             raise InputError(
                 f"test_every must not be negative, and test_sector a share of the photos from 0 to below 1, such as 0.2: they are {self.test_every} and {self.test_sector}"
             )
 
-    def for_photos(self, number: int) -> TrainSettings:
-        """With a number of iterations; number: of photos that are trained on."""
-        return self if self.iterations else replace(self, iterations=max(1000, 40 * number))
+    def resolved(self, device: str, num_photos: int = 0) -> TrainSettings:
+        """With the numbers that every 0 stands for.
+
+        device: that trains, cuda or cpu (as all others count); num_photos: that are trained on; 0 = not known yet:
+            `iterations` stays as it is
+        """
+        auto = ON_GPU if device == "cuda" else ON_CPU
+        steps = min(max(auto.fewest_steps, auto.steps_per_photo * num_photos), auto.most_steps)
+        return replace(
+            self,
+            iterations=self.iterations or (int(steps) if num_photos else 0),
+            max_gaussians=self.max_gaussians or auto.max_gaussians,
+            max_size=self.max_size or auto.max_size,
+        )
 
     def size(self, longest: int) -> int:
-        """Longest side of the training image of a photo whose longest side is `longest`, px."""
+        """Longest side of the training image of a photo whose longest side is `longest`, px; of `resolved`
+        settings.
+        """
         return round(longest / self.downscale) if self.downscale else min(longest, self.max_size)
 
     @property
@@ -134,6 +172,12 @@ class TrainSettings:
         """
         boost = min(max((30_000 / self.iterations) ** 0.5, 1.0), 4.0)
         return self.means_rate * boost * extent * 0.01 ** (iteration / self.iterations)
+
+    def exposure_rate(self, iteration: int) -> float:
+        """Learning rate of what is fitted to each photo; colors have farther to go than brightness, which
+        cameras mostly settle, so theirs begins higher and falls to a tenth.
+        """
+        return 0.02 * 0.1 ** (iteration / self.iterations) if self.exposure == "affine" else 1e-3
 
     def densify_interval(self, num_views: int) -> int:
         """Iterations between densifications: a 300th of the run, but long enough for statistics of every view

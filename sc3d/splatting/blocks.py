@@ -32,7 +32,9 @@ from sc3d.io.provenance import peak_memory_mb
 from sc3d.io.splats import read_splat_ply, write_splat_ply
 from sc3d.scene.scene import Scene
 from sc3d.settings.train import TrainSettings
+from sc3d.splatting import losses
 from sc3d.splatting.dataset import TrainingData, scene_data
+from sc3d.splatting.device import device_type
 from sc3d.splatting.evaluation import held_out_scores
 from sc3d.splatting.gaussians import Gaussians
 from sc3d.splatting.trainer import TrainResult, train
@@ -81,7 +83,8 @@ def train_blocks(job: BlockJob, data: TrainingData, tasks: Executor) -> tuple[Tr
     parts = [Gaussians.from_arrays(read_splat_ply(job.file(index, "ply"))[0]) for index in indices]
     records = [cast(dict[str, Any], read_json(job.file(index, "json"))) for index in indices]
     gaussians = merge(parts, list(job.blocks))
-    exposures, counts = np.zeros((len(data.views), 2)), np.zeros((len(data.views), 1))
+    size = losses.EXPOSURE_SIZES[job.settings.exposure]
+    exposures, counts = np.zeros((len(data.views), size)), np.zeros((len(data.views), 1))
     for record in records:
         exposures[record["views"]] += record["exposures"]
         counts[record["views"]] += 1
@@ -156,7 +159,8 @@ def share_settings(
     So each photo is looked at as often as without blocks, and all cores together hold about `max_gaussians`.
     """
     num_views = len(data.held_out(settings).trained)
-    iterations = max(1, round(settings.for_photos(num_views).iterations * len(views) / num_views))
+    settings = settings.resolved(device_type(settings.device), num_views)
+    iterations = max(1, round(settings.iterations * len(views) / num_views))
     share = float(block.holds(data.points, border=True).mean())
     max_gaussians = max(1, round(settings.max_gaussians * share))
     own = replace(settings, iterations=iterations, max_gaussians=max_gaussians)

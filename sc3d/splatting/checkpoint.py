@@ -28,20 +28,22 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, saved: list[dict]) -> No
         }
 
 
-def check_state(state: dict, parameters: dict[str, torch.Tensor], views: list[View], path: str) -> None:
+def check_state(
+    state: dict, parameters: dict[str, torch.Tensor], exposures: torch.Tensor, views: list[View], path: str
+) -> None:
     """Raise ValueError, KeyError, RuntimeError, TypeError or InputError unless a state has the shapes and
     ranges of one that `Trainer.save` wrote.
 
-    state: as loaded, with tensors and plain values only; parameters: as a fresh run has them; views: all of
-        them
+    state: as loaded, with tensors and plain values only; parameters, exposures: as a fresh run has them; views:
+        all of them
     """
     size = len(state["parameters"]["means"])
     shapes = {name: (size, *tensor.shape[1:]) for name, tensor in parameters.items()}
     _check_tensors(state["parameters"], shapes)
     check_splats({name: tensor.numpy() for name, tensor in state["parameters"].items()}, path)
     _check_optimizer(state["optimizer"], list(shapes.values()))
-    _check_tensors({"exposures": state["exposures"]}, {"exposures": (len(views), 2)})
-    _check_optimizer(state["exposure_optimizer"], [(len(views), 2)])
+    _check_tensors({"exposures": state["exposures"]}, {"exposures": exposures.shape})
+    _check_optimizer(state["exposure_optimizer"], [exposures.shape])
     _check_tensors(state["statistics"], {field.name: (size,) for field in fields(Statistics)})
     _check_tensors(
         state["depths"], {index: (views[index].height, views[index].width) for index in state["depths"]}

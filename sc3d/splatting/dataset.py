@@ -17,6 +17,7 @@ from sc3d.scene.depth_map import DepthMap, depth_file, read_depth_map
 from sc3d.scene.scene import Scene
 from sc3d.scene.splats import read_scene_splats
 from sc3d.settings.train import TrainSettings
+from sc3d.splatting.device import device_type
 from sc3d.splatting.gaussians import Gaussians
 
 CACHED_PIXELS = 500_000_000  # undistorted photos kept in memory: 1.5 GB
@@ -140,6 +141,7 @@ def scene_data(scene: Scene, settings: TrainSettings) -> tuple[TrainingData, np.
     """A scene's photos, undistorted at training size when they are asked for, and sparse points; the (3,)
     world position of the local origin.
     """
+    settings = settings.resolved(device_type(settings.device))
     model = scene.model
     origin = local_origin(model.views)
     local = [view.shifted(origin) for view in model.views]

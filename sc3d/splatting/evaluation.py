@@ -61,7 +61,7 @@ def compare(
 
     view: pinhole, local frame; photo: (H, W, 3) uint8 RGB; mask: (H, W) bool, False does not count for the
         PSNR
-    exposure: a, b of the photo (`losses.apply_exposure`); None = what fits it best
+    exposure: of the photo (`losses.apply_exposure`); None = the gain and offset that fit it best
     """
     image = render(gaussians, view, geometry=False).color.cpu()
     target = torch.from_numpy(np.ascontiguousarray(photo)).float() / 255
@@ -102,9 +102,9 @@ def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSet
             HeldOutPhoto(
                 view.name,
                 SECTOR if index in split.sector else f"every {settings.test_every}",
-                *_likeness(rendering.color, target, used, settings.exposure),
+                *_likeness(rendering.color, target, used, settings.exposure != "none"),
                 _share(inside, used) or 0.0,
-                *_likeness(rendering.color, target, inside, settings.exposure),
+                *_likeness(rendering.color, target, inside, settings.exposure != "none"),
                 _share(agrees & (rendering.alpha >= 0.5), expected > 0),
             )
         )
@@ -114,7 +114,7 @@ def held_out_scores(gaussians: Gaussians, data: TrainingData, settings: TrainSet
 def _likeness(
     image: torch.Tensor, target: torch.Tensor, used: torch.Tensor, exposure: bool
 ) -> tuple[float | None, float | None]:
-    """PSNR (dB) and SSIM of the used pixels, (H, W) bool, with the exposure that fits these; None of none."""
+    """PSNR (dB) and SSIM of the used pixels, (H, W) bool, with the gain and offset that fit these; None of none."""
     if not used.any():
         return None, None
     if exposure:

@@ -14,9 +14,8 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from sc3d.geometry.cameras import View, in_image, project
+from sc3d.geometry.cameras import View
 from sc3d.geometry.plane_sweep import (
-    MIN_SPARSE,
     Plane,
     SweepVolume,
     SweptView,
@@ -96,10 +95,12 @@ def plane_sweep_points(
     )
     step = max(4.0, np.sqrt(num_pixels / max(budget, 1)))
     grays = [_small_gray(data, index) for index in range(len(data.views))]
-    volume = SweepVolume.from_points(np.asarray(data.points, np.float64), data.views)
+    points = np.asarray(data.points, np.float64)
+    volume = SweepVolume.from_points(points, data.views)
     found, colors, sizes = [], [], []
     for index, view in enumerate(progress(data.views, "first Gaussians", "view")):
-        reference = _reference(data, index, step)
+        seen = points if data.tracks is None else points[data.tracks[index]]
+        reference = SweptView.between(view, seen, data.mask(index), step)
         if reference is None:
             continue
         planes = sweep_planes(reference, volume)
@@ -114,9 +115,9 @@ def plane_sweep_points(
         sizes.append(step * depth / view.focal)
     if not found:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    points = np.concatenate(found)
-    kept = one_per_cube(points, float(np.median(np.concatenate(sizes))))
-    return points[kept], np.concatenate(colors)[kept]
+    filled = np.concatenate(found)
+    kept = one_per_cube(filled, float(np.median(np.concatenate(sizes))))
+    return filled[kept], np.concatenate(colors)[kept]
 
 
 def _small_gray(data: TrainingData, index: int) -> tuple[torch.Tensor, View]:
@@ -125,25 +126,6 @@ def _small_gray(data: TrainingData, index: int) -> tuple[torch.Tensor, View]:
     small = view.resized(max(8, round(view.width * scale)), max(8, round(view.height * scale)))
     image = cv2.resize(data.image(index), (small.width, small.height), interpolation=cv2.INTER_AREA)
     return losses.to_gray(torch.from_numpy(image).float() / 255), small
-
-
-def _reference(data: TrainingData, index: int, step: float) -> SweptView | None:
-    """None where too few sparse points are seen, or nothing is empty. Without tracks every point in the image
-    counts as seen.
-    """
-    view, points = data.views[index], np.asarray(data.points, np.float64)
-    pixels, depths = project(view, points if data.tracks is None else points[data.tracks[index]])
-    usable = in_image(view, pixels) & (depths > 0)
-    if usable.sum() < MIN_SPARSE:
-        return None
-    columns, rows = np.meshgrid(np.arange(step / 2, view.width, step), np.arange(step / 2, view.height, step))
-    grid = np.stack([columns.ravel(), rows.ravel()], 1)
-    mask = data.mask(index)
-    if mask is not None:
-        grid = grid[mask[grid[:, 1].astype(int), grid[:, 0].astype(int)]]
-    if len(grid):
-        grid = grid[cKDTree(pixels[usable]).query(grid)[0] > step]
-    return SweptView(view, pixels[usable], depths[usable], grid) if len(grid) else None
 
 
 def _sweep(

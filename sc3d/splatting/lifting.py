@@ -9,17 +9,15 @@ sum(image * mask) with respect to the Gaussian's color.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 
 import numpy as np
-import torch
 
 from sc3d.geometry.cameras import View
 from sc3d.io.progress import progress
 from sc3d.splatting import device
 from sc3d.splatting.cpu.label_lifting import add_evidence
-from sc3d.splatting.gaussians import SH_C0, Gaussians
-from sc3d.splatting.rendering import render
+from sc3d.splatting.gaussians import Gaussians
+from sc3d.splatting.gpu.label_lifting import evidence_by_gradient
 
 SCALE = 1 << 30  # evidence of one whole pixel, in fixed point: 2^63 of it are 8 thousand million pixels
 ReadMask = Callable[[View], tuple[np.ndarray, np.ndarray | None]]
@@ -51,28 +49,6 @@ def lift(gaussians: Gaussians, views: Iterable[View], read: ReadMask, num_channe
             part = evidence_by_gradient(gaussians, view, mask, weights, num_channels)
             evidence += np.rint(part * SCALE).astype(np.int64)
     return evidence / SCALE
-
-
-def evidence_by_gradient(
-    gaussians: Gaussians, view: View, mask: np.ndarray, weights: np.ndarray, num_channels: int
-) -> np.ndarray:
-    """The same for one view by the renderer's backward pass, three classes at a time: the twin of the kernel,
-    and the way on a GPU.
-
-    returns: (N, num_channels) float64
-    """
-    evidence = np.zeros((len(gaussians), num_channels))
-    # away from 0, where colors are cut
-    gray = gaussians.detached().painted(np.full((len(gaussians), 3), 0.5))
-    target, weight = torch.from_numpy(mask.astype(np.int64)), torch.from_numpy(weights)
-    for first in range(1, num_channels, 3):
-        dc = gray.sh_dc.clone().requires_grad_()
-        image = render(replace(gray, sh_dc=dc), view, 0, geometry=False).color
-        shown = torch.stack([(target == label) * weight for label in range(first, first + 3)], dim=2)
-        (gradient,) = torch.autograd.grad((image * shown.to(image)).sum(), dc)
-        part = gradient.cpu().numpy().astype(np.float64) / SH_C0
-        evidence[:, first : first + 3] = part[:, : num_channels - first]
-    return evidence
 
 
 def winners(evidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

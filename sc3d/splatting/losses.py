@@ -22,6 +22,8 @@ from sc3d.splatting.rendered_view import Rendering
 
 GRAY = (0.299, 0.587, 0.114)
 FAR_OFF = 0.1  # relative depth error that counts no more: one of the two is wrong
+EXPOSURE_SIZES = {"none": 2, "gain": 2, "affine": 12}
+"""numbers that a photo has, see `apply_exposure`"""
 PIXELS_PER_PATCH = 4
 """the geometric term looks at this many times more pixels than the photometric one"""
 
@@ -36,11 +38,18 @@ class Neighbor:
 
 
 def apply_exposure(image: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
-    """exp(a) image + b: a photo's brightness against the scene's. exposure: (2,) a, b, on any device; zeros
-    change nothing.
+    """A photo's brightness or colors against the scene's: exp(a) image + b, or (I + M) color + t of every pixel.
+
+    image: (..., 3); exposure: (2,) a, b, or (12,) the rows of (M | t), on any device; zeros change nothing
     """
     exposure = exposure.to(image.device)
-    return per_row(exposure[0].exp(), image) * image + per_row(exposure[1], image)
+    if len(exposure) == EXPOSURE_SIZES["gain"]:
+        return per_row(exposure[0].exp(), image) * image + per_row(exposure[1], image)
+    planes, changed = image.unbind(-1), []
+    for plane, row in zip(planes, exposure.reshape(3, 4), strict=True):
+        parts = [per_row(each, plane) * other for each, other in zip(row, planes, strict=False)]
+        changed.append(plane + sum(parts) + per_row(row[3], plane))
+    return torch.stack(changed).movedim(0, -1)  # plane by plane
 
 
 def fit_exposure(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

@@ -31,7 +31,7 @@ from sc3d.splatting.strategy import DensifyLimits, Statistics
 log = logging.getLogger(__name__)
 
 LOG_EVERY = 50
-CHECKPOINT_VERSION = 2
+CHECKPOINT_VERSION = 3
 # learning rates; that of the means follows `TrainSettings.position_rate`
 RATES = {
     "means": 0.0,
@@ -41,12 +41,12 @@ RATES = {
     "sh_dc": 2.5e-3,
     "sh_rest": 1.25e-4,
 }
-EXPOSURE_RATE = 1e-3
 
 
 @dataclass
 class TrainResult:
-    """gaussians: not part of an autograd graph; exposures: (V, 2) a, b per view, zero where held out
+    """gaussians: not part of an autograd graph
+    exposures: (V, 2) or (V, 12) of every view, see `losses.apply_exposure`; zero where held out
     log: rows of iteration, loss, psnr, num_gaussians, seconds; held_out: one row per photo left out
     """
 
@@ -90,8 +90,8 @@ class Trainer:
 
     def __init__(self, data: TrainingData, settings: TrainSettings) -> None:
         self.data, self.train_views = data, data.held_out(settings).trained
-        settings = settings.for_photos(len(self.train_views))
-        self.settings, self.device = settings, pick_device(settings.device)
+        self.device = pick_device(settings.device)
+        self.settings = settings = settings.resolved(self.device.type, len(self.train_views))
         self.generator = torch.Generator().manual_seed(settings.seed)
         used = data.subset(self.train_views, settings.seen_by)
         points, centers = np.asarray(used.points, np.float64), np.stack([view.center for view in used.views])
@@ -103,9 +103,10 @@ class Trainer:
         self.extent = scene_extent(centers, points)
         gaussians = initial_gaussians(used, neighbors, settings, self.generator).to(self.device)
         self.optimizer = strategy.adam(gaussians, RATES)
-        self.exposures = torch.zeros(len(data.views), 2, requires_grad=True)
+        size = losses.EXPOSURE_SIZES[settings.exposure]
+        self.exposures = torch.zeros(len(data.views), size, requires_grad=True)
         # of one photo per step: Adam for rows that have a gradient
-        self.exposure_optimizer = torch.optim.SparseAdam([self.exposures], EXPOSURE_RATE, eps=1e-15)
+        self.exposure_optimizer = torch.optim.SparseAdam([self.exposures], eps=1e-15)
         self.num_initial = len(gaussians)
         self.statistics = Statistics.zeros(self.num_initial, self.device)
         self.iteration = 0
@@ -132,7 +133,7 @@ class Trainer:
         degree = settings.active_sh_degree(iteration)
         rendering = render(gaussians, view, degree, background, shapes_surface, settings.depth_mode)
         image = rendering.color
-        if settings.exposure:
+        if settings.exposure != "none":
             exposure = torch.nn.functional.embedding(torch.tensor(index), self.exposures, sparse=True)
             image = losses.apply_exposure(image, exposure)
         stereo = self.data.stereo(index, settings.coarse(iteration), self.device) if settings.fill else None
@@ -186,7 +187,7 @@ class Trainer:
             state = torch.load(path, map_location="cpu", weights_only=True)
             matches = all(state[name] == value for name, value in self._identity().items())
             if matches:
-                check_state(state, self.gaussians.parameters(), self.data.views, str(path))
+                check_state(state, self.gaussians.parameters(), self.exposures, self.data.views, str(path))
         except Exception as error:  # torch raises many types for broken files
             raise InputError(
                 f"{path} is not a readable checkpoint ({type(error).__name__}): delete it to start over"
@@ -245,9 +246,15 @@ class Trainer:
         self.statistics.add(rendering)
         rate = self.settings.position_rate(self.iteration, self.extent)
         next(group for group in self.optimizer.param_groups if group["name"] == "means")["lr"] = rate
+        self.exposure_optimizer.param_groups[0]["lr"] = self.settings.exposure_rate(self.iteration)
         for optimizer in (self.optimizer, self.exposure_optimizer):
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
+        if (
+            self.settings.exposure == "affine"
+        ):  # the mean photo keeps its colors: those of the scene cannot drift
+            known = self.exposures.detach().numpy()  # numpy adds up in one order, whatever the threads
+            known[self.train_views] -= known[self.train_views].mean(axis=0)
 
     def _densify(self) -> None:
         settings, iteration, num_views = self.settings, self.iteration, len(self.train_views)

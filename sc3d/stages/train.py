@@ -16,10 +16,10 @@ from sc3d.io.readable_photos import tell_of_transparent
 from sc3d.io.splats import origin_comment, write_splat_ply
 from sc3d.scene.held_out import mean_scores, write_held_out
 from sc3d.scene.scene import Scene, check_photos, require_views
-from sc3d.settings.train import Train
+from sc3d.settings.train import Train, TrainSettings
 from sc3d.splatting.blocks import BlockJob, train_blocks
 from sc3d.splatting.dataset import TrainingData, scene_data
-from sc3d.splatting.device import pick_device
+from sc3d.splatting.device import device_type, pick_device
 from sc3d.splatting.trainer import TrainResult, train
 from sc3d.tiling.executor import open_executor
 from sc3d.view.training_sheet import write_training_sheet
@@ -43,10 +43,11 @@ def besides(scene: Scene, settings: Train) -> list[Path]:
 
 def run(scene: Scene, settings: Train) -> dict[str, object]:
     in_blocks = settings.blocks > 1
-    if not (in_blocks and settings.cluster):  # whose workers may have the GPU that this machine lacks
-        device = pick_device(settings.device)  # complain before the work begins
-        if device.type == "cuda" and not settings.iterations:
-            logger.info("training on a GPU, for as long as suits a CPU; the paper's --iterations is 30000")
+    if in_blocks and settings.cluster:  # whose workers may have the GPU that this machine lacks
+        device = device_type(settings.device)
+    else:
+        device = pick_device(settings.device).type  # complain before the work begins
+    training = settings.training.resolved(device)
     require_views(scene)
     check_photos(scene, [view.name for view in scene.model.views])
     _tell_of_left_out(scene)
@@ -54,23 +55,33 @@ def run(scene: Scene, settings: Train) -> dict[str, object]:
         raise InputError(
             f"{scene.sparse} has {len(scene.model.points)} sparse points, too few to start from: run `sc3d reconstruct` with more overlap"
         )
-    data, origin = scene_data(scene, settings.training)
-    _tell_of_held_out(data, settings)
-    unfinished = _unfinished(scene, settings)
+    data, origin = scene_data(scene, training)
+    _tell_of_held_out(data, training)
+    unfinished = _unfinished(scene, settings, training)
+    training = training.resolved(device, len(data.held_out(training).trained))
+    if device == "cuda":
+        logger.info(
+            "training on a GPU: %d iterations, at most %d Gaussians, photos of %d px at most; defaults for a GPU were never measured",
+            training.iterations,
+            training.max_gaussians,
+            max(max(view.width, view.height) for view in data.views),
+        )
     if in_blocks:
-        result, summary = _train_blocks(scene, settings, data, unfinished)
+        result, summary = _train_blocks(scene, settings, training, data, unfinished)
     else:
         checkpoint = unfinished if settings.checkpoint_every else None
-        result, summary = train(data, settings.training, checkpoint), {}
+        result, summary = train(data, training, checkpoint), {}
     write_splat_ply(scene.gaussians, result.gaussians.arrays(), [origin_comment(origin)])
     write_log(result.log, scene.path / "train.csv")
     write_held_out(scene.path / "held_out.csv", result.held_out)
-    write_training_sheet(scene.path / "train.jpg", result, data, settings.training)
+    write_training_sheet(scene.path / "train.jpg", result, data, training)
     remove(unfinished)
     last = result.log[-1] if result.log else {}
     return {
         "photos": len(data.views),
         "size": f"{data.views[0].width}x{data.views[0].height}",
+        "iterations": training.iterations,
+        "max_gaussians": training.max_gaussians,
         "gaussians": len(result.gaussians),
         "psnr": round(last.get("psnr", float("nan")), 2),
         **{f"held_out_{name}": round(value, 3) for name, value in mean_scores(result.held_out).items()},
@@ -87,9 +98,9 @@ def _tell_of_left_out(scene: Scene) -> None:
     tell_of_transparent({name: scene.photo(name) for name in sorted(known)}, "teach nothing")
 
 
-def _tell_of_held_out(data: TrainingData, settings: Train) -> None:
+def _tell_of_held_out(data: TrainingData, settings: TrainSettings) -> None:
     """Say what training leaves out for a sector; InputError if hardly anything is left to start from."""
-    split = data.held_out(settings.training)
+    split = data.held_out(settings)
     if not split.sector:
         return
     names = [data.views[index].name for index in split.sector]
@@ -118,21 +129,21 @@ def write_log(rows: list[dict[str, float]], path: Path) -> None:
 
 
 def _train_blocks(
-    scene: Scene, settings: Train, data: TrainingData, folder: Path
+    scene: Scene, settings: Train, training: TrainSettings, data: TrainingData, folder: Path
 ) -> tuple[TrainResult, dict[str, object]]:
     blocks = tuple(split_blocks(data.points, settings.blocks))
     here = not settings.workers and not settings.cluster
-    job = BlockJob(scene.path.absolute(), settings.training, blocks, folder.absolute(), progress=here)
+    job = BlockJob(scene.path.absolute(), training, blocks, folder.absolute(), progress=here)
     with open_executor(settings) as tasks:
         return train_blocks(job, data, tasks)
 
 
-def _unfinished(scene: Scene, settings: Train) -> Path:
+def _unfinished(scene: Scene, settings: Train, training: TrainSettings) -> Path:
     """Where this run's checkpoint lies, or the folder of its blocks; those of other settings, photos or
-    cameras are removed.
+    cameras are removed. training: with the numbers of the device
     """
     blocks = settings.blocks if settings.blocks > 1 else 0
-    state = repr((settings.training, blocks, *map(digest, inputs(scene, settings))))
+    state = repr((training, blocks, *map(digest, inputs(scene, settings))))
     mine = (
         scene.path
         / f"train.{hashlib.blake2b(state.encode(), digest_size=8).hexdigest()}.{'blocks' if blocks else 'checkpoint'}"

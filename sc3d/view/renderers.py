@@ -109,7 +109,7 @@ def draws_colors(draw: Callable[[Renderable, View, tuple[int, int, int]], np.nda
     """Whether a renderer shows red at the left and blue at the right, as points and as triangles."""
     corners = np.array([[x, y, 2.0] for x in (-1, -0.1, 0.1, 1) for y in (-1, 1)], np.float32)
     triangles = np.array([[0, 1, 2], [1, 3, 2], [4, 5, 6], [5, 7, 6]])
-    colors = np.repeat(np.uint8([[200, 30, 40], [20, 60, 220]]), 4, axis=0)
+    colors = np.repeat(np.array([[200, 30, 40], [20, 60, 220]], np.uint8), 4, axis=0)
     middles = np.array([[x, 0, 2.0] for x in (-0.5, 0.5)], np.float32)
     cloud = Renderable(middles, colors[::4], point_size=8.0)
     view = pinhole_view("probe", (32, 32), (32, 32, 16, 16), np.eye(4))

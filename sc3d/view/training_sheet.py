@@ -26,9 +26,8 @@ def write_training_sheet(
     path: Path, result: TrainResult, data: TrainingData, settings: TrainSettings
 ) -> None:
     """Write the contact sheet of a training, a picture of 1600 px width; its title says how long and how
-    well.
+    well. settings: `resolved`
     """
-    settings = settings.for_photos(len(data.held_out(settings).trained))
     title = f"{settings.iterations:,} iterations, {len(result.gaussians):,} Gaussians"
     if result.log:
         title += f", PSNR {result.log[-1]['psnr']:.2f} dB over the last steps"
@@ -45,11 +44,11 @@ def training_rows(
 ) -> list[Comparison]:
     """Up to six photos spread over the flight with what training made of them, held-out ones first.
 
-    exposures: (V, 2) a, b per view as found by training; held-out photos get what fits them best
+    exposures: per view as found by training, see `TrainResult`; held-out photos get what fits them best
     """
     rows = []
     for index, held_out in chosen_views(data.held_out(settings)):
-        exposure = (0.0, 0.0) if not settings.exposure else None if held_out else exposures[index]
+        exposure = (0.0, 0.0) if settings.exposure == "none" else None if held_out else exposures[index]
         found = compare(gaussians, data.views[index], data.image(index), data.mask(index), exposure)
         rows.append(replace(found, held_out=held_out))
     return rows

@@ -8,6 +8,7 @@ import shutil
 import signal
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -19,17 +20,18 @@ import torch
 from sc3d.cli import main
 from sc3d.errors import InputError
 from sc3d.geometry.blocks import split_blocks, views_of
-from sc3d.geometry.cameras import rays
+from sc3d.geometry.cameras import rays, undistorted
 from sc3d.io.json_files import read_json
 from sc3d.io.splats import read_splat_ply
 from sc3d.runner import sidecar
 from sc3d.scene.depth_map import DepthMap, depth_file, write_depth_map
 from sc3d.scene.scene import Scene
-from sc3d.settings.train import Train
-from sc3d.splatting import blocks
-from sc3d.splatting.blocks import restrict, share_settings
+from sc3d.settings.train import Train, TrainSettings
+from sc3d.splatting import blocks, dataset, device
+from sc3d.splatting.blocks import BlockJob, restrict, share_settings
 from sc3d.splatting.dataset import scene_data
 from sc3d.splatting.trainer import Trainer
+from sc3d.stages import train as train_stage
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -64,6 +66,96 @@ def test_too_many_blocks_are_refused_before_work(site, tmp_path, capsys):
     assert status.value.code == 2 and "lower --blocks" in capsys.readouterr().err
     with pytest.raises(InputError):
         Train(blocks=-1)
+
+
+def test_affine_colors_of_blocks_are_means(site, tmp_path, monkeypatch):
+    found = []
+    monkeypatch.setattr(
+        train_stage, "write_training_sheet", lambda path, result, data, settings: found.append(result)
+    )
+    few = ["--iterations", "24", "--plain", "--no-fill", "--exposure", "affine"]
+    folder = trained(site, tmp_path / "scene", *few, "--blocks", "2", "--checkpoint-every", "0")
+    monkeypatch.undo()
+    exposures = found[0].exposures
+    assert exposures.shape == (8, 12) and not exposures[3::4].any() and np.isfinite(exposures).all()
+    assert (np.abs(exposures).max(axis=1) > 0).sum() == 6 and np.abs(exposures).max() < 1
+    assert read_json(sidecar(folder / "gaussians.ply"))["settings"]["exposure"] == "affine"
+
+
+class Reached(Exception):
+    """Training would begin."""
+
+
+CPU, GPU = (1000, 200_000, 800), (7000, 1_000_000, 1600)
+
+
+@pytest.mark.parametrize(
+    ("gpu", "options", "numbers"),
+    [
+        (False, {}, CPU),
+        (True, {}, GPU),
+        (True, {"device": "cpu"}, CPU),
+        (True, {"iterations": 50, "max_size": 48}, (50, 1_000_000, 48)),
+        (False, {"blocks": 2}, CPU),
+        (True, {"blocks": 2}, GPU),
+        (False, {"blocks": 2, "cluster": "tls://nowhere:1"}, CPU),
+        (False, {"blocks": 2, "cluster": "tls://nowhere:1", "device": "cuda"}, GPU),
+    ],
+)
+def test_numbers_are_those_of_the_device_that_trains(site, tmp_path, monkeypatch, gpu, options, numbers):
+    found, sizes = [], []
+
+    def begun(*arguments):
+        found.extend(each for each in arguments if isinstance(each, TrainSettings))
+        found.extend(each.settings for each in arguments if isinstance(each, BlockJob))
+        raise Reached
+
+    def sized(view, max_size):
+        sizes.append(max_size)
+        return undistorted(view, max_size)
+
+    pretend_gpu(monkeypatch, gpu)
+    monkeypatch.setattr(train_stage, "train", begun)
+    monkeypatch.setattr(train_stage, "train_blocks", begun)
+    monkeypatch.setattr(train_stage, "open_executor", lambda settings: nullcontext())
+    monkeypatch.setattr(dataset, "undistorted", sized)
+    for name in ("images", "sparse"):
+        (tmp_path / name).symlink_to(site / name)
+    with pytest.raises(Reached):
+        train_stage.run(Scene(tmp_path), Train(**options))
+    (settings,) = found
+    assert (settings.iterations, settings.max_gaussians, settings.max_size) == numbers
+    assert set(sizes) == {min(160, settings.max_size)}
+    assert settings.device == options.get("device", "auto")  # each worker looks for its own
+
+
+def pretend_gpu(monkeypatch, there):
+    precision = torch.backends.cudnn.allow_tf32
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", precision)  # set back afterwards
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
+    monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: name)
+
+
+def test_the_names_of_checkpoints_are_those_of_the_numbers(site):
+    """So that a run that was interrupted goes on, whether its numbers were given or stand for themselves."""
+    scene, auto = Scene(site), Train()
+    for kind, other in (("cpu", "cuda"), ("cuda", "cpu")):
+        training = auto.training.resolved(kind)
+        given = Train(max_gaussians=training.max_gaussians, max_size=training.max_size)
+        name = train_stage._unfinished(scene, auto, training).name
+        assert name == train_stage._unfinished(scene, given, given.training.resolved(other)).name
+        assert name != train_stage._unfinished(scene, auto, auto.training.resolved(other)).name
+
+
+def test_blocks_share_the_numbers_of_the_device(site, monkeypatch):
+    data, _ = scene_data(Scene(site), Train())
+    block = split_blocks(data.points, 2)[0]
+    views = views_of(block, data.points, data.sightings)
+    for there, (steps, count, size) in ((False, CPU), (True, GPU)):
+        pretend_gpu(monkeypatch, there)
+        found = share_settings(Train().training, data, block, views)
+        assert found.iterations == round(steps * len(views) / 8) and found.max_size == size
+        assert found.max_gaussians == round(count * block.holds(data.points, border=True).mean())
 
 
 def test_masks_show_core_and_border_as_the_exact_depth_does(site):

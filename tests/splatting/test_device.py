@@ -8,12 +8,10 @@ import torch
 
 from sc3d.errors import InputError, MissingPackageError
 from sc3d.scene.held_out import mean_scores
-from sc3d.scene.scene import Scene
-from sc3d.settings.train import Train, TrainSettings
+from sc3d.settings.train import TrainSettings
 from sc3d.splatting import device, trainer
 from sc3d.splatting.gpu import gsplat_backend
 from sc3d.splatting.trainer import train
-from sc3d.stages import train as train_stage
 from tests.pretend_device import PretendDevice
 from tests.splatting.gpu.test_gsplat_backend import functions, reference  # noqa: F401, fixtures
 from tests.splatting.scenes import photographed, ring, valley
@@ -68,22 +66,15 @@ def test_device_is_picked_by_what_is_there(monkeypatch):
     precision = torch.backends.cudnn.allow_tf32
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert device.pick_device("cpu").type == device.pick_device("auto").type == "cpu"
+    assert [device.device_type(name) for name in ("cpu", "auto", "cuda")] == ["cpu", "cpu", "cuda"]
     with pytest.raises(InputError, match="no CUDA device"):
         device.pick_device("cuda")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: None)
-    assert device.pick_device("auto").type == "cpu"
+    assert device.pick_device("auto").type == device.device_type("auto") == "cpu"
     with pytest.raises(MissingPackageError, match="gsplat"):
         device.pick_device("cuda")
     monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: name)
     assert device.pick_device("auto").type == device.pick_device("cuda").type == "cuda"
+    assert [device.device_type(name) for name in ("cpu", "auto")] == ["cpu", "cuda"]
     torch.backends.cudnn.allow_tf32 = precision
-
-
-@pytest.mark.parametrize(("name", "iterations", "told"), [("cuda", 0, 1), ("cuda", 500, 0), ("cpu", 0, 0)])
-def test_on_a_gpu_the_papers_iterations_are_named(tmp_path, monkeypatch, caplog, name, iterations, told):
-    monkeypatch.setattr(train_stage, "pick_device", lambda asked: torch.device(name))
-    caplog.set_level("INFO")
-    with pytest.raises(InputError):  # nothing is there to be trained on
-        train_stage.run(Scene(tmp_path), Train(iterations=iterations))
-    assert caplog.text.count("--iterations is 30000") == told

@@ -51,3 +51,12 @@ def test_exposure_of_the_photo_is_fitted_or_applied(gaussians):
         > compare(gaussians, view, photo, exposure=(0.0, 0.0)).psnr
     )
     assert compare(gaussians, view, photo, exposure=(np.log(0.8), 10 / 255)).psnr > 45
+
+
+def test_colors_of_a_photo_are_applied_but_never_fitted(gaussians):
+    """What was held out is judged with its brightness alone, whatever was fitted to the others."""
+    view = view_of((1, -2, 9))
+    change = np.diag([0.1, -0.1, -0.2])
+    photo = np.round(picture(gaussians, view) @ (np.eye(3) + change)).astype(np.uint8)
+    exposure = np.hstack([change, np.zeros((3, 1))]).ravel()
+    assert compare(gaussians, view, photo, exposure=exposure).psnr > 45 > compare(gaussians, view, photo).psnr

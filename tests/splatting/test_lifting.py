@@ -10,7 +10,8 @@ import torch
 
 from sc3d.geometry.cameras import View, look_at, pinhole_view
 from sc3d.splatting.gaussians import SH_C0, Gaussians
-from sc3d.splatting.lifting import evidence_by_gradient, lift, winners
+from sc3d.splatting.gpu.label_lifting import evidence_by_gradient
+from sc3d.splatting.lifting import lift, winners
 from sc3d.splatting.rendering import render
 from tests.reference.splatting import render_reference
 from tests.splatting.test_rendering import make_gaussians, make_view

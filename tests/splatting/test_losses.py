@@ -170,6 +170,36 @@ def test_exposure_is_recovered():
     assert torch.equal(losses.apply_exposure(image, torch.zeros(2)), image)
 
 
+@pytest.mark.parametrize("shape", [(7, 11, 3), (40, 3)])
+def test_affine_colors_and_their_gradients_are_those_of_a_matrix(shape):
+    random = torch.Generator().manual_seed(1)
+    image, weight = (torch.rand(shape, generator=random) for _ in range(2))
+    exposure = 0.2 * torch.randn(12, generator=random)
+    found = [
+        leaf.clone().to(kind).requires_grad_()
+        for kind in (torch.float32, torch.float64)
+        for leaf in (image, exposure)
+    ]
+    ours = losses.apply_exposure(*found[:2])
+    change = found[3].reshape(3, 4)
+    dense = found[2] @ (torch.eye(3) + change[:, :3]).T + change[:, 3]
+    torch.testing.assert_close(ours.double(), dense, atol=1e-6, rtol=1e-6)
+    for result in (ours, dense):
+        (result.square() * weight.to(result)).sum().backward()
+    for one, other in zip(found[:2], found[2:], strict=True):
+        torch.testing.assert_close(one.grad.double(), other.grad, atol=1e-5, rtol=1e-5)
+    assert torch.equal(losses.apply_exposure(image, torch.zeros(12)), image)
+
+
+def test_gain_is_an_affine_transform_of_equal_channels():
+    image = torch.rand(6, 9, 3, generator=torch.Generator().manual_seed(2))
+    rows = torch.cat([(np.exp(0.2) - 1) * torch.eye(3), torch.full((3, 1), -0.05)], 1)
+    torch.testing.assert_close(
+        losses.apply_exposure(image, rows.flatten()),
+        losses.apply_exposure(image, torch.tensor([0.2, -0.05])),
+    )
+
+
 def test_image_edges_are_relative():
     image = torch.zeros(10, 12, 3)
     image[:, 6:] = 0.3

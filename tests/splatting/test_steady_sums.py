@@ -29,26 +29,28 @@ def test_nothing_has_no_mean():
 
 
 @pytest.mark.parametrize("planes", [False, True])
-def test_sums_and_exposures_do_not_depend_on_threads(planes):
+@pytest.mark.parametrize("exposure", [[0.1, -0.02], [0.05 * number - 0.3 for number in range(12)]])
+def test_sums_and_exposures_do_not_depend_on_threads(planes, exposure):
     generator = torch.Generator().manual_seed(1)
     image = torch.rand(3, 400, 300, generator=generator).permute(1, 2, 0)
     image, found, before = image if planes else image.contiguous(), [], torch.get_num_threads()
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            exposure = torch.tensor([0.1, -0.02], requires_grad=True)
-            (losses.apply_exposure(image, exposure) * image.flip(0)).sum().backward()
-            found.append([*exposure.grad.tolist(), steady_sum(image).item()])
+            leaf = torch.tensor(exposure, requires_grad=True)
+            (losses.apply_exposure(image, leaf) * image.flip(0)).sum().backward()
+            found.append([*leaf.grad.tolist(), steady_sum(image).item()])
     finally:
         torch.set_num_threads(before)
     assert found[0] == found[1] == found[2]
 
 
-def test_one_and_two_threads_train_the_same_bytes():
+@pytest.mark.parametrize("exposure", ["gain", "affine"])
+def test_one_and_two_threads_train_the_same_bytes(exposure):
     told = []
     for threads in ("1", "2"):
         found = subprocess.run(
-            [sys.executable, "-m", "tests.splatting.train_with_threads", "6"],
+            [sys.executable, "-m", "tests.splatting.train_with_threads", "6", exposure],
             cwd=ROOT,
             env=os.environ | {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads},
             capture_output=True,

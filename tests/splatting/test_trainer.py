@@ -250,7 +250,7 @@ def test_what_the_held_out_photos_show_leaves_no_trace(scene):
 def test_scores_are_of_the_pixels_that_the_training_can_know(scene):
     """Gaussians that are right wherever the training sees, and missing elsewhere, are right."""
     data = with_tracks(scene[0])
-    settings = replace(SHORT, test_sector=0.25, exposure=False)
+    settings = replace(SHORT, test_sector=0.25, exposure="none")
     good = train(data, SHORT, progress=False).gaussians
     index = data.held_out(settings).sector[0]
     whole = {row.photo: row for row in held_out_scores(good, data, settings)}[data.views[index].name]
@@ -297,9 +297,31 @@ def test_hold_outs_that_say_nothing_are_refused(wrong):
         TrainSettings(**wrong)
 
 
-def test_the_number_of_steps_follows_that_of_the_photos():
-    assert TrainSettings().for_photos(18).iterations == 1000
-    assert TrainSettings().for_photos(100).iterations == 4000
-    assert TrainSettings(iterations=7).for_photos(100).iterations == 7
-    with pytest.raises(InputError, match="iterations"):
-        TrainSettings(iterations=-1)
+@pytest.mark.parametrize(
+    ("device", "photos", "steps"),
+    [("cpu", 18, 1000), ("cpu", 100, 4000), ("cpu", 1000, 40_000), ("meta", 18, 1000)]
+    + [("cuda", 18, 7000), ("cuda", 60, 18_000), ("cuda", 1000, 30_000)],
+)
+def test_numbers_follow_the_device_and_the_photos(device, photos, steps):
+    found = TrainSettings().resolved(device, photos)
+    amounts = (1_000_000, 1600) if device == "cuda" else (200_000, 800)
+    assert (found.iterations, found.max_gaussians, found.max_size) == (steps, *amounts)
+    assert found.resolved("cuda", 5) == found.resolved("cpu", 5) == found  # nothing is left to choose
+    sized = TrainSettings().resolved(device)
+    assert sized.iterations == 0 and sized.resolved(device, photos) == found
+    assert replace(found, iterations=0, max_gaussians=0, max_size=0) == TrainSettings()
+    assert [found.size(longest) for longest in (640, 4000)] == [640, amounts[1]]
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_numbers_that_are_given_hold_on_every_device(device):
+    given = TrainSettings(iterations=7, max_gaussians=11, max_size=100)
+    assert given.resolved(device, 100) == given
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"iterations": -1}, {"max_gaussians": -1}, {"max_size": 15}, {"max_size": -1}]
+)
+def test_numbers_that_no_training_can_have_are_refused(wrong):
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        TrainSettings(**wrong)

@@ -5,6 +5,7 @@ missing.
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -259,6 +260,13 @@ def write_points_scene(path: Path, ground) -> Path:
     (path / "sparse" / "0").mkdir(parents=True)
     model.write_binary(str(path / "sparse" / "0"))
     return path
+
+
+def test_devices_are_compared_at_the_same_numbers(tmp_path):
+    scene, command = write_bare_scene(tmp_path / "scene"), BenchmarkGpu(tmp_path)
+    told = gpu.amounts(command, scene)
+    assert told == ["--iterations", "1000", "--max-gaussians", "200000", "--max-size", "800"]
+    assert gpu.amounts(replace(command, iterations=30), scene) == ["--iterations", "30", *told[2:]]
 
 
 def test_the_check_of_a_gpu_tells_what_does_not_pass(tmp_path, monkeypatch):

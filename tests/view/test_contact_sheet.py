@@ -91,12 +91,16 @@ def test_chosen_photos_are_spread_and_held_out_ones_come_first():
     assert chosen_views(split(8, 8))[0] == (7, True) and len(chosen_views(split(8, 8))) == 6
 
 
-def test_training_sheet_uses_the_exposures_found(gaussians, tmp_path):
+@pytest.mark.parametrize("exposure", ["gain", "affine"])
+def test_training_sheet_uses_the_exposures_found(gaussians, tmp_path, exposure):
     cameras = [view_of(center) for center in [(0, -3, 7), (2, 2, 8), (-2, 1, 8), (0, 2, 9)]]
     photos = [np.round(0.7 * picture(gaussians, view)).astype(np.uint8) for view in cameras]
     data = TrainingData(cameras, photos, np.zeros((10, 3)), np.zeros((10, 3), np.uint8))
     exposures = np.array([[np.log(0.7), 0], [0, 0], [np.log(0.7), 0], [0, 0]])
-    settings = TrainSettings(iterations=30, test_every=4)
+    if exposure == "affine":
+        darker = np.hstack([-0.3 * np.eye(3), np.zeros((3, 1))]).ravel()
+        exposures = np.stack([darker, 0 * darker, darker, 0 * darker])
+    settings = TrainSettings(iterations=30, test_every=4, exposure=exposure)
     rows = training_rows(gaussians, data, settings, exposures)
     assert [row.held_out for row in rows] == [True, False, False, False]
     assert [row.psnr > 40 for row in rows] == [True, True, False, True]  # the held-out one is fitted

@@ -21,7 +21,9 @@ from sc3d.geometry.cameras import View, look_at, pinhole_view
 from sc3d.io.json_files import read_json, write_text
 from sc3d.io.provenance import peak_memory_mb, reset_peak_memory
 from sc3d.runner import MAX_SIDECAR
+from sc3d.scene.scene import Scene
 from sc3d.settings.synthesize import Synthesize
+from sc3d.settings.train import TrainSettings
 from sc3d.splatting import strategy
 from sc3d.splatting.device import pick_device
 from sc3d.splatting.gaussians import Gaussians
@@ -205,17 +207,35 @@ def trainings(command: BenchmarkGpu) -> Iterator[Row]:
         yield Row(
             f"{scene.name} on {command.device}, 2 blocks", trained(command, scene, command.device, 2)[1]
         )
+        if command.device.startswith("cuda"):
+            text = trained(command, scene, command.device, defaults=True)[1]
+            yield Row(f"{scene.name} on {command.device}, with its defaults", text)
 
 
-def trained(command: BenchmarkGpu, scene: Path, device: str, blocks: int = 0) -> tuple[float, str]:
-    """PSNR of the photos left out, dB, and what is told of a training; a process of its own, as users start it."""
-    copy = command.workdir / f"{scene.name}_{device.replace(':', '')}_{blocks}"
+def amounts(command: BenchmarkGpu, scene: Path) -> list[str]:
+    """The CPU's numbers as options, so that all devices are asked for the same."""
+    auto = TrainSettings(command.iterations).resolved("cpu", len(Scene(scene).model.views))
+    values = {
+        "iterations": auto.iterations,
+        "max-gaussians": auto.max_gaussians,
+        "max-size": auto.max_size,
+    }
+    return [word for name, value in values.items() for word in (f"--{name}", str(value))]
+
+
+def trained(
+    command: BenchmarkGpu, scene: Path, device: str, blocks: int = 0, defaults: bool = False
+) -> tuple[float, str]:
+    """PSNR of the photos left out, dB, and what is told of a training; a process of its own, as users start it.
+    defaults: those of the device, not the CPU's
+    """
+    copy = command.workdir / f"{scene.name}_{device.replace(':', '')}_{'defaults' if defaults else blocks}"
     copy.mkdir(exist_ok=True)
     for name in ("images", "sparse", "depth", "masks", "classes.json"):
         if (scene / name).exists() and not (copy / name).exists():
             (copy / name).symlink_to((scene / name).resolve())
     options = ["--device", device, "--test-every", "8", "--overwrite", "--blocks", str(blocks)]
-    options += ["--iterations", str(command.iterations)] if command.iterations else []
+    options += [] if defaults else amounts(command, scene)
     code = "from sc3d.cli import main; main()"
     subprocess.run([sys.executable, "-c", code, "train", str(copy), *options], check=True)
     record = read_json(copy / "gaussians.ply.json", MAX_SIDECAR)

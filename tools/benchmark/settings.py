@@ -57,7 +57,7 @@ class BenchmarkGpu:
     width: int = 800
     """Their width, px."""
     iterations: int = 0
-    """Steps of a training; 0 = as `sc3d train` has it."""
+    """Steps of a training; 0 = as `sc3d train` has it on the CPU."""
     against_cpu: bool = True
     """Train on the CPU too, which takes minutes, and compare the scores."""
 
