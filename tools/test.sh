@@ -3,4 +3,4 @@
 set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 cd "$root"
-exec "$venv/bin/python" -m pytest --numprocesses "${SC3D_TEST_PROCESSES:-2}" --dist loadfile "$@"
+exec "$venv/bin/python" -m pytest --numprocesses "${SC3D_TEST_PROCESSES:-2}" --dist loadfile --no-loadscope-reorder "$@"
