@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -43,6 +45,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long files first: a worker that begins one at the end works on alone."""
     place = {name: row for row, name in enumerate(LONG)}
     items.sort(key=lambda item: place.get(item.nodeid.partition("::")[0], len(LONG)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def fsync() -> Iterator[Callable[[int], None]]:
+    """The real `os.fsync`. Nothing waits here until a disk has what was written: tests kill processes, whose writes
+    stay, not machines. The processes that tests start do wait.
+    """
+    real = os.fsync
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield real
 
 
 @pytest.fixture(scope="module")
