@@ -167,9 +167,7 @@ def test_there_are_several_tiles_of_the_size_asked_for(site):
 
 @pytest.mark.parametrize("given", [True, False])
 @pytest.mark.parametrize("surface", ["auto", "voxels", "surfels"])
-def test_without_a_mesh_the_points_hide_by_tile_what_they_hide_as_a_whole(
-    bare, small_tiles, surface, given
-):
+def test_without_a_mesh_the_points_hide_by_tile_what_they_hide_as_a_whole(bare, small_tiles, surface, given):
     """Voxels, and surfels but for the last digit of a range, and so of a vote; with the cloud's own normals and with
     estimated ones.
     """
