@@ -34,7 +34,7 @@ def site(tmp_path_factory) -> Scene:
 @pytest.fixture(scope="module")
 def scene(site, tmp_path_factory) -> Scene:
     scene = copy_of(site, tmp_path_factory.mktemp("scene"))
-    execute("depth", scene, Depth(max_size=240))
+    execute("depth", scene, Depth(max_size=160))
     return scene
 
 
@@ -83,7 +83,7 @@ def test_surface_from_depth_lies_on_the_true_one(scene, site):
 
 def test_second_run_is_up_to_date_and_previews_are_there(scene, caplog):
     with caplog.at_level("INFO"):
-        execute("depth", scene, Depth(max_size=240))
+        execute("depth", scene, Depth(max_size=160))
     assert "up to date" in caplog.text
     assert len(list(scene.depth.glob("*.png"))) == len(list(scene.depth.glob("*.npz"))) == 8
     assert not list(scene.path.glob(".depth.*.parts"))
