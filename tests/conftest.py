@@ -8,15 +8,16 @@ from pathlib import Path
 
 import pytest
 
-# Files that take 10 s and more, the longest first: as `bash tools/test.sh --durations=0` counts them
+# Files that take 10 s and more, about the longest first, as `bash tools/test.sh --durations=0` counts them. Kernels are
+# compiled by whoever first needs them: the first two need others, and those in the browser find them compiled.
 LONG = (
+    "tests/end_to_end/test_chain.py",
+    "tests/robustness/test_interrupted.py",
     "tests/tiling/test_tiling.py",
     "tests/view/web/test_questions.py",
-    "tests/end_to_end/test_chain.py",
     "tests/robustness/test_security.py",
     "tests/splatting/test_steady_sums.py",
     "tests/stereo/test_depth_stage.py",
-    "tests/robustness/test_interrupted.py",
     "tests/robustness/test_fuzz.py",
     "tests/view/web/test_corrections.py",
     "tests/tools/test_tables.py",
