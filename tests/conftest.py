@@ -2,9 +2,61 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+# Files that take 10 s and more, about the longest first, as `bash tools/test.sh --durations=0` counts them. Kernels are
+# compiled by whoever first needs them: the first two need others, and those in the browser find them compiled.
+LONG = (
+    "tests/end_to_end/test_chain.py",
+    "tests/robustness/test_interrupted.py",
+    "tests/tiling/test_tiling.py",
+    "tests/view/web/test_questions.py",
+    "tests/robustness/test_security.py",
+    "tests/splatting/test_steady_sums.py",
+    "tests/stereo/test_depth_stage.py",
+    "tests/robustness/test_fuzz.py",
+    "tests/view/web/test_corrections.py",
+    "tests/tools/test_tables.py",
+    "tests/robustness/test_clouds.py",
+    "tests/tiling/test_site_model.py",
+    "tests/end_to_end/test_examples.py",
+    "tests/report/test_report.py",
+    "tests/splatting/test_blocks.py",
+    "tests/view/web/test_measure.py",
+    "tests/view/test_screenshot.py",
+    "tests/robustness/test_annotations.py",
+    "tests/georeferencing/test_georeference.py",
+    "tests/robustness/test_platforms.py",
+    "tests/stereo/test_patch_match.py",
+    "tests/view/web/test_page.py",
+    "tests/robustness/test_environment.py",
+    "tests/splatting/test_trainer.py",
+    "tests/annotate/test_annotate.py",
+    "tests/annotate/test_suggest.py",
+    "tests/synthetic/test_street.py",
+    "tests/splatting/test_median_depth.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first: a worker that begins one at the end works on alone."""
+    place = {name: row for row, name in enumerate(LONG)}
+    items.sort(key=lambda item: place.get(item.nodeid.partition("::")[0], len(LONG)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def fsync() -> Iterator[Callable[[int], None]]:
+    """The real `os.fsync`. Nothing waits here until a disk has what was written: tests kill processes, whose writes
+    stay, not machines. The processes that tests start do wait.
+    """
+    real = os.fsync
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield real
 
 
 @pytest.fixture(scope="module")

@@ -70,10 +70,11 @@ def without_masks(site, scene) -> list:
         "run",
         site / "images",
         scene,
-        *("--train.iterations", 250),
-        *("--train.max-size", 400),
-        *("--train.max-gaussians", 40000),
-        *("--extract.max-size", 400),
+        *("--depth.max-size", 200),
+        *("--train.iterations", 150),
+        *("--train.max-size", 240),
+        *("--train.max-gaussians", 20000),
+        *("--extract.max-size", 240),
     ]
 
 

@@ -14,7 +14,7 @@ import open3d as o3d
 import pycolmap
 import pytest
 
-from sc3d.errors import InputError
+from sc3d.errors import InputError, Sc3dError
 from sc3d.geometry.cameras import View, look_at
 from sc3d.geometry.raycast import Surface, first_surface, surface_points
 from sc3d.io.clouds import write_geometry
@@ -353,7 +353,17 @@ def test_truth_without_surface_is_told_of(tmp_path, counts, told):
     assert "nothing is hit" in section and told in section if told else "nothing is hit" not in section
 
 
-def test_page_is_made_again_when_objects_were_exported_since(toy, tmp_path):
+def without_pictures(monkeypatch) -> None:
+    """No page gets pictures of the cloud, which take the longest."""
+
+    def fail(*_):
+        raise Sc3dError("no renderer")
+
+    monkeypatch.setattr("sc3d.report.images.draw_points", fail)
+
+
+def test_page_is_made_again_when_objects_were_exported_since(toy, tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
     scene = Scene(tmp_path)
     for path in (toy.labelled, toy.classes):
         (tmp_path / path.name).write_bytes(path.read_bytes())
@@ -458,12 +468,7 @@ def test_ground_picture_lies_where_the_points_are():
 
 
 def test_no_renderer_leaves_out_the_pictures(toy, tmp_path, monkeypatch):
-    from sc3d.errors import Sc3dError
-
-    def fail(*_):
-        raise Sc3dError("no renderer")
-
-    monkeypatch.setattr("sc3d.report.images.draw_points", fail)
+    without_pictures(monkeypatch)
     write_report(toy, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert '<section id="cloud"' not in page and '<section id="photos"' in page

@@ -241,8 +241,8 @@ def test_full_disk_in_other_words(small_disk):
 # ---- atomic_path
 
 
-def test_content_is_on_the_disk_before_it_gets_its_name(tmp_path, monkeypatch):
-    done, fsync, replace = [], os.fsync, os.replace
+def test_content_is_on_the_disk_before_it_gets_its_name(tmp_path, monkeypatch, fsync):
+    done, replace = [], os.replace
     monkeypatch.setattr(
         os, "fsync", lambda handle: (done.append(os.readlink(f"/proc/self/fd/{handle}")), fsync(handle))
     )

@@ -34,7 +34,15 @@ def site(tmp_path_factory) -> Scene:
 @pytest.fixture(scope="module")
 def scene(site, tmp_path_factory) -> Scene:
     scene = copy_of(site, tmp_path_factory.mktemp("scene"))
-    execute("depth", scene, Depth(max_size=240))
+    execute("depth", scene, Depth(max_size=160))
+    return scene
+
+
+@pytest.fixture(scope="module")
+def small(site, tmp_path_factory) -> Scene:
+    """Depth of small photos, made without masks and without interruption."""
+    scene = copy_of(site, tmp_path_factory.mktemp("small"))
+    assert "sky_masks" not in execute("depth", scene, Depth(max_size=64))
     return scene
 
 
@@ -75,13 +83,13 @@ def test_surface_from_depth_lies_on_the_true_one(scene, site):
 
 def test_second_run_is_up_to_date_and_previews_are_there(scene, caplog):
     with caplog.at_level("INFO"):
-        execute("depth", scene, Depth(max_size=240))
+        execute("depth", scene, Depth(max_size=160))
     assert "up to date" in caplog.text
     assert len(list(scene.depth.glob("*.png"))) == len(list(scene.depth.glob("*.npz"))) == 8
     assert not list(scene.path.glob(".depth.*.parts"))
 
 
-def test_an_interrupted_run_goes_on_and_gives_the_same(scene, site, tmp_path, monkeypatch):
+def test_an_interrupted_run_goes_on_and_gives_the_same(small, site, tmp_path, monkeypatch):
     again, calls = copy_of(site, tmp_path), []
     run_pass = multi_view.run_pass
 
@@ -93,13 +101,13 @@ def test_an_interrupted_run_goes_on_and_gives_the_same(scene, site, tmp_path, mo
 
     monkeypatch.setattr(multi_view, "run_pass", dying)
     with pytest.raises(KeyboardInterrupt):
-        execute("depth", again, Depth(max_size=240))
+        execute("depth", again, Depth(max_size=64))
     assert not again.depth.exists()
     kept = {file.name: file.stat().st_mtime_ns for file in again.path.glob(".depth.*.parts/passes/1-*.npy")}
     assert len(kept) == 3
-    execute("depth", again, Depth(max_size=240))
-    for view in scene.model.views:
-        one, other = (read_depth_map(depth_file(each.depth, view.name)) for each in (scene, again))
+    execute("depth", again, Depth(max_size=64))
+    for view in small.model.views:
+        one, other = (read_depth_map(depth_file(each.depth, view.name)) for each in (small, again))
         np.testing.assert_array_equal(one.depth, other.depth)
         np.testing.assert_array_equal(one.num_views, other.num_views)
 
@@ -172,15 +180,14 @@ def with_masks(site: Scene, folder: Path, classes: list[dict], photos: int = 7) 
     return scene
 
 
-def test_what_masks_say_has_no_surface_is_sky(site, tmp_path, caplog):
-    scene, plain = with_masks(site, tmp_path / "masks", CLASSES), copy_of(site, tmp_path / "plain")
+def test_what_masks_say_has_no_surface_is_sky(site, small, tmp_path, caplog):
+    scene = with_masks(site, tmp_path / "masks", CLASSES)
     with caplog.at_level("INFO"):
         figures = execute("depth", scene, Depth(max_size=64))
     assert figures["sky_masks"] == "of 7 photos"
     assert f"1 of 8 photos have no mask in {scene.masks}" in caplog.text
-    assert "sky_masks" not in execute("depth", plain, Depth(max_size=64))
     for row, view in enumerate(scene.model.views):
-        found, before = (read_depth_map(depth_file(each.depth, view.name)) for each in (scene, plain))
+        found, before = (read_depth_map(depth_file(each.depth, view.name)) for each in (scene, small))
         if row == 7:
             np.testing.assert_array_equal(found.sky, before.sky)
             continue

@@ -61,16 +61,45 @@ def site(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture
-def small_tiles(monkeypatch):
-    """Room for TILES points only, whatever a point needs."""
+def make_tiles_small(patch: pytest.MonkeyPatch) -> None:
+    """Room for TILES points only, whatever a point needs, where `max_memory` is 2G."""
 
     def room(resources, _):
         return TILES if resources.max_memory == "2G" else 10**9
 
     for module in (tiled_label, tiled_propagate, seen_points):
-        monkeypatch.setattr(module, "max_points", room)
-        monkeypatch.setattr(module, "fits", lambda _, resources: resources.max_memory != "2G")
+        patch.setattr(module, "max_points", room)
+        patch.setattr(module, "fits", lambda _, resources: resources.max_memory != "2G")
+
+
+@pytest.fixture
+def small_tiles(monkeypatch):
+    make_tiles_small(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def labels(site) -> dict[str, Path]:
+    """The site's labels with the usual options, in one piece (`whole`) and by tile (`tiled`)."""
+    with pytest.MonkeyPatch.context() as patch:
+        make_tiles_small(patch)
+        return label_both_ways(site, "usual")
+
+
+@pytest.fixture(scope="module")
+def bare(site, tmp_path_factory) -> dict[bool, tuple[Path, np.ndarray]]:
+    """Copies of the site without meshes, by whether the cloud has its normals, each with the `num_views` that labels
+    get where nothing hides.
+    """
+    found = {}
+    for given in (True, False):
+        folder = tmp_path_factory.mktemp("bare") / "scene"
+        shutil.copytree(site, folder, ignore=shutil.ignore_patterns("*mesh.ply", ".*"))
+        if not given:
+            cloud = read_cloud(folder / "cloud.ply")
+            del cloud.point["normals"]
+            write_geometry(folder / "cloud.ply", cloud)
+        found[given] = folder, run_label(folder, "open", depth_filter=False)["num_views"]
+    return found
 
 
 def columns(path: Path) -> dict[str, np.ndarray]:
@@ -80,6 +109,13 @@ def columns(path: Path) -> dict[str, np.ndarray]:
 def run_label(site: Path, name: str, **options) -> dict[str, np.ndarray]:
     label.run(Scene(site), Label(output=site / f"{name}.ply", **options))
     return columns(site / f"{name}.ply")
+
+
+def label_both_ways(site: Path, name: str, **options) -> dict[str, Path]:
+    files = {way: site / f"{name}_{way}.ply" for way in ("whole", "tiled")}
+    for way, memory in (("whole", ""), ("tiled", "2G")):
+        run_label(site, files[way].stem, max_memory=memory, **options)
+    return files
 
 
 def assert_same(
@@ -110,10 +146,11 @@ def blocks(path: Path) -> tuple[np.ndarray, np.ndarray]:
         {"depth_filter": False},
     ],
 )
-def test_labels_and_votes_by_tile_are_those_of_the_whole_to_the_bit(site, small_tiles, options):
-    whole, tiled = run_label(site, "whole", **options), run_label(site, "tiled", max_memory="2G", **options)
-    assert_same(whole, tiled)
-    for first, second in zip(blocks(site / "whole.votes.npz"), blocks(site / "tiled.votes.npz"), strict=True):
+def test_labels_and_votes_by_tile_are_those_of_the_whole_to_the_bit(site, labels, small_tiles, options):
+    files = label_both_ways(site, "other", **options) if options else labels
+    assert_same(columns(files["whole"]), columns(files["tiled"]))
+    fields = [blocks(files[way].with_suffix(".votes.npz")) for way in ("whole", "tiled")]
+    for first, second in zip(*fields, strict=True):
         np.testing.assert_array_equal(first, second)
     assert not list(site.glob(".*.parts"))
 
@@ -130,25 +167,19 @@ def test_there_are_several_tiles_of_the_size_asked_for(site):
 
 @pytest.mark.parametrize("given", [True, False])
 @pytest.mark.parametrize("surface", ["auto", "voxels", "surfels"])
-def test_without_a_mesh_the_points_hide_by_tile_what_they_hide_as_a_whole(
-    site, small_tiles, tmp_path, surface, given
-):
+def test_without_a_mesh_the_points_hide_by_tile_what_they_hide_as_a_whole(bare, small_tiles, surface, given):
     """Voxels, and surfels but for the last digit of a range, and so of a vote; with the cloud's own normals and with
     estimated ones.
     """
-    shutil.copytree(site, tmp_path / "bare", ignore=shutil.ignore_patterns("*mesh.ply", ".*"))
-    if not given:
-        cloud = read_cloud(tmp_path / "bare" / "cloud.ply")
-        del cloud.point["normals"]
-        write_geometry(tmp_path / "bare" / "cloud.ply", cloud)
-    whole = run_label(tmp_path / "bare", "whole", surface=surface)
-    tiled = run_label(tmp_path / "bare", "tiled", surface=surface, max_memory="2G")
+    folder, seen_openly = bare[given]
+    whole = run_label(folder, "whole", surface=surface)
+    tiled = run_label(folder, "tiled", surface=surface, max_memory="2G")
     weighed = [name for name in whole if name.startswith("votes") or name == "confidence"]
     assert_same(whole, tiled, but=tuple(weighed) if surface == "surfels" else ())
     for name in weighed:
         assert (whole[name] != tiled[name]).mean() <= 1e-3, name
         np.testing.assert_allclose(whole[name], tiled[name], atol=1e-3, err_msg=name)
-    assert (whole["num_views"] != run_label(tmp_path / "bare", "open", depth_filter=False)["num_views"]).any()
+    assert (whole["num_views"] != seen_openly).any()
 
 
 def test_patches_of_the_tiles_are_those_of_the_whole(site, tmp_path, monkeypatch):
@@ -178,7 +209,7 @@ def test_patches_of_the_tiles_are_those_of_the_whole(site, tmp_path, monkeypatch
 
 
 def test_what_no_second_photo_confirms_hides_as_the_mesh_does_by_tile_and_as_a_whole(
-    site, small_tiles, tmp_path
+    site, labels, small_tiles, tmp_path
 ):
     """The mesh cut in two files gives the labels of the one."""
     shutil.copytree(site, tmp_path / "cut", ignore=shutil.ignore_patterns(".*"))
@@ -186,17 +217,16 @@ def test_what_no_second_photo_confirms_hides_as_the_mesh_does_by_tile_and_as_a_w
     first = np.arange(len(mesh.triangle.indices)) % 3 > 0
     for path, chosen in zip(scene.surface, (first, ~first), strict=True):
         write_geometry(path, mesh.select_faces_by_mask(o3d.core.Tensor(chosen)))
+    expected = columns(labels["whole"])
     for name, options in (("whole", {}), ("tiled", {"max_memory": "2G"})):
-        assert_same(run_label(site, name), run_label(scene.path, name, **options))
+        assert_same(expected, run_label(scene.path, name, **options))
     scene.unconfirmed.unlink()
-    assert (run_label(site, "whole")["num_views"] != run_label(scene.path, "whole")["num_views"]).any()
+    assert (expected["num_views"] != run_label(scene.path, "whole")["num_views"]).any()
 
 
 @pytest.mark.parametrize("options", [{}, {"rounds": 1, "color": False}, {"fill": True}])
-def test_map_by_tile_is_that_of_the_whole(site, small_tiles, options):
-    seeds = site / "seeds_for_map.ply"
-    label.run(Scene(site), Label(output=seeds))
-    results = []
+def test_map_by_tile_is_that_of_the_whole(site, labels, small_tiles, options):
+    seeds, results = labels["whole"], []
     for name, memory in (("whole", ""), ("tiled", "2G")):
         propagate.run(
             Scene(site), Propagate(seeds=seeds, output=site / f"{name}_map.ply", max_memory=memory, **options)
@@ -212,12 +242,10 @@ def test_map_by_tile_is_that_of_the_whole(site, small_tiles, options):
 
 
 def test_votes_that_stand_on_the_ground_by_mistake_count_less_by_tile_as_in_the_whole(
-    site, small_tiles, tmp_path, caplog
+    site, labels, small_tiles, tmp_path, caplog
 ):
     """Every view calls most of the road a building."""
-    seeds = tmp_path / "seeds.ply"
-    label.run(Scene(site), Label(output=seeds))
-    cloud = read_cloud(seeds)
+    seeds, cloud = tmp_path / "seeds.ply", read_cloud(labels["whole"])
     told, votes = cloud.point["label"].numpy(), [cloud.point[f"votes_{id_}"].numpy() for id_ in (1, 3)]
     wrong = (told == 3) & (cloud.point.positions.numpy()[:, 1:2] % 10 < 8)
     votes[0][wrong], votes[1][wrong], told[wrong] = votes[1][wrong], votes[0][wrong], 1
@@ -233,10 +261,8 @@ def test_votes_that_stand_on_the_ground_by_mistake_count_less_by_tile_as_in_the_
 
 
 @pytest.mark.parametrize("method", ["geometry", "knn"])
-def test_other_methods_by_tile_differ_in_few_points(site, small_tiles, method):
-    seeds = site / "seeds_for_others.ply"
-    label.run(Scene(site), Label(output=seeds))
-    results = []
+def test_other_methods_by_tile_differ_in_few_points(site, labels, small_tiles, method):
+    seeds, results = labels["whole"], []
     for name, memory in (("whole", ""), ("tiled", "2G")):
         propagate.run(
             Scene(site),
@@ -278,9 +304,8 @@ def test_points_that_hang_on_a_seed_only_through_other_tiles_are_reached(site, s
         assert labelled[: -len(island)].all() and not labelled[-len(island) :].any()
 
 
-def test_votes_without_those_of_some_class_are_refused(site, small_tiles, tmp_path):
-    label.run(Scene(site), Label(output=tmp_path / "seeds.ply"))
-    seeds = read_cloud(tmp_path / "seeds.ply")
+def test_votes_without_those_of_some_class_are_refused(site, labels, small_tiles, tmp_path):
+    seeds = read_cloud(labels["whole"])
     del seeds.point["votes_1"]
     write_geometry(tmp_path / "seeds.ply", seeds)
     with pytest.raises(InputError, match="votes_1"):
@@ -290,12 +315,11 @@ def test_votes_without_those_of_some_class_are_refused(site, small_tiles, tmp_pa
         )
 
 
-def test_evaluation_by_tile_judges_the_same_pixels(site, small_tiles):
-    label.run(Scene(site), Label(output=site / "judged.ply"))
+def test_evaluation_by_tile_judges_the_same_pixels(site, labels, small_tiles):
     figures = []
     for memory in ("", "2G"):
         settings = Evaluate(
-            labelled=site / "judged.ply", output=site / f"metrics{memory}.json", max_memory=memory
+            labelled=labels["whole"], output=site / f"metrics{memory}.json", max_memory=memory
         )
         evaluate.run(Scene(site), settings)
         figures.append(json.loads(settings.output.read_text()))
@@ -347,8 +371,8 @@ def command(site):
     return start
 
 
-def test_workers_give_the_same_bytes_also_if_one_is_killed(site, command, small_tiles):
-    run_label(site, "here", max_memory="2G")
+def test_workers_give_the_same_bytes_also_if_one_is_killed(site, command, labels):
+    here = labels["tiled"]
     for workers, killed in ((1, False), (2, True)):
         output = site / f"workers{workers}.ply"
         process = command(workers, output)
@@ -356,8 +380,8 @@ def test_workers_give_the_same_bytes_also_if_one_is_killed(site, command, small_
             assert kill_a_worker(process.pid, site)
         _, said = process.communicate(timeout=240)
         assert process.returncode == 0, said
-        assert output.read_bytes() == (site / "here.ply").read_bytes()
-        assert output.with_suffix(".votes.npz").read_bytes() == (site / "here.votes.npz").read_bytes()
+        assert output.read_bytes() == here.read_bytes()
+        assert output.with_suffix(".votes.npz").read_bytes() == here.with_suffix(".votes.npz").read_bytes()
 
 
 def kill_a_worker(parent: int, site: Path, seconds: float = 120) -> bool:
@@ -384,8 +408,8 @@ def _said_by(folder: Path, name: str) -> str:
         return ""
 
 
-def test_a_killed_run_keeps_its_finished_tiles(site, small_tiles, monkeypatch):
-    expected = run_label(site, "uninterrupted", max_memory="2G")
+def test_a_killed_run_keeps_its_finished_tiles(site, labels, small_tiles, monkeypatch):
+    expected = columns(labels["tiled"])
     original, done = tiled_label.label_tile, []
 
     def stops(job, tile):
@@ -508,7 +532,7 @@ def test_a_cloud_that_cannot_be_read_in_parts_is_refused(tmp_path):
         CloudFile.open(tmp_path / "cloud.xyz")
 
 
-def test_a_laz_cloud_is_labelled(site, tmp_path):
+def test_a_laz_cloud_is_labelled(site, labels, tmp_path):
     """Normals are estimated by tile; positions are rounded to a millimeter."""
     source = read_cloud(site / "cloud.ply")
     header = laspy.LasHeader(point_format=6, version="1.4")
@@ -517,7 +541,7 @@ def test_a_laz_cloud_is_labelled(site, tmp_path):
     las.x, las.y, las.z = source.point.positions.numpy().T
     las.write(tmp_path / "cloud.laz")
     label.run(Scene(site), Label(cloud=tmp_path / "cloud.laz", output=tmp_path / "laz.ply"))
-    found, expected = columns(tmp_path / "laz.ply"), run_label(site, "from_ply")
+    found, expected = columns(tmp_path / "laz.ply"), columns(labels["whole"])
     both = (found["label"] > 0) & (expected["label"] > 0)
     assert both.mean() > 0.7 and (found["label"] == expected["label"])[both].mean() > 0.98
     np.testing.assert_allclose(found["positions"], source.point.positions.numpy(), atol=1e-3)

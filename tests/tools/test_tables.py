@@ -80,7 +80,7 @@ def command(path: Path) -> list:
         "--width",
         "160",
         "--points",
-        "20000",
+        "8000",
         "--every",
         "1",
     ]

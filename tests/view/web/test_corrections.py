@@ -53,9 +53,7 @@ def ready(found: Visit) -> None:
     """Wait until the page is drawn."""
     found.page.get_by_text("Color by", exact=True).wait_for()
     found.page.locator(".mantine-Notification-closeButton").click()
-    found.wait_for(
-        lambda: found.share(ROAD) > 0.02 and found.share(GRASS) > 0.02 and found.is_still(), "the cloud"
-    )
+    found.wait_for(lambda: found.is_still_with(0.02, ROAD, GRASS), "the cloud")
 
 
 def choose(found: Visit, name: str, value: str) -> None:

@@ -57,11 +57,16 @@ class Visit(NamedTuple):
 
     def share(self, color: list[int]) -> float:
         """Of the pixels at the left that have exactly this color."""
-        return float((self.picture[LEFT] == color).all(axis=-1).mean())
+        return share_of(self.picture, color)
 
-    def is_still(self) -> bool:
+    def is_still_with(self, least: float, *colors: list[int]) -> bool:
+        """Whether each color has a larger share than `least`, and the page is still."""
+        picture = self.picture
+        return all(share_of(picture, color) > least for color in colors) and self.is_still(picture)
+
+    def is_still(self, before: np.ndarray | None = None) -> bool:
         """Whether pictures over half a second are the same: a loaded machine pauses within a movement."""
-        before = self.picture
+        before = self.picture if before is None else before
         for _ in range(2):
             self.page.wait_for_timeout(250)
             if not np.array_equal(before, self.picture):
@@ -70,11 +75,16 @@ class Visit(NamedTuple):
 
     def wait_for(self, condition: Callable[[], bool], what: str) -> None:
         """Until a condition on this visit holds; software rendering takes its time."""
-        for _ in range(150):
+        for _ in range(300):
             if condition():
                 return
-            self.page.wait_for_timeout(200)
+            self.page.wait_for_timeout(100)
         pytest.fail(f"waited in vain for {what}; errors: {self.errors}")
+
+
+def share_of(picture: np.ndarray, color: list[int]) -> float:
+    """Of the pixels at the left of an (H, W, 3) picture that have exactly this color."""
+    return float((picture[LEFT] == color).all(axis=-1).mean())
 
 
 def decoded(file: bytes) -> np.ndarray:
@@ -148,10 +158,7 @@ def served(scene: Scene, browser: object) -> Iterator[Visit]:
 def opened(served: Visit) -> Iterator[Visit]:
     """The page as it looks at the start; at the end, nothing may have gone wrong in the browser."""
     served.page.get_by_role("button", name="Overview").click()
-    served.wait_for(
-        lambda: served.share(ROAD) > 0.05 and served.share(GRASS) > 0.05 and served.is_still(),
-        "road and grass in their own colors",
-    )
+    served.wait_for(lambda: served.is_still_with(0.05, ROAD, GRASS), "road and grass in their own colors")
     yield served
     assert served.errors == []
 

@@ -54,7 +54,14 @@ def served(scene: Scene) -> AbstractContextManager[str]:
 
 
 @pytest.fixture
-def opened(scene, browser) -> Iterator[Visit]:  # noqa: F811
+def quick(scene, monkeypatch) -> None:
+    """Short flights, and soon a look at whether others answered."""
+    monkeypatch.setattr("sc3d.view.web.orbit_camera._FLIGHT", 0.1)
+    monkeypatch.setattr("sc3d.view.web.question_panel._PAUSE", 0.25)
+
+
+@pytest.fixture
+def opened(scene, browser, quick) -> Iterator[Visit]:  # noqa: F811
     """The page, with the first question asked."""
     with served(scene) as address, visit(browser, address, (900, 1100)) as found:
         ready(found)
@@ -179,7 +186,7 @@ def test_two_pages_and_annotate_follow_one_another(scene, browser, opened):  # n
         assert other.errors == []
 
 
-def test_tabs_share_the_question_and_only_who_takes_part_flies(scene, browser):  # noqa: F811
+def test_tabs_share_the_question_and_only_who_takes_part_flies(scene, browser, quick):  # noqa: F811
     with served(scene) as address, visit(browser, address) as first, visit(browser, address) as second:
         for tab in (first, second):
             ready(tab)
@@ -208,7 +215,7 @@ def test_apply_asks_about_the_new_labels(scene, opened):
     assert np.allclose((points[places[0].rows] - ORIGIN)[:, :2].mean(axis=0), SMALL, atol=0.3)
 
 
-def test_clouds_without_votes_and_with_colors_are_asked_about(scene, browser):  # noqa: F811
+def test_clouds_without_votes_and_with_colors_are_asked_about(scene, browser, quick):  # noqa: F811
     scene.seeds.unlink()
     cloud = read_cloud(scene.labelled)
     cloud.point["colors"] = o3d.core.Tensor(np.full((len(cloud.point.positions), 3), 100, np.uint8))
@@ -227,7 +234,7 @@ def test_clouds_without_votes_and_with_colors_are_asked_about(scene, browser):  
         assert name == "road" and np.allclose(middle, LARGE, atol=0.1)
 
 
-def test_where_nothing_is_doubtful_nothing_is_asked_and_errors_are_told(scene, browser):  # noqa: F811
+def test_where_nothing_is_doubtful_nothing_is_asked_and_errors_are_told(scene, browser, quick):  # noqa: F811
     cloud, seeds = read_cloud(scene.labelled), scene.seeds.read_bytes()
     cloud.point["confidence"] = o3d.core.Tensor(np.ones((len(cloud.point.positions), 1), np.float32))
     write_geometry(scene.labelled, cloud)
