@@ -60,9 +60,15 @@ def choose(found: Visit, name: str, value: str) -> None:
     """Choose in one of the panel's lists, by keys alone; a list that is left shows what it holds, not what was typed."""
     box = found.page.get_by_label(name, exact=True).first
     box.fill(value)
-    shown = found.page.locator("[role=option]:visible")
-    found.wait_for(lambda: shown.all_inner_texts() == [value], f"only {value} to be offered")
-    box.press("ArrowDown")
+    offered = found.page.locator("[role=option]:visible")
+    found.wait_for(lambda: offered.all_inner_texts() == [value], f"only {value} to be offered")
+    marked = found.page.locator("[role=option][data-combobox-selected]:visible")
+
+    def is_marked() -> bool:
+        box.press("ArrowDown")  # lost while the list opens
+        return marked.all_inner_texts() == [value]
+
+    found.wait_for(is_marked, f"{value} to be marked")
     box.press("Enter")
     box.press("Tab")
     found.wait_for(lambda: box.input_value() == value, f"{value} to be chosen")
