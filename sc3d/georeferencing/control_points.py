@@ -22,6 +22,7 @@ from sc3d.georeferencing.control_fit import (
     fit_control_points,
     fits_exchanged,
 )
+from sc3d.georeferencing.focal import adjustment_options
 from sc3d.georeferencing.gcp_list import is_title, parse_crs, parse_mark, read_lines
 from sc3d.georeferencing.georeference import crs_to_geodetic, geodetic_to_enu
 from sc3d.georeferencing.geotags import is_altitude
@@ -505,9 +506,7 @@ def _adjust(
             images[name].points2D.append(pycolmap.Point2D(seen[name]))
         added.append(model.add_point3D(position, track))
         config.add_constant_point(added[-1])
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary, options.refine_focal_length = False, refine_focal
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    pycolmap.create_default_bundle_adjuster(adjustment_options(refine_focal), config, model).solve()
     for point in added:
         model.delete_point3D(point)
     for seen in reversed(observations):

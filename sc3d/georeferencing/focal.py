@@ -98,10 +98,9 @@ def adjust(model: pycolmap.Reconstruction, flight: Flight | None, refine_focal: 
     """Bundle adjustment of a whole model, with the flight's GPS as priors where there is any (the model is
     then moved onto it).
     """
-    config, options = pycolmap.BundleAdjustmentConfig(), pycolmap.BundleAdjustmentOptions()
+    config, options = pycolmap.BundleAdjustmentConfig(), adjustment_options(refine_focal)
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
-    options.print_summary, options.refine_focal_length = False, refine_focal
     if flight is None:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         pycolmap.create_default_bundle_adjuster(options, config, model).solve()
@@ -111,6 +110,14 @@ def adjust(model: pycolmap.Reconstruction, flight: Flight | None, refine_focal: 
             options, prior_options, config, pose_priors(model, flight), model
         ).solve()
     model.update_point_3d_errors()
+
+
+def adjustment_options(refine_focal: bool) -> pycolmap.BundleAdjustmentOptions:
+    """Of a bundle adjustment that says nothing, on one thread: with more, sums are rounded otherwise in each run."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary, options.refine_focal_length = False, refine_focal
+    options.ceres.solver_options.num_threads = 1
+    return options
 
 
 def pose_priors(model: pycolmap.Reconstruction, flight: Flight) -> list[pycolmap.PosePrior]:
