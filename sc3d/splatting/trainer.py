@@ -250,9 +250,8 @@ class Trainer:
         for optimizer in (self.optimizer, self.exposure_optimizer):
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
-        if (
-            self.settings.exposure == "affine"
-        ):  # the mean photo keeps its colors: those of the scene cannot drift
+        if self.settings.exposure == "affine":
+            # the mean photo keeps its colors: those of the scene cannot drift
             known = self.exposures.detach().numpy()  # numpy adds up in one order, whatever the threads
             known[self.train_views] -= known[self.train_views].mean(axis=0)
 

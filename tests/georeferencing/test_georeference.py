@@ -28,7 +28,7 @@ from sc3d.georeferencing.control_points import (
     transform,
     triangulate,
 )
-from sc3d.georeferencing.focal import anchor_focal, exif_focal, tells_focal
+from sc3d.georeferencing.focal import adjustment_options, anchor_focal, exif_focal, tells_focal
 from sc3d.georeferencing.georeference import (
     Georeference,
     enu_to_geodetic,
@@ -653,3 +653,11 @@ def test_reconstruct_with_control_points_and_georeference_command(tmp_path, capl
     assert read_georeference(Scene(scene)).epsg == 28355 and errors().max() < 0.15
     main(["georeference", str(scene), "--from-gps", "--epsg", "32755"])
     assert errors().max() < 1.0  # GPS noise of the site
+
+
+def test_bundle_adjustments_have_one_thread():
+    """On small models more threads show nothing: on Brighton Beach each run had other last digits."""
+    for refine in (True, False):
+        options = adjustment_options(refine)
+        assert options.ceres.solver_options.num_threads == 1
+        assert options.refine_focal_length == refine
